@@ -1,4 +1,4 @@
-"""What every room stands on: errors, rigid motions, time grids, segments.
+"""Foundations of all packages: errors, rigid motions, time grids, segments.
 
-Pure functions over numpy arrays and one base class for errors. Nothing here knows of logs, tables or files.
+Pure functions over numpy arrays and one base class for errors, independent of logs, tables and files.
 """

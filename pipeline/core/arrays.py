@@ -1,4 +1,4 @@
-"""Arrays: their kinds, sampling on uniform grids, robust regression."""
+"""Arrays: types, sampling on uniform grids, robust regression."""
 
 from typing import Any
 
@@ -12,27 +12,28 @@ Bytes = NDArray[np.uint8]
 Complex = NDArray[np.complex128]
 
 _POINTS = 4096
-"""Of the circle: what is left of an angle is then at most 8e-4 rad, see `turn_units`. A power of two."""
+"""Number of tabulated points of the unit circle, a power of two: the remainder of an angle in `turn_units` is
+at most 8e-4 rad."""
 _CIRCLE: Complex = np.exp(2j * np.pi * np.arange(_POINTS) / _POINTS)
 
 
 def join_parts(real: Floats, imaginary: Floats | float) -> Complex:
-    """Complex numbers of their parts, shape (n,)."""
+    """Complex numbers from their real and imaginary parts, shape (n,)."""
     joined = np.empty(real.shape, dtype=np.complex128)
     joined.real, joined.imag = real, imaginary
     return joined
 
 
 def group_rows(number: NDArray[Any]) -> list[Ints]:
-    """Rows that have the same number, group by group in order of the numbers, each in order."""
+    """Row indices grouped by number, groups and rows in ascending order."""
     order = np.argsort(number, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
 def turn_units(angle: Floats) -> Complex:
-    """exp(i angle) to rounding, of angles [rad] of shape (n,): points of a circle, turned on by a series.
+    """exp(i angle) of angles [rad], shape (n,): tabulated points of the circle times a series.
 
-    Of the 8e-4 rad that are left at most, powers from the fifth on are below rounding.
+    The remainder is at most 8e-4 rad: its fifth and higher powers are below rounding.
     """
     nearest = np.rint(angle * (_POINTS / (2.0 * np.pi)))
     rest = angle - nearest * (2.0 * np.pi / _POINTS)
@@ -47,32 +48,32 @@ def turn_units(angle: Floats) -> Complex:
 # Times are float64 seconds, increasing. Nothing here crosses a segment: callers pass one segment at a time.
 
 ROUNDING_S = 1e-6
-"""Times [s] that differ by less are the same: a double of a stamp since 1970 is known to 2.4e-7 s."""
+"""Times [s] that differ by less are equal: a double resolves a stamp since 1970 to 2.4e-7 s."""
 SILENT_S = 0.25
-"""Farther than that [s] from their messages nobody knows what a wheel or a gyro did: `PERIODS` of 20 Hz."""
+"""Time from the nearest message [s] above which wheel and gyro signals are unknown: `PERIODS` at 20 Hz."""
 _FEWEST_POINTS = 4
-"""Poses of a quadratic fit: one more than it has numbers, so that noise is averaged at all. Eight smooth slow
-poses more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
+"""Minimum number of poses of a quadratic fit: one more than its coefficients, to average noise. Eight smooth
+slow poses more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
 _BLOCK = 4096
-"""Queries that are fitted at a time, which bounds the memory; no answer depends on it."""
+"""Number of queries fitted at a time, which limits memory; results do not depend on it."""
 _SHORTEST_HOLD_S = 0.5
-"""As diff_drive_controller's cmd_vel_timeout [s] by default; who knows better says it as `hold_s`."""
+"""Default cmd_vel_timeout of diff_drive_controller [s]; `hold_s` of the configuration replaces it."""
 PERIODS = 5.0
-"""Usual periods after which a message is missing, not late; with half of them, two lost ones stop a
-vehicle."""
+"""Number of median periods after which a message is missing, not late; with half of it, two lost messages
+stop a vehicle."""
 _SHORTEST_PERIOD = 1e-3
-"""Samples that share a stamp are taken to come a millisecond apart."""
+"""Assumed period of samples with equal stamps [s]."""
 
 
 def make_grid(start: float, end: float, rate: float) -> Floats:
-    """Uniform times from ``start`` in steps of 1/``rate`` to ``end`` inclusive, rounding forgiven."""
+    """Uniform times from ``start`` to ``end`` inclusive in steps of 1/``rate``, tolerant of rounding."""
     count = int(np.floor((end - start) * rate + 1e-6)) + 1
     return start + np.arange(max(count, 0)) / rate
 
 
 def hold_indices(at: Floats, times: Floats) -> Ints:
     """Index of the last sample at or before each query time; -1 before the first sample."""
-    # Stamps pass through nanoseconds and seconds: a sample at the very query time must count as known.
+    # Stamps are converted between nanoseconds and seconds: a sample at exactly the query time is known.
     return np.searchsorted(times, at + 1e-7, side="right").astype(np.int64) - 1
 
 
@@ -85,7 +86,7 @@ def nearest_indices(at: Floats, times: Floats) -> Ints:
 
 
 def count_steps(times: Floats, span: float) -> int:
-    """How many samples make a span of time, at least one.
+    """Number of samples in a span of time, at least one.
 
     Args:
         times: increasing [s], shape (n,), n >= 2.
@@ -95,12 +96,12 @@ def count_steps(times: Floats, span: float) -> int:
 
 
 def usual_hold(stamps: Floats) -> float:
-    """How long a controller holds its last command where nobody says: five periods, at least half a second.
+    """Default time for which a controller holds its last command [s]: five periods, at least half a second.
 
     Args:
-        stamps: of the commands [s], shape (n,).
+        stamps: stamps of the commands [s], shape (n,).
     """
-    # Two topics, one a side, come in pairs of nearly equal stamps: the median period would be next to none.
+    # Two topics, one per side, have pairs of nearly equal stamps: their median period is almost zero.
     period = float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
     return max(_SHORTEST_HOLD_S, PERIODS * period)
 
@@ -112,8 +113,8 @@ def differentiate_locally(at: Floats, times: Floats, values: Floats, window: flo
         at: query times [s], shape (m,), inside the range of ``times``.
         times: strictly increasing sample times [s], shape (n,), n >= 2.
         values: samples, shape (n, k), any unit.
-        window: full width of the window [s]; where it holds fewer than four samples it grows to the nearest
-            four (or all there are), where the series ends it becomes one-sided.
+        window: full width of the window [s]; with fewer than four samples it grows to the nearest four (or
+            all), and at the ends of the series it is one-sided.
 
     Returns:
         Derivatives at ``at``, shape (m, k), unit of ``values`` per second.
@@ -137,7 +138,7 @@ def _choose_neighbours(at: Floats, times: Floats, window: float) -> tuple[Ints, 
             break
         before = np.where(first > 0, at - times[np.maximum(first - 1, 0)], np.inf)
         after = np.where(last < times.size, times[np.minimum(last, times.size - 1)] - at, np.inf)
-        # Of two that are as near the earlier one, whatever rounding says.
+        # Of two equally near samples the earlier one, independent of rounding.
         earlier = before <= after + 1e-9
         first = np.where(short & earlier, first - 1, first)
         last = np.where(short & ~earlier, last + 1, last)
@@ -153,8 +154,8 @@ def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: In
     offset = np.where(inside, (times[index] - at[:, None]) / window, 0.0)
     powers = np.stack((inside.astype(float), offset, offset**2), axis=-1)
     normal = np.einsum("mwi,mwj->mij", powers, powers)
-    # Two or three points, or all on one instant, leave the quadratic undetermined: a whisper of a ridge on
-    # the curvature turns the fit into a line there and changes nothing elsewhere.
+    # With two or three points, or with equal times, the quadratic is undetermined: a small ridge on the
+    # curvature makes the fit a line there, with no effect elsewhere.
     normal[:, 2, 2] += 1e-9
     reference = values[np.clip(first, 0, times.size - 1)]
     right = np.einsum("mwi,mwk->mik", powers, (values[index] - reference[:, None, :]) * inside[..., None])
@@ -162,15 +163,15 @@ def _fit_slopes(at: Floats, times: Floats, values: Floats, first: Ints, last: In
 
 
 STRETCH_S = 10.0
-"""Length of the stretches [s] that count as independent: residuals are alike for one to two seconds. Half of
-it would count a slow disturbance twice, double would leave six stretches of two minutes."""
+"""Length of stretches treated as independent [s]: residuals are correlated over one to two seconds. Half of
+it would count a slow disturbance twice; double would leave six stretches of two minutes."""
 
 
 def number_stretches(since: Floats, length: float = STRETCH_S) -> Ints:
-    """Number of the stretch of ``length`` [s] that each time [s] lies in, shape (n,).
+    """Number of the stretch of ``length`` [s] that contains each time [s], shape (n,).
 
-    Stamps on a raster meet the ends of stretches exactly: rounding must not decide, or an answer would depend
-    on when the recorder was started.
+    Stamps on a raster coincide with the ends of stretches: without a tolerance, the result would depend on
+    the start time of the recorder.
     """
     number: Ints = ((since + ROUNDING_S) // length).astype(np.int64)
     return number
@@ -188,35 +189,34 @@ def integrate_rate(times: Floats, rate: Floats) -> Floats:
 
 
 _GAUSSIAN = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute values."""
+"""Ratio of the standard deviation of a normal distribution to its median absolute value."""
 _SHARE_OF_RMS = 0.5
-"""Of a column's root mean square, below which no robust spread of it is believed: of normal values the spread
-is all of it, of values that are mostly zero nothing."""
+"""Minimum robust spread of a column as a share of its RMS: for normal values the spread is the RMS, for
+values that are mostly zero it is zero."""
 _ROUNDS = 10
-"""Of reweighting; five or twenty change no finding of three recordings (`benchmarks/constants.py`)."""
+"""Number of reweightings; five or twenty change no finding of three recordings (`make bench-constants`)."""
 _WIDTH = 2.0
-"""Median sizes from which on Cauchy's weights hold an outlier back: 1.35 standard deviations of normal noise.
-Holland and Welsch take 2.385; poses have more outliers. Half or double change no finding of three
-recordings."""
+"""Scale of Cauchy's weights in median sizes: 1.35 standard deviations of normal noise. Holland and Welsch use
+2.385; poses have more outliers. Half or double change no finding of three recordings."""
 _LEAST = 1e-9
-"""Spread below which there is none: it keeps quotients finite."""
+"""Minimum spread, to keep quotients finite."""
 
 
 def robust_spread(values: Floats) -> float:
-    """Standard deviation about zero of normal values with as large a median size."""
+    """Standard deviation about zero, estimated from the median absolute value."""
     return _GAUSSIAN * float(np.median(np.abs(values)))
 
 
 def robust_spreads(values: Floats) -> Floats:
-    """The same of every column, shape (n, ...) to (...)."""
+    """`robust_spread` of every column, shape (n, ...) to (...)."""
     spreads: Floats = _GAUSSIAN * np.median(np.abs(values), axis=0)
     return spreads
 
 
 def guarded_spreads(values: Floats, clip: float = np.inf, least: float = _LEAST) -> Floats:
-    """Robust spread of every column, never below half the rms of values that are clipped at so many spreads.
+    """Robust spread of every column, at least half the RMS of the values clipped at ``clip`` spreads.
 
-    Where a vehicle mostly drives straight, the median of what turning leaves says nothing about turning.
+    If a vehicle mostly drives straight, the median does not describe the residuals of its turns.
     """
     middle = np.maximum(robust_spreads(values), least)
     clipped = np.sqrt(np.mean(np.minimum(np.abs(values), clip * middle) ** 2, axis=0))
@@ -225,16 +225,16 @@ def guarded_spreads(values: Floats, clip: float = np.inf, least: float = _LEAST)
 
 
 def guarded_spread(values: Floats, clip: float = np.inf, least: float = _LEAST) -> float:
-    """The same of one column, shape (n,)."""
+    """`guarded_spreads` of one column, shape (n,)."""
     return float(guarded_spreads(values[:, None], clip, least)[0])
 
 
 def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
-    """Fit values on columns, so that a minority of outliers counts little.
+    """Robust linear regression: a minority of outliers has little weight.
 
     Args:
         design: columns, shape (n, p).
-        values: what they should add up to, shape (n,).
+        values: target, shape (n,).
 
     Returns:
         The coefficients, shape (p,), and the residuals, shape (n,).
@@ -253,20 +253,20 @@ def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def count_freedom(normals: Floats, without: Floats) -> Floats:
-    """Degrees of freedom of the jackknife's variances, were residuals alike in all blocks, shape (p,).
+    """Degrees of freedom of the jackknife variances for equally distributed residuals, shape (p,).
 
-    Variances of the fits without each block are a quadratic form of the blocks' gradients: twice the square
-    of its mean over its variance (Satterthwaite).
+    The jackknife variance is a quadratic form of the gradients of the blocks: its degrees of freedom are
+    twice the square of its mean over its variance (Satterthwaite).
 
     Args:
         normals: normal matrix of each block, shape (k, p, p).
-        without: of all others, shape (k, p, p).
+        without: normal matrix of all other blocks, shape (k, p, p).
     """
     count = normals.shape[0]
     moved = np.linalg.inv(without)
     pull = np.swapaxes(moved @ normals, 0, 1)
     shared = pull @ np.linalg.pinv(normals[0] + without[0])
-    # The form is diagonal but for what blocks share, and centred: its traces need no (k, k) matrix.
+    # The form is diagonal plus low rank, and centred: its traces need no (k, k) matrix.
     own = np.einsum("pkq,kqp->pk", pull, moved)
     joint = np.swapaxes(pull, 1, 2) @ shared
     rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
@@ -279,6 +279,6 @@ def count_freedom(normals: Floats, without: Floats) -> Floats:
         - 2.0 * np.sum(rows**2, axis=1) / count
         + (total / count) ** 2
     )
-    # One block alone leaves nothing to vary.
+    # A single block has no variance.
     freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
     return freedom

@@ -1,4 +1,4 @@
-"""Independent work on two cores, what is remembered, and memory that is free again."""
+"""Parallel work on two cores, a cache of recent results, and release of freed memory."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ Result = TypeVar("Result")
 
 _NUMBER = struct.Struct("Q")
 _END = 2**64 - 1
-"""No item has this number: who reads it goes home."""
+"""Index of no item: a process that reads it stops."""
 _PIECES = 500
-"""As many numbers fit into any pipe that nobody reads yet: the least is a page of 4096 bytes."""
+"""Number of indices that fit into any unread pipe: the smallest is a page of 4096 bytes."""
 _DIE_WITH_PARENT = 1
 """PR_SET_PDEATHSIG of <linux/prctl.h>."""
 
 
 @dataclass
 class _Beside:
-    """The other process: its number, the line to it, and a pipe of which both take what is next."""
+    """The other process: its id, the connection to it, and a pipe from which both read the next index."""
 
     pid: int
     line: Connection
@@ -53,7 +53,7 @@ class _Beside:
     shared: Sequence[object]
 
     def end(self) -> None:
-        """Once and for all."""
+        """Stop the other process; further calls have no effect."""
         pid, self.pid = self.pid, 0
         if not pid:
             return
@@ -73,18 +73,18 @@ _spent_s = [0.0, 0.0]
 
 
 def measure_cpu() -> float:
-    """CPU time of this process and of those beside it [s]."""
+    """CPU time of this process and of its parallel processes [s]."""
     return time.process_time() + sum(_spent_s)
 
 
 @contextmanager
 def both_cores(shared: Sequence[object]) -> Iterator[None]:
-    """Let `map_parallel` work in two processes.
+    """Let `map_parallel` use two processes.
 
-    Libraries compute on one thread meanwhile: how they split sums would depend on how many cores there are.
+    Libraries use one thread meanwhile: their order of summation would depend on the number of cores.
 
     Args:
-        shared: large objects that functions, items and results refer to: they are not copied.
+        shared: large objects referenced by functions, items and results, which are not copied.
     """
     from threadpoolctl import threadpool_limits  # noqa: PLC0415 - heavy
 
@@ -147,19 +147,19 @@ def _fork(shared: Sequence[object]) -> _Beside | None:
 
 
 def map_parallel(function: Callable[[Item], Result], items: Sequence[Item]) -> list[Result]:
-    """The function of every item.
+    """Results of a function for every item, computed in parallel where possible.
 
     Args:
-        function: without side effects that matter; one that can be pickled, else all is done here.
-        items: what it is called with; whichever process is free takes the next.
+        function: has no side effects that matter; if it cannot be pickled, this process does all the work.
+        items: its arguments; the process that is free takes the next one.
     """
     results = _share(_at_hand[0], function, items) if len(items) > 1 and _is_main() and _at_hand else {}
-    # What failed beside is done here, where its error is seen.
+    # What failed in the other process is repeated here, where its error is raised.
     return [results[n] if n in results else function(item) for n, item in enumerate(items)]
 
 
 def _share(beside: _Beside, function: Callable[[Item], Result], items: Sequence[Item]) -> dict[int, Result]:
-    """Results by number; none, and no other process from now on, where anything failed."""
+    """Results by index; none after a failure, which also ends the other process."""
     try:
         request = _pack((function, items), beside.shared)
     except (pickle.PicklingError, AttributeError, TypeError):
@@ -199,7 +199,7 @@ def _pack(content: object, shared: Sequence[object]) -> bytes:
 
 
 def _reduce(values: NDArray[Any]) -> Any:  # noqa: ANN401 - as pickle has it
-    """Axes lie in memory as they did: sums over them are the same to the last bit."""
+    """Pickle an array with its memory layout: sums over its axes remain identical to the last bit."""
     if values.flags.forc:
         return values.__reduce_ex__(5)
     order = np.argsort(values.strides, kind="stable")[::-1]
@@ -213,10 +213,10 @@ def _unpack(content: bytes, shared: Sequence[object]) -> Any:  # noqa: ANN401 - 
 
 
 class Newest(Generic[Result]):
-    """The newest results of something that is asked again.
+    """Cache of the most recent results.
 
     Args:
-        most: how many are kept.
+        most: maximum number of results.
     """
 
     def __init__(self, most: int) -> None:
@@ -224,7 +224,7 @@ class Newest(Generic[Result]):
         self._known: OrderedDict[Hashable, Result] = OrderedDict()
 
     def recall(self, key: Hashable, make: Callable[[], Result]) -> Result:
-        """The result that is known under a key, made where it is not."""
+        """The cached result of a key, computed if it is missing."""
         result = self._known.pop(key, None)
         if result is None:
             result = make()
@@ -235,10 +235,10 @@ class Newest(Generic[Result]):
 
 
 def return_freed_memory() -> None:
-    """Hand memory that was freed back to the machine, where the C library can.
+    """Return freed memory to the operating system, if the C library can.
 
-    Columns of a log are many small pieces from several threads: what is left between them stays with the
-    process, up to half of what was read, until it is asked for.
+    Columns of a log are many small allocations of several threads: the free memory between them, up to half
+    of what was read, otherwise remains with the process.
     """
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

@@ -1,4 +1,4 @@
-"""JSON objects as they were stored, read without errors: what is missing or of another kind is left out."""
+"""Tolerant access to stored JSON objects: missing values and those of another type are omitted."""
 
 import json
 import sys
@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 def read_object(path: Path) -> dict[str, object]:
-    """The object in a file; empty where there is none that can be read."""
+    """The object in a file; empty if there is none or it cannot be read."""
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError):
@@ -21,18 +21,18 @@ def number_in(source: Mapping[str, object], key: str) -> float | None:
 
 
 def numbers_in(source: Mapping[str, object], key: str) -> list[float | None]:
-    """A list of numbers under a key; entries that are none become None."""
+    """A list of numbers under a key; other entries become None."""
     return [_take_number(entry) for entry in _take_list(source.get(key))]
 
 
 def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
-    """An object under a key; empty when it is not there."""
+    """An object under a key; empty if missing."""
     value = source.get(key)
     return value if isinstance(value, Mapping) else {}
 
 
 def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, object]]:
-    """A list of objects under a key; empty when it is not there, entries of other kinds left out."""
+    """A list of objects under a key; empty if missing, without entries of other types."""
     return [entry for entry in _take_list(source.get(key)) if isinstance(entry, Mapping)]
 
 

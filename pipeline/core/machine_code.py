@@ -1,12 +1,12 @@
-"""Loops over signals, written as plain Python and run as machine code that was made at set-up.
+"""Loops over signals, written as plain Python and compiled to machine code at set-up.
 
-Numba makes the code, once: it is kept as an object file beside the source, or in the user's cache where the
-installation is read-only, and in no place where neither can be written. Files of older versions are deleted
-some time after their last use. Running it needs no compiler, whose start costs half a second of CPU.
-`NUMBA_DISABLE_JIT=1` runs the Python itself, with the same numbers.
+Numba compiles them once. The code is stored as an object file beside the source, or in the user's cache if
+the installation is read-only, and nowhere if neither is writable. Files of older versions are deleted some
+time after their last use. Running the code needs no compiler, whose start takes half a second of CPU.
+`NUMBA_DISABLE_JIT=1` runs the Python source instead, with the same results.
 
-A loop allocates nothing: it writes into arrays that it is given. Arrays are C-contiguous and of the types of
-its signature; anything else is refused, as the code would read beyond them.
+A loop allocates nothing: it writes into its array arguments. Arrays must be C-contiguous and have the types
+of the signature; others are refused, because the code would read beyond them.
 """
 
 from __future__ import annotations
@@ -39,25 +39,25 @@ _TYPES: dict[str, tuple[np.dtype[Any], Any, str]] = {
     "uint8": (np.dtype(np.uint8), ctypes.c_uint8, "i8"),
     "complex128": (np.dtype(np.complex128), None, ""),
 }
-"""Of each type of a signature: the array's, that of a number in C, and in LLVM."""
+"""Types of a signature: dtype of the array, scalar type in C, and in LLVM."""
 _ARGUMENT = re.compile(r"(\w+)(\[[:, ]+\])?(?:, |$)")
 _DIGEST_BYTES = 32
-"""Of SHA-256."""
+"""Size of a SHA-256 digest [bytes]."""
 _FOLDER = "NUMBA_CACHE_DIR"
 _KEPT_S = 30 * 86400.0
-"""How long machine code that no present loop has is kept after its last use [s]: another version of the
-program may share the folder, and compiles anew what it misses."""
+"""Age since the last use [s] after which machine code of no current loop is deleted: another version of the
+program may share the folder, and recompiles what is missing."""
 
 _loops: list[Loop[Any]] = []
 
 
 class Loop(Generic[Given]):
-    """A loop that is called as machine code.
+    """A loop that runs as machine code.
 
     Args:
         loop: in Python.
-        signature: types of the arguments, for example ``float64[:, :], int64``; empty for what only other
-            loops call.
+        signature: types of the arguments, for example ``float64[:, :], int64``; empty for a loop that only
+            other loops call.
     """
 
     def __init__(self, loop: Callable[Given, Any], signature: str) -> None:
@@ -68,7 +68,7 @@ class Loop(Generic[Given]):
 
     @cached_property
     def machine_code(self) -> Callable[..., Any]:
-        """The loop as it is called: its machine code, or the Python where that is asked for."""
+        """The callable: its machine code, or the Python source if `NUMBA_DISABLE_JIT` is set."""
         if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
             return self._loop
         return _bind(self.make_object(), _split(self.signature), self.name)
@@ -80,15 +80,15 @@ class Loop(Generic[Given]):
 
     @property
     def _numba_type_(self) -> object:
-        """What the compiler takes it for in another loop."""
+        """Type of the loop when another loop calls it."""
         return _make_dispatcher(self._loop)._numba_type_
 
     def find_object(self) -> Path | None:
-        """The file that keeps its machine code; None where none does."""
+        """File with its machine code; None if there is none."""
         return next((path for path, _ in self._read_objects()), None)
 
     def make_object(self) -> bytes:
-        """Its machine code, kept for the next time if any folder can be written."""
+        """Its machine code, stored for later use if any folder is writable."""
         for _, code in self._read_objects():
             return code
         code = _compile(self._loop, self.signature)
@@ -101,10 +101,9 @@ class Loop(Generic[Given]):
         return code
 
     def _read_objects(self) -> Iterator[tuple[Path, bytes]]:
-        """Files that keep its machine code whole, and may be run, with that code.
+        """Files with its complete machine code that may be run, with their content.
 
-        Code is run only of those whom the program is run or was installed by: others may write into a folder
-        that they share.
+        Only code of the user who runs or installed the program is run: others may write into a shared folder.
         """
         believed = {0, os.geteuid(), Path(self._loop.__code__.co_filename).stat().st_uid}
         for folder in self._list_folders():
@@ -122,12 +121,12 @@ class Loop(Generic[Given]):
 
     @property
     def file_name(self) -> str:
-        """Name of the file that keeps its machine code: another one for every version of its source."""
+        """Name of the file with its machine code, different for every version of its source."""
         module = self.__module__.rpartition(".")[2]
         return f"{module}.{self.name}-{_hash_source(self._loop.__code__.co_filename, self.signature)}.o"
 
     def _list_folders(self) -> Iterator[Path]:
-        """Where its code may be kept, the first one first."""
+        """Folders in which its code may be stored, in order of preference."""
         if asked := os.environ.get(_FOLDER):
             yield Path(asked)
             return
@@ -136,12 +135,12 @@ class Loop(Generic[Given]):
             yield Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "slip"
 
     def __call__(self, *args: Given.args, **kwargs: Given.kwargs) -> Any:  # noqa: ANN401 - the loop's
-        """Run the machine code; Python that runs in its place may give something back to another loop."""
+        """Run the machine code; the Python source in its place may return a value to another loop."""
         return self.machine_code(*args, **kwargs)
 
 
 def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[Given, Any]]:
-    """Run a loop as machine code.
+    """Decorator that runs a loop as machine code.
 
     Args:
         signature: types of its arguments, for example ``float64[:, :], int64``; empty for what only other
@@ -158,27 +157,27 @@ def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[G
 
 
 def compile_loops() -> Iterator[str]:
-    """Make the machine code of all loops that are imported and have none yet; their names."""
+    """Compile all imported loops without machine code; returns their names."""
     for loop in _loops:
         if loop.is_compiled:
             yield loop.name
 
 
 def list_caches() -> set[str | None]:
-    """Folders in which loops are kept; None for those that cannot be; nothing where none is compiled."""
+    """Folders with stored loops, None for a loop that cannot be stored; empty if none is compiled."""
     paths = [loop.find_object() for loop in _loops if loop.is_compiled]
     return {None if path is None else str(path.parent) for path in paths}
 
 
 @functools.cache
 def _load_compiler() -> ModuleType:
-    """LLVM, without Numba: it links, and writes object files."""
+    """LLVM without Numba, to link and to write object files."""
     return import_module("llvmlite.binding")
 
 
 @functools.cache
 def _hash_source(source: str, signature: str) -> str:
-    """What a loop's machine code depends on: its file, the compiler, and the processor."""
+    """Dependencies of the machine code of a loop: its file, the compiler and the processor."""
     binding = _load_compiler()
     features = binding.get_host_cpu_features().flatten()
     parts = [signature, version("numba"), version("llvmlite"), binding.get_host_cpu_name(), features]
@@ -188,7 +187,7 @@ def _hash_source(source: str, signature: str) -> str:
 
 
 def _replace_file(path: Path, content: bytes) -> None:
-    """Write a file that other processes see whole or not at all, and that all may read whom the mask lets."""
+    """Write a file atomically, with the permissions of the umask."""
     draft = path.with_name(f".{path.name}.{secrets.token_hex(8)}")
     try:
         with draft.open("xb") as file:
@@ -200,7 +199,7 @@ def _replace_file(path: Path, content: bytes) -> None:
 
 
 def _delete_unused(folder: Path) -> None:
-    """Delete machine code that older versions of the imported files left, and nobody has used for long."""
+    """Delete machine code of older versions of the imported files that has not been used for long."""
     present = {loop.file_name for loop in _loops}
     modules = {name.partition(".")[0] for name in present}
     for path in folder.glob(f"*.*-{'[0-9a-f]' * 16}.o"):
@@ -211,7 +210,7 @@ def _delete_unused(folder: Path) -> None:
 
 
 def _split(signature: str) -> list[tuple[str, int]]:
-    """Type and number of axes of every argument; a number has none."""
+    """Type and number of axes of every argument; a scalar has none."""
     return [(kind, axes.count(":")) for kind, axes in _ARGUMENT.findall(signature)]
 
 
@@ -222,7 +221,7 @@ def _make_dispatcher(loop: Callable[..., object]) -> Any:  # noqa: ANN401 - the 
 
 
 def _compile(loop: Callable[..., object], signature: str) -> bytes:
-    """Object file with one function, ``enter``, which takes numbers and array objects."""
+    """Object file with one function, ``enter``, whose arguments are scalars and array objects."""
     types = import_module("numba.core.types")
     arguments = _split(signature)
     plain = [(getattr(types, kind), axes) for kind, axes in arguments]
@@ -238,10 +237,10 @@ def _compile(loop: Callable[..., object], signature: str) -> bytes:
 
 
 def _write_entry(inner: str, arguments: list[tuple[str, int]]) -> str:
-    """The function ``enter`` in LLVM's words: it takes arrays apart and calls the loop.
+    """The function ``enter`` in LLVM IR: it unpacks arrays and calls the loop.
 
-    An array object is what NumPy's C interface says (``PyArrayObject``): data, number of axes, lengths, and
-    strides, each 8 bytes, after what every object begins with.
+    An array object has the layout of NumPy's C interface (``PyArrayObject``): data, number of axes, lengths
+    and strides, 8 bytes each, after the header of every object.
     """
     # The loop writes that it returns nothing, and where an error is described.
     taken, passed = [], ["ptr %nothing", "ptr %error"]
@@ -294,7 +293,7 @@ def _make_target() -> Any:  # noqa: ANN401 - the linker's
 
 
 _linked: list[object] = []
-"""What is linked stays for as long as the process."""
+"""Linked code remains for the life of the process."""
 
 
 def _bind(code: bytes, arguments: list[tuple[str, int]], name: str) -> Callable[..., None]:

@@ -1,7 +1,7 @@
-"""Small methods of numerics: some whose library takes longer to load than a diagnosis spends on them.
+"""Small numerical methods whose library import would take longer than their use in a diagnosis.
 
-SciPy's own (`stdtrit`, `nnls`, `solveh_banded`) cost half a second of CPU before their first answer; tests
-compare.
+Importing those of SciPy (`stdtrit`, `nnls`, `solveh_banded`) takes half a second of CPU; tests compare the
+results.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from pipeline.core.arrays import Flags, Floats
 from pipeline.core.machine_code import compiled
 
 _MANY = 400.0
-"""Degrees of freedom from which on the series for the quantile is exact to 1e-10."""
+"""Degrees of freedom above which the series for the quantile is exact to 1e-10."""
 _SOME = 5.0
-"""Degrees of freedom from which on the series is nearer than the normal quantile."""
+"""Degrees of freedom above which the series is closer than the normal quantile."""
 _TINY = 1e-300
-"""In the place of zero, by which Lentz's method would divide: the smallest double is 2e-308."""
+"""Replacement of a zero divisor in Lentz's method: the smallest double is 2e-308."""
 _ROOT_HALF = math.sqrt(0.5)
 _ROUNDS = 1000
-"""Most steps: a guard. Both loops end by `_EXACT`, the fraction after some sqrt(`_MANY`) steps."""
+"""Maximum number of steps, as a guard. Both loops end by `_EXACT`, the fraction in about sqrt(`_MANY`)."""
 _EXACT = 1e-12
-"""Share of the result by which the last step changes it."""
+"""Relative change of the result by the last step."""
 
 
 @functools.lru_cache(maxsize=4096)
@@ -65,7 +65,7 @@ def student_quantile(level: float, freedom: float) -> float:
 
 
 def normal_tail(deviations: Floats) -> Floats:
-    """Probability that a standard normal number is larger, of each of a few numbers, shape (n,)."""
+    """Upper tail probability of the standard normal distribution, shape (n,)."""
     return np.array([0.5 * math.erfc(one * _ROOT_HALF) for one in deviations.tolist()])
 
 
@@ -81,7 +81,7 @@ def jackknife_deviation(without: Floats) -> float:
 
 
 def _find_tail(t: float, freedom: float) -> float:
-    """Probability that Student's t is larger than ``t`` on either side: an incomplete beta function."""
+    """Two-sided tail probability of Student's t distribution: an incomplete beta function."""
     x = freedom / (freedom + t * t)
     a, b = 0.5 * freedom, 0.5
     front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x)
@@ -112,7 +112,7 @@ def _keep_off_zero(value: float) -> float:
 
 
 def solve_nonnegative(design: Floats, target: Floats) -> Floats:
-    """Non-negative numbers with the least squares of ``design @ numbers - target``, shape (p,).
+    """Non-negative least squares: minimize the norm of ``design @ numbers - target``, shape (p,).
 
     Args:
         design: shape (n, p), p in the tens.
@@ -149,11 +149,11 @@ def _solve_free(design: Floats, target: Floats, free: Flags) -> Floats:
 
 
 def solve_tridiagonal(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
-    """Solution of a symmetric positive definite system with one diagonal on each side, shape (n,).
+    """Solution of a symmetric positive definite tridiagonal system, shape (n,).
 
     Args:
         diagonal: shape (n,).
-        beside: from each row to the next, shape (n - 1,).
+        beside: off-diagonal, shape (n - 1,).
         right: right-hand side, shape (n,).
 
     Source: Golub and Van Loan, Matrix Computations, 4.3.6.
@@ -165,7 +165,7 @@ def solve_tridiagonal(diagonal: Floats, beside: Floats, right: Floats) -> Floats
 
 @compiled("float64[:], float64[:], float64[:]")
 def _solve_tridiagonal(diagonal: Floats, beside: Floats, solution: Floats) -> None:
-    """See `solve_tridiagonal`; ``solution`` holds the right-hand side, and the diagonal is used up."""
+    """`solve_tridiagonal` in place: ``solution`` is the right-hand side; ``diagonal`` is overwritten."""
     for row in range(1, diagonal.size):
         share = beside[row - 1] / diagonal[row - 1]
         diagonal[row] -= share * beside[row - 1]

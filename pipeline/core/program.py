@@ -1,7 +1,7 @@
-"""The program: its errors, its version, numbers and durations for people, Python started again.
+"""Errors, version, formatting of numbers and durations, and starting Python processes.
 
-An error has a stable code for scripts, says what is wrong and where, and ends with what to do about it.
-Each room derives one class of its own.
+An error has a stable code for scripts, states what is wrong and where, and ends with what to do about it.
+Each package derives a class of its own.
 """
 
 import math
@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 
 _READABLE = 300
-"""Characters of a foreign text within a sentence: four lines of a screen."""
+"""Maximum number of characters of quoted text in a sentence: four lines of a screen."""
 _LONGEST = 1000
-"""Characters of a whole error: what a file says is repeated in errors, and a file may say a gigabyte."""
+"""Maximum number of characters of an error, which may quote a text of any size from a file."""
 
 
 class SlipError(Exception):
-    """Something the user can mend.
+    """An error that the user can correct.
 
     Args:
         code: stable identifier in snake_case, for example ``log_not_found``.
@@ -45,7 +45,7 @@ class SlipError(Exception):
         return f"{origin}{self.what}. {self.hint.rstrip('.')}."
 
     def _render_traceback_(self) -> list[str]:
-        """The same line in place of a traceback, where a notebook asks for one."""
+        """The same line in place of a traceback in a notebook."""
         return [f"slip: {' '.join(str(self).split())}"]
 
     def __reduce__(self) -> tuple[object, ...]:
@@ -54,12 +54,12 @@ class SlipError(Exception):
 
 
 def shorten(text: str, most: int = _READABLE) -> str:
-    """The beginning of what a text of any length says."""
+    """A text, truncated if it is long."""
     return text if len(text) <= most else f"{text[:most]}..."
 
 
 def guess_names(name: str, known: Iterable[str]) -> str:
-    """`Did you mean husky_a200? ` where known names are near a name that is not; else empty."""
+    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty."""
     import difflib  # noqa: PLC0415 - only needed once something is already wrong
 
     near = difflib.get_close_matches(name, list(known), n=3)
@@ -74,7 +74,7 @@ def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str)
 def naming_os_errors(
     make: type[SlipError], code: str, what: str, *, where: object, hint: str
 ) -> Iterator[None]:
-    """Within it, what the operating system refuses is an error of the house: `what`, and the reason it gives.
+    """Context manager that raises errors of the operating system as `SlipError` with their reason.
 
     Raises:
         SlipError: of the class `make`.
@@ -87,19 +87,19 @@ def naming_os_errors(
 
 _MINUTE, _HOUR = 60.0, 3600.0  # seconds
 _NEARLY_ALL = 0.95
-"""Below this share of the recording it is worth saying how much of it could be compared."""
+"""Share of the recording below which the compared duration is shown as well."""
 
 
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
-"""How people read the input that the ideal model is fed with."""
+"""Text for each input of the ideal model."""
 
 
 def format_share(share: float, digits: int = 2) -> str:
-    """A share in percent as people read it: `56 %`, `8.6 %`, `0.5 %`.
+    """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
 
     Args:
         share: 1 is the whole.
-        digits: that count, though never fewer than those before the point; 0 for whole percent.
+        digits: significant digits, at least those before the decimal point; 0 for whole percent.
     """
     percent = 100.0 * share
     leading = math.floor(math.log10(abs(percent))) if percent and math.isfinite(percent) else 0
@@ -109,7 +109,7 @@ def format_share(share: float, digits: int = 2) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """Seconds in the two units that matter: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
+    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
     if seconds < _MINUTE:
         return f"{round(seconds, 1):g} s"
     whole = round(seconds)
@@ -119,7 +119,7 @@ def format_duration(seconds: float) -> str:
 
 
 def format_recorded(recorded_s: float, compared_s: object = None) -> str:
-    """How long a log is, and how much of it has slip where that is clearly less."""
+    """Duration of a log, and of its part with slip if that is clearly less."""
     text = format_duration(recorded_s)
     if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
         text += f", {format_duration(compared_s)} of it compared"
@@ -130,31 +130,31 @@ NORMAL_95 = 1.959964
 """Half of a normal distribution's 95 % interval, in standard deviations."""
 
 JSON_DIGITS = 6
-"""Significant digits of what is estimated, in JSON: more than any such number is known to."""
+"""Significant digits of estimates in JSON, more than any estimate has."""
 
 
 def finite_or_none(value: float, digits: int | None = None) -> float | None:
-    """The number, to so many significant digits where they are given; None where it is not finite."""
+    """A number, rounded to ``digits`` significant digits if given; None if it is not finite."""
     if not math.isfinite(value):
         return None
     return value if digits is None else float(f"{value:.{digits}g}")
 
 
 def pick(item: object, *names: str) -> dict[str, Any]:
-    """Some of an object's fields by name."""
+    """Selected fields of an object by name."""
     return {name: getattr(item, name) for name in names}
 
 
 def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
-    """Some of an object's numbers by name, as `finite_or_none`."""
+    """Selected numbers of an object by name, as `finite_or_none`."""
     return {name: finite_or_none(getattr(item, name), digits) for name in names}
 
 
 def silence_warnings() -> None:
-    """Show no warnings in this process, unless they were asked for (``python -W``, ``PYTHONWARNINGS``).
+    """Hide warnings in this process unless requested (``python -W``, ``PYTHONWARNINGS``).
 
-    What a user must know is a finding, a loss or an error. Filters stay as they are: where warnings are
-    errors, as in the tests, they are errors still.
+    Users are informed by findings, losses and errors. Filters are unchanged: warnings that are errors, as in
+    the tests, remain errors.
     """
     if not sys.warnoptions:
         warnings.showwarning = _ignore
@@ -168,7 +168,7 @@ PACKAGE = "slip-pipeline"
 
 
 def read_version() -> str:
-    """The version that the installed package says; in a checkout that is not installed, the declared one."""
+    """Version of the installed package; in a checkout that is not installed, the declared one."""
     # Every call of the program passes here, and few ask for the version.
     import importlib.metadata  # noqa: PLC0415
     import tomllib  # noqa: PLC0415
@@ -189,32 +189,32 @@ def read_version() -> str:
 # installed.
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
-"""What tells numeric libraries how many threads to take."""
+"""Environment variables with the number of threads of numerical libraries."""
 
 _ORPHAN_PERIOD_S = 0.5
-"""A process whose parent died ends within so long [s]; looking for the parent costs microseconds."""
+"""Period of checking for the parent process [s]: an orphan ends within it; a check takes microseconds."""
 
 
 def python_command(*words: str) -> list[str]:
-    """The command line of this interpreter, by its absolute path, that leaves the current folder out.
+    """Command line of this interpreter, by its absolute path, without the current folder in its path.
 
     Args:
-        words: what follows, such as ``-m pipeline batch``.
+        words: arguments, such as ``-m pipeline batch``.
     """
     return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
 
 
 def slip_command(*words: str) -> list[str]:
-    """The command line of a verb in a process of its own.
+    """Command line of a verb in a process of its own.
 
     Args:
-        words: the verb and its words.
+        words: the verb and its arguments.
     """
     return python_command("-m", "pipeline", *words)
 
 
 def keep_current_folder_out() -> None:
-    """Make every Python that libraries start from here leave the current folder out: workers, trackers."""
+    """Exclude the current folder from the path of Python processes started by libraries."""
     os.environ["PYTHONSAFEPATH"] = "1"
 
 

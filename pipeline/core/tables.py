@@ -1,4 +1,4 @@
-"""Rows as tables of the contracts."""
+"""Conversion of rows to tables of the contracts, and to CSV."""
 
 from collections.abc import Iterable, Mapping
 
@@ -6,11 +6,11 @@ import polars as pl
 import polars.selectors as cs
 
 _FORMULA = "=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20"
-"""What spreadsheets begin a formula with, after OWASP, "CSV Injection"; the last four are wide forms."""
+"""First characters of a spreadsheet formula, after OWASP, "CSV Injection"; the last four are wide forms."""
 
 
 def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
-    """Rows by column as a table, without the columns that every table has; what a row lacks is null."""
+    """Rows as a table, without the columns that every table has; missing values are null."""
     from schemas import Table, contract_of  # noqa: PLC0415 - `slip inspect` needs no contract
 
     kinds = contract_of(table).schema.create_empty().schema
@@ -19,7 +19,7 @@ def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
 
 
 def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None = None) -> str:
-    """A table as CSV of which no spreadsheet takes a text for a formula: such texts get a quote in front.
+    """A table as CSV, safe for spreadsheets: a text that looks like a formula gets a leading quote.
 
     Args:
         frame: a table of plain columns; numbers stay as they are, negative ones too.
@@ -36,7 +36,7 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
 
 
 def unquote_formulas(frame: pl.DataFrame) -> pl.DataFrame:
-    """The texts of a table that `format_csv` wrote, as they were before."""
+    """The original texts of a table that `format_csv` wrote."""
     return frame.with_columns(cs.string().str.replace(f"^'('*[{_FORMULA}])", "$1"))
 
 

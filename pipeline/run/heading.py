@@ -1,4 +1,4 @@
-"""The fine grid of a run, and the heading that models are judged with."""
+"""Fine time grid of a run, and the heading against which models are compared."""
 
 import enum
 import itertools
@@ -20,7 +20,7 @@ _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags b
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells of all spans, one after the other.
+    """Consecutive cells of all spans.
 
     Attributes:
         step_s: width of a cell.
@@ -39,13 +39,13 @@ class Grid:
     ends: Floats
 
     def find_span(self, at: Floats) -> Ints:
-        """Number of the span that holds each time, -1 in a hole."""
+        """Number of the span that contains each time, -1 in a gap."""
         span = np.searchsorted(self.starts, at, side="right") - 1
         inside = (span >= 0) & (at <= self.ends[np.maximum(span, 0)])
         return np.where(inside, span, -1)
 
     def sum_up(self, rate: Signal) -> Signal:
-        """Integral of a rate at every cell edge: index 0 is the first edge of all, holes count nothing."""
+        """Integral of a rate at every cell edge: index 0 is the first edge, gaps add nothing."""
         summed: Signal = np.empty(rate.size + 1, dtype=rate.dtype)
         summed[0] = 0.0
         np.cumsum(rate, out=summed[1:])
@@ -53,7 +53,7 @@ class Grid:
         return summed
 
     def locate_edges(self, at: Floats) -> Floats:
-        """Place of times among the cell edges as a fractional index into `sum_up`'s result."""
+        """Fractional index of times into the result of `sum_up`."""
         places = np.empty(at.size)
         _locate_edges(np.ascontiguousarray(at), self.starts, self.ends, self.first, self.step_s, places)
         return places
@@ -63,7 +63,7 @@ class Grid:
 def _locate_edges(
     at: Floats, starts: Floats, ends: Floats, first: Ints, step_s: float, places: Floats
 ) -> None:
-    """See `Grid.locate_edges`; quickest where times are in order."""
+    """See `Grid.locate_edges`; fastest for sorted times."""
     span = 0
     for row in range(at.size):
         time = at[row]
@@ -76,7 +76,7 @@ def _locate_edges(
 
 
 def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
-    """Cut a run at the holes of its recording and lay cells over what remains.
+    """Cut a run at the gaps of its recording and cover the rest with cells.
 
     Args:
         run: the run.
@@ -99,7 +99,7 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
 
 
 class MeasuredDrive:
-    """Measured wheels as a function of time, held towards the middle of holes.
+    """Measured wheels as a function of time, held up to the middle of gaps.
 
     Args:
         series: wheel speeds [rad/s] and steering [rad] at their stamps.
@@ -122,7 +122,7 @@ class MeasuredDrive:
         self._values = np.array([fill(signal) for signal in signals])
 
     def interpolate(self, at: Floats, delay_s: float) -> Wheels:
-        """Wheels at times [s] of shape (n,), their stamps being late by ``delay_s``."""
+        """Wheels at times [s], shape (n,), with stamps late by ``delay_s``."""
         signals = np.empty((len(self._values), at.size))
         _interpolate(at + delay_s, self._knots, self._values, signals)
         left, right, *rest = signals
@@ -132,7 +132,7 @@ class MeasuredDrive:
 
 @compiled("float64[:], float64[:], float64[:, :], float64[:, :]")
 def _interpolate(at: Floats, knots: Floats, values: Floats, signals: Floats) -> None:
-    """Signals at times, linear between knots and held beyond them.
+    """Signals at times, linear between knots and constant outside.
 
     Args:
         at: times [s], quickest in order, shape (n,).
@@ -154,7 +154,7 @@ def _interpolate(at: Floats, knots: Floats, values: Floats, signals: Floats) -> 
 
 
 class HeldDrive:
-    """Held commands on cells; what depends on their stamps alone is worked out once.
+    """Held commands on cells; everything that depends only on their stamps is computed once.
 
     Args:
         series: held commands.
@@ -177,7 +177,7 @@ class HeldDrive:
         self._held = Commands(times[order], *sides, sideways)
 
     def begin_spans(self, measured: Floats) -> Commands:
-        """Commands with a first value for every span: what the wheels did there, or its first command.
+        """Commands with a first value for every span: the wheel speeds there, or its first command.
 
         Args:
             measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
@@ -209,7 +209,7 @@ class HeldDrive:
 
 
 def average_held(times: Floats, values: Floats, grid: Grid) -> Floats:
-    """Cell means of held values, exact wherever a stamp falls inside a cell, shape (n,).
+    """Cell means of held values, exact for stamps inside a cell, shape (n,).
 
     Args:
         times: stamps [s], increasing, shape (m,).
@@ -258,7 +258,7 @@ _LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
 
 
 class HeadingSource(enum.Enum):
-    """Whose heading is used: the gyro's where it agrees with the poses, or always the poses'."""
+    """Source of the heading: the gyro if it agrees with the poses, or always the poses."""
 
     AUTO = "auto"
     POSE = "pose"
@@ -281,7 +281,7 @@ class Heading:
 
 
 def choose_heading(run: MotionRun, grid: Grid, source: HeadingSource) -> Heading:
-    """The gyro's heading where it agrees with the poses, else the poses' own."""
+    """Heading of the gyro if it agrees with the poses, else of the poses."""
     track = run.track
     fit = run.gyro_fit if source is HeadingSource.AUTO else None
     if fit is None or run.gyro is None:
@@ -297,7 +297,7 @@ def choose_heading(run: MotionRun, grid: Grid, source: HeadingSource) -> Heading
 
 
 def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | None = None) -> Floats:
-    """Slow part of the difference between two headings, within segments and spans [rad], shape (n,).
+    """Slow part of the difference of two headings, within segments and spans [rad], shape (n,).
 
     Args:
         track: the poses.
@@ -316,7 +316,7 @@ def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | No
 
 
 def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out is a reason
-    """Compare turning over half a second; None where there is no gyro, little turning, or no agreement."""
+    """Compare turns over half a second; None without a gyro, with little turning, or without agreement."""
     if run.gyro is None:
         return None
     times, rate = run.gyro
@@ -358,7 +358,7 @@ def _refine(
     turned: Floats,
     values: tuple[float, float, float],
 ) -> tuple[float, float, float, float]:
-    """Scale, bias and delay by robust Gauss-Newton steps; and the delay's standard error.
+    """Scale, bias and delay by robust Gauss-Newton steps, with the standard error of the delay.
 
     Args:
         gyro: times [s] and integrated rate [rad], each of shape (m,).
@@ -396,7 +396,7 @@ def _refine(
 
 
 def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tuple[float, float]:
-    """Scale and bias [rad/s] by headings over stretches of ten seconds, each with an offset of its own.
+    """Scale and bias [rad/s] from headings over stretches of ten seconds, each with its own offset.
 
     Over half a second a pose that grows older while it turns has turned too little; over ten that is nothing.
 
@@ -427,7 +427,7 @@ def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tup
 
 
 def _measure_cover(times: Floats, at: Floats) -> float:
-    """Share of some moments beside which the gyro spoke: one that fell silent half-way is no heading."""
+    """Share of times with a gyro message nearby: a gyro that stopped half-way is no source of heading."""
     next_one = np.minimum(np.searchsorted(times, at), times.size - 1)
     nearest = np.minimum(np.abs(times[next_one] - at), np.abs(times[np.maximum(next_one - 1, 0)] - at))
     return float(np.mean(nearest < SILENT_S))
@@ -447,12 +447,12 @@ def _pair_up(track: Track, run: MotionRun) -> tuple[Ints, Ints]:
 
 
 def has_excluded(excluded: Floats, start: Floats, end: Floats) -> Flags:
-    """Whether a barred sample lies in each closed interval."""
+    """Whether each closed interval contains an excluded sample."""
     return np.searchsorted(excluded, end + 1e-9) > np.searchsorted(excluded, start - 1e-9)
 
 
 def mark_excluded(run: MotionRun, times: Floats) -> Flags:
-    """Whether a barred sample lies beside each time."""
+    """Whether an excluded sample is next to each time."""
     return has_excluded(run.excluded, times - 0.05, times + 0.05)
 
 

@@ -1,4 +1,4 @@
-"""One run as arrays, ready for models: commands, wheels, poses, gyro, and the stretches that count."""
+"""A run as arrays for models: commands, wheels, poses, gyro and the stretches to compare."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 class MotionError(SlipError):
-    """A model, an effect, a formula or a fit that cannot be, in one line."""
+    """Error of a model, an effect, a formula or a fit."""
 
 
 # One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count.
@@ -32,18 +32,18 @@ class MotionError(SlipError):
 # it was aligned (stage `align`); nothing is corrected here.
 
 _DEAD = 1e-9
-"""Wheel speed [rad/s] below which a log's wheels are dead: rounding."""
+"""Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
 _REPEATED_SHARE = 0.2
 """Share of repeated poses from which on the stamps' period is an uncertainty of their time: the recordings
 have none, or 0.49 to 0.80."""
 _ROLLS = 0.3
-"""Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 of a Warthog."""
+"""Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 cm/s of a Warthog."""
 _INPUTS = ("command", "measured")
 
 
 @dataclass(frozen=True)
 class Track:
-    """Poses that carry information, in the plane the body moves in.
+    """Poses with new information, in the plane of motion.
 
     Attributes:
         times: stamps [s], shape (n,).
@@ -86,13 +86,13 @@ class GyroFit:
     moved_s: float = 0.0
 
     def turn(self, times: Floats, rate: Floats) -> Floats:
-        """Angle that the gyro has turned by [rad], of its own rate [rad/s] at times [s], shape (n,)."""
+        """Integrated angle of the gyro [rad] from its rate [rad/s] at times [s], shape (n,)."""
         return self.signed_scale * arrays.integrate_rate(times, rate) + self.bias * times
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the clocks, scales and signs of a recording were corrected.
+    """Corrections of the clocks, scales and signs of a recording.
 
     Attributes:
         hold_s: how long after its last command the controller stops; None without commands.
@@ -156,28 +156,28 @@ class MotionRun:
 
     @property
     def start_s(self) -> float:
-        """When its first stream begins [s]."""
+        """Start of its first stream [s]."""
         return float(self.streams[0])
 
     @property
     def gyro_fit(self) -> GyroFit | None:
-        """How the gyro fits the poses; None without a good one."""
+        """Fit of the gyro to the poses; None without a good one."""
         return self.alignment.gyro
 
     @property
     def wheel_period_s(self) -> float:
-        """Median time between two readings of the wheels [s]; zero without wheels."""
+        """Median period of the wheel measurements [s]; zero without wheels."""
         return 0.0 if self.wheels is None else float(np.median(np.diff(self.wheels.times)))
 
     def correct_vehicle(self, vehicle: Vehicle) -> Vehicle:
-        """A vehicle with the controller's track multiplier that this recording shows."""
+        """The vehicle with the track multiplier of the controller in this recording."""
         return msgspec.structs.replace(vehicle, controller_track_multiplier=self.alignment.track_multiplier)
 
 
 def load_run(
     tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, *, name: str, sha256: str = ""
 ) -> MotionRun:
-    """Make a run of its aligned tables.
+    """Make a run from its aligned tables.
 
     Args:
         tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `findings`, and `slip` (for steps and
@@ -200,7 +200,7 @@ def load_run(
 def make_run(
     tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, *, name: str, sha256: str = ""
 ) -> MotionRun:
-    """As `load_run`, with an alignment that is being made.
+    """As `load_run`, with an alignment that is not yet stored.
 
     Raises:
         MotionError: ``no_poses``.
@@ -252,7 +252,7 @@ def _measure_repeats(poses: pl.DataFrame) -> float:
 
 
 def read_alignment(table: pl.DataFrame) -> Alignment:
-    """The one row of table `alignments`."""
+    """The only row of table `alignments`."""
     row = table.row(0, named=True)
     gyro = None
     if row["gyro_scale"] is not None:
@@ -274,7 +274,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
 
 
 def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
-    """Table `alignments` of one run, without the run's columns."""
+    """Table `alignments` of one run, without the columns of the run."""
     from pipeline.core.tables import tabulate  # noqa: PLC0415 - only where tables are written
 
     row = {
@@ -322,7 +322,7 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
 
 
 def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
-    """Repeats of a pose that are shorter than any rest while wheels turn: a localization that waits.
+    """Short repeats of a pose while wheels turn: a localization that waits.
 
     Args:
         times: stamps of a segment's poses [s], shape (n,).
@@ -339,7 +339,7 @@ def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: In
 
 
 def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
-    """One segment's poses, rolled out into the plane of motion; headings go on from the segment before.
+    """Poses of one segment in the plane of motion; headings continue from the previous segment.
 
     How often a heading has gone round since the map's x axis must not matter between segments.
     """
@@ -365,7 +365,7 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
 
 
 def read_wheel_times(table: pl.DataFrame) -> Floats:
-    """When the drive did what a table says [s]: its stamps, less how late they are where that is known."""
+    """Times of the rows of a table [s]: its stamps minus their delay, if known."""
     times = table["t"].to_numpy()
     return times - table["latency"].to_numpy() if "latency" in table.columns else times
 
@@ -409,7 +409,7 @@ def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
 
 
 def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:
-    """Where steps start, and times of samples that must not be scored, of all that was recorded."""
+    """Starts of steps and times of excluded samples, of the whole recording."""
     if slip is None or slip.is_empty():
         return np.zeros(0), np.zeros(0)
     leading = "command" if (slip["input"] == "command").any() else "measured"

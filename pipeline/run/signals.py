@@ -30,7 +30,7 @@ Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 @dataclass(frozen=True)
 class DriveSeries:
-    """What wheels were told, or did, at stamps.
+    """Commanded or measured wheel speeds at stamps.
 
     Attributes:
         times: stamps [s], increasing, shape (n,).
@@ -47,26 +47,26 @@ class DriveSeries:
     sideways: Floats | None = None
 
     def change(self, times: Floats, change: Callable[[Floats], Floats]) -> DriveSeries:
-        """The series at other stamps, each signal changed alike."""
+        """The series at other stamps, with the same change of each signal."""
         sideways = None if self.sideways is None else change(self.sideways)
         return DriveSeries(times, change(self.left), change(self.right), change(self.steering), sideways)
 
 
 class Commands(DriveSeries):
-    """Held commands: each value counts from its stamp to the next."""
+    """Held commands: each value applies from its stamp to the next."""
 
     def change_wheels(self, left: Floats, right: Floats) -> Commands:
-        """The same commands with other mean wheel speeds of the sides."""
+        """The commands with other mean wheel speeds of the sides."""
         return replace(self, left=left, right=right)
 
     def change_each_wheel(self, change: Callable[[Floats], Floats]) -> Commands:
-        """The same commands with the speed of every single wheel changed."""
+        """The commands with the speed of every wheel changed."""
         return replace(self, **_join_wheels([change(wheel) for wheel in split_wheels(self)]))
 
 
 @dataclass(frozen=True)
 class Wheels:
-    """What the drivetrain's output does, on cells.
+    """Output of the drivetrain on cells.
 
     Attributes:
         left, right: wheel speeds [rad/s], shape (n,).
@@ -84,15 +84,15 @@ class Wheels:
     straight: Floats | None = None
 
     def stack(self) -> Floats:
-        """Left, right and sideways [rad/s] side by side, shape (n, 3)."""
+        """Columns left, right and sideways [rad/s], shape (n, 3)."""
         sideways = np.zeros_like(self.left) if self.sideways is None else self.sideways
         return np.column_stack((self.left, self.right, sideways))
 
     def change_each_wheel(self, change: Callable[[Floats, Floats], Floats], start: Floats) -> Wheels:
-        """The same with the speed of every single wheel changed, each from a state of its own.
+        """The output with the speed of every wheel changed, each from its own state.
 
         Args:
-            change: of a wheel's speed, shape (n,), and its state at every reset, shape (k,).
+            change: function of the speed of a wheel, shape (n,), and its state at every reset, shape (k,).
             start: left, right and sideways at every reset, shape (k, 3).
         """
         sideways = None if self.sideways is None else start[:, 2]
@@ -110,7 +110,7 @@ def split_wheels(drive: Drive) -> list[Floats]:
 
 
 def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Floats]:
-    """The inverse of `split_wheels`, by name; a combination of four wheels that moves nothing is dropped."""
+    """Inverse of `split_wheels`, by name; the combination of four wheels without motion is dropped."""
     if len(wheels) == 2:  # noqa: PLR2004 - one a side
         return {"left": wheels[0], "right": wheels[1]}
     front_left, front_right, rear_left, rear_right = wheels
@@ -122,7 +122,7 @@ def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Floats]:
 
 
 def find_fastest_wheel(drive: Drive) -> Floats:
-    """Speed of the fastest wheel [rad/s], never negative, shape (n,)."""
+    """Absolute speed of the fastest wheel [rad/s], shape (n,)."""
     fastest: Floats = np.maximum(np.abs(drive.left), np.abs(drive.right))
     return fastest if drive.sideways is None else fastest + np.abs(drive.sideways)
 
@@ -145,11 +145,11 @@ class Rolling:
 
     @property
     def velocity(self) -> Velocity:
-        """The same as a velocity of the body."""
+        """The rolling velocity as a velocity of the body."""
         return Velocity(self.v0, np.zeros_like(self.v0) + self.s0, self.w0)
 
     def scale(self, along: Floats | float, turning: Floats | float) -> Rolling:
-        """Rolling with the speed, whichever way it goes, and the yaw rate multiplied."""
+        """Rolling with the speed in every direction and the yaw rate multiplied."""
         return Rolling(self.v0 * along, self.w0 * turning, self.wheels, self.s0 * along)
 
 
@@ -167,7 +167,7 @@ class Velocity:
         y: Floats | float | None = None,
         w: Floats | float | None = None,
     ) -> Velocity:
-        """Velocity with something added; None leaves a channel alone."""
+        """Velocity with an addition; None leaves a channel unchanged."""
         return Velocity(
             self.x if x is None else self.x + x,
             self.y if y is None else self.y + y,
@@ -177,7 +177,7 @@ class Velocity:
 
 @dataclass(frozen=True)
 class Resets:
-    """Where internal states begin anew, and with what.
+    """Resets of internal states, and their start values.
 
     Attributes:
         number: which reset each cell follows, shape (n,).
@@ -194,7 +194,7 @@ class Resets:
 
 @dataclass(frozen=True)
 class RunContext:
-    """What an effect may know of a run beside the signal it acts on.
+    """Data of a run that an effect may use besides the signal it acts on.
 
     Attributes:
         vehicle: geometry.
@@ -222,20 +222,20 @@ class RunContext:
 
     @cached_property
     def from_start(self) -> Floats:
-        """x, y [m] and yaw [rad] in the frame of the run's first pose, which no map's axes enter, (n, 3)."""
+        """x, y [m] and yaw [rad] in the frame of the first pose, independent of the map, shape (n, 3)."""
         yaw = self.attitude[:, 2] - self.attitude[0, 2]
         moved = (self.position - self.position[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
         return np.column_stack((moved.real, moved.imag, yaw))
 
     @property
     def slope_rad(self) -> float:
-        """Half of what pitch varies by for nine tenths of the run [rad]."""
+        """Half of the range of pitch over nine tenths of the run [rad]."""
         low, high = np.quantile(self.attitude[:, 1], (0.05, 0.95))
         return 0.5 * float(high - low)
 
     @property
     def track_m(self) -> float:
-        """Nominal width over which a difference between the sides turns the vehicle [m]; one without."""
+        """Nominal track width of a difference between the sides [m]; 1 if there is none."""
         return self.vehicle.kinematics.turning_width_m(self.vehicle)
 
 
@@ -252,17 +252,17 @@ ANSWERS_S = 2.0
 """Time [s] in which a drive does what it is asked: longer than dead times and pauses; of a step behind a lag
 of 1.2 s, 19 % are left."""
 LEAST_RIM_SPEED = 0.01
-"""Speed [m/s] of the fastest rim from which on effects of a vehicle that drives act."""
+"""Speed of the fastest rim [m/s] above which effects of driving act."""
 
 
 def find_turning(wheels: Wheels, context: RunContext) -> Floats:
-    """One where the wheels turn, zero where they stand, shape (n,)."""
+    """One where the wheels turn, zero where they are at rest, shape (n,)."""
     rim = context.vehicle.wheel_radius_m * find_fastest_wheel(wheels)
     return (rim > LEAST_RIM_SPEED).astype(np.float64)
 
 
 def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
-    """The signals of a drive by the names under which kinematics ask for them."""
+    """Signals of a drive by their names in the kinematics."""
     named = {"left": drive.left, "right": drive.right, "steering": drive.steering}
     if vehicle.kinematics.has_inputs("speed"):
         named["speed"] = 0.5 * vehicle.wheel_radius_m * (drive.left + drive.right)
@@ -277,7 +277,7 @@ def roll_ideally(wheels: Wheels, context: RunContext) -> Rolling:
 
 
 def earlier_in_span(context: RunContext, late: float) -> Flags:
-    """Whether the time ``late`` seconds before each cell lies in the same span (after it, when negative)."""
+    """Whether the time ``late`` seconds before each cell (after it, if negative) lies in the same span."""
     spans = context.spans
     last = np.append(spans.first[1:], context.times.size) - 1
     at = context.times - late

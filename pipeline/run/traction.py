@@ -1,4 +1,4 @@
-"""Traction at a moment: whether wheels dig in or spin, or a body slides, by the last seconds."""
+"""Traction over time: whether wheels dig in or spin, or the body slides, from the last seconds."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ LEAST_SHARE = 0.125
 """Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground. Also the least
 gain that a limit is divided by."""
 MARGIN_SHARE = 0.25
-"""Of it, by which a body must be faster than its wheels: lags and poses that wander stay below."""
+"""Share of it by which a body must be faster than its wheels: lags and drifting poses stay below."""
 
 
 def find_limits(top: float, gain: float) -> Limits:
@@ -83,7 +83,7 @@ def trace_traction(
     sudden_s: float,
     hold_s: float,
 ) -> list[int]:
-    """What the wheels do at every step: 0 drive, 1 dig in, 2 spin, 3 slide.
+    """State of the wheels at every step: 0 drive, 1 dig in, 2 spin, 3 slide.
 
     Args:
         wheels: forward speed that the wheels usually bring when they turn as they do [m/s].

@@ -1,4 +1,4 @@
-"""What of a run is compared: displacements, predictions over two seconds, first and last stretches."""
+"""Compared parts of a run: displacements, predictions over two seconds, first and last stretches."""
 
 from dataclasses import dataclass, replace
 
@@ -18,23 +18,23 @@ from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 
 WINDOW_S = SPAN_S
 """Span of the displacements that models are fitted to [s]: the noise of poses is a larger share of shorter
-ones, and longer ones tell less of lags."""
+ones, and longer ones are less sensitive to lags."""
 HORIZON_S = 2.0
 """Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25
 """Step between means of poses [s]: windows overlap by half."""
 _GATHER_S = 0.066
-"""Half the width over which poses are averaged [s]: three of 20 Hz, whose noise falls, while no motion of
-half a second does."""
+"""Half-width of the mean over poses [s]: of three poses at 20 Hz, which reduces noise and no motion of half a
+second."""
 _DENSE_S = 0.08
-"""Median period of poses [s] above which each stands alone: a mean over 0.13 s would hold one or two."""
+"""Median period of poses [s] above which they are not averaged: 0.13 s would contain one or two."""
 _LEAD_S = 0.5
-"""First moments of a span [s] that are not compared where no encoder says what the drive did before: a lag of
-0.5 s fades to a third."""
+"""Start of a span that is not compared without encoders [s], as the state of the drive is unknown: that of a
+lag of 0.5 s decays to a third."""
 _LEAST_LEAD_S = 0.02
-"""The same beside encoders [s], after the poses' delay: two of their periods at 100 Hz, one at 50."""
+"""`_LEAD_S` with encoders [s], after the delay of the poses: two of their periods at 100 Hz, one at 50 Hz."""
 _SHORTEST_BLOCK_S = 5.0
-"""Shortest block [s]: several times what residuals remember (about a second)."""
+"""Shortest block [s]: several times the correlation time of residuals (about a second)."""
 _LONGEST_BLOCK_S = 12.0
 """Longest block [s]: above it, a block is cut into pieces of half of it and more, so that a run of one
 command step has folds, too."""
@@ -46,7 +46,7 @@ class Nodes:
 
     Attributes:
         poses: indices into the track of all members, shape (m,).
-        first: place in `poses` where each group begins, shape (n,).
+        first: index in `poses` of the first member of each group, shape (n,).
         count: members of each group, shape (n,).
         times: mean stamp of each group [s], shape (n,).
         piece: number of the stretch without segment end or hole, shape (n,).
@@ -86,7 +86,7 @@ class Windows:
 
 @dataclass(frozen=True)
 class Horizons:
-    """Predictions of up to two seconds: one row a node reached.
+    """Predictions of up to two seconds: one row per predicted node.
 
     Attributes:
         origin: node predicted from, shape (n,).
@@ -104,7 +104,7 @@ class Horizons:
 
 
 def gather_nodes(track: Track, grid: Grid) -> Nodes:
-    """Gather poses: means over 0.13 s every quarter of a second, or single poses where they are rare."""
+    """Group poses: means over 0.13 s every quarter of a second, or single poses if they are rare."""
     span = grid.find_span(track.times)
     cut = (np.diff(track.segment) != 0) | (np.diff(span) != 0)
     piece = np.concatenate(([0], np.cumsum(cut)))
@@ -150,7 +150,7 @@ def number_blocks(run: MotionRun, grid: Grid) -> Floats:
 
 
 def find_lead(run: MotionRun, delay_s: float) -> float:
-    """How long after its start a span is not compared [s].
+    """Time after the start of a span that is not compared [s].
 
     Where encoders say what the wheels did when the recording began, only the delay of the poses must pass:
     they report what happened before. Without them the state of the drive must settle first.
@@ -179,7 +179,7 @@ def join_windows(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Win
 
 
 def join_horizons(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Horizons:
-    """Predictions of two seconds, one after the other."""
+    """Consecutive predictions of two seconds."""
     ends = nodes.times + HORIZON_S
     last = np.searchsorted(nodes.times, ends + 0.13, side="right") - 1
     origin = np.arange(nodes.times.size)
@@ -203,7 +203,7 @@ def join_horizons(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Ho
 
 
 def _is_clean(run: MotionRun, grid: Grid, nodes: Nodes, ends: tuple[Ints, Ints], lead_s: float) -> Flags:
-    """Whether a stretch stays in one piece, clear of what is barred and of its span's first moments."""
+    """Whether a stretch lies in one piece, without excluded times and the start of its span."""
     start, end = ends
     begin, stop = nodes.times[start], nodes.times[end]
     clean = (nodes.piece[start] == nodes.piece[end]) & ~has_excluded(run.excluded, begin, stop)
@@ -213,11 +213,11 @@ def _is_clean(run: MotionRun, grid: Grid, nodes: Nodes, ends: tuple[Ints, Ints],
 
 
 _STANDING = 0.02
-"""Share of the fastest speed below which wheels stand."""
+"""Share of the fastest speed below which wheels are at rest."""
 
 
 def find_driven(run: MotionRun, driven_s: float) -> float:
-    """Stamp [s] at which a run has been driven for so long [s]: wheels turn or are told to, poses are known.
+    """Stamp [s] after a duration of driving [s]: wheels turn or are commanded to, and poses are known.
 
     Raises:
         MotionError: ``too_short``: it was not.
@@ -239,7 +239,7 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
 
 
 def cut_run(run: MotionRun, begin_s: float = -np.inf, end_s: float = np.inf) -> MotionRun:
-    """The run of which only poses from one stamp to another [s] count; what came before is still known.
+    """The run with only the poses between two stamps [s]; earlier inputs are still known.
 
     Recorded series end with the stretch: a fit to the first seconds of a run sees nothing of the rest but how
     its clocks were aligned.
@@ -275,7 +275,7 @@ def find_gaps(
     turned: Floats,
     span_s: Floats,
 ) -> Floats:
-    """Measured less predicted displacement of windows between nodes, over their length.
+    """Measured minus predicted displacement of windows between nodes, divided by their length.
 
     Args:
         x: predicted velocity forward on cells [m/s], shape (n,).
