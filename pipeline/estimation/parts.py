@@ -272,13 +272,13 @@ class Part(ABC):
         for index, number in enumerate(free):
             rows = slice(None) if number.run is None else self.run == number.run
             value, (low, high) = state.get(number), number.bounds
-            step = _NARROW * number.step if both_sides else number.step
-            above, below = value + step, value - step
+            above, below = value + _NARROW * number.step, value - _NARROW * number.step
             if both_sides and low <= below and above <= high:
                 change = self._look(state, number, below) - self._look(state, number, above)
                 columns[rows, :, index] = change / (above - below)
             else:
-                at = above if above <= high else below
+                # At a bound, the influence of a parameter may grow with its square.
+                at = value + number.step if value + number.step <= high else value - number.step
                 columns[rows, :, index] = (residual[rows] - self._look(state, number, at)) / (at - value)
         return columns
 
