@@ -52,14 +52,14 @@ ROUNDING_S = 1e-6
 SILENT_S = 0.25
 """Time from the nearest message [s] above which wheel and gyro signals are unknown: `PERIODS` at 20 Hz."""
 _FEWEST_POINTS = 4
-"""Minimum number of poses of a quadratic fit: one more than its coefficients, to average noise. Eight smooth
-slow poses more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
+"""Minimum number of poses of a quadratic fit: its coefficients plus one, to average noise. With eight, slow
+poses are smoothed more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
 _BLOCK = 4096
 """Number of queries fitted at a time, which limits memory; results do not depend on it."""
 _SHORTEST_HOLD_S = 0.5
-"""Default cmd_vel_timeout of diff_drive_controller [s]; `hold_s` of the configuration replaces it."""
+"""Default cmd_vel_timeout of diff_drive_controller [s]; `command.hold_s` of the configuration replaces it."""
 PERIODS = 5.0
-"""Number of median periods after which a message is missing, not late; with half of it, two lost messages
+"""Number of typical periods after which a message is missing, not late; with half of it, two lost messages
 stop a vehicle."""
 _SHORTEST_PERIOD = 1e-3
 """Assumed period of samples with equal stamps [s]."""

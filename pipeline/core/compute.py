@@ -27,8 +27,8 @@ if TYPE_CHECKING:
 
 # Independent computations on two cores, with the same results in the same order as one after the other.
 #
-# Within `both_cores` a process that was forked from this one works beside it: it has in memory all that this
-# one had. Where there can be none (one core, no Linux, a worker, a thread of a server) all is done here.
+# Within `both_cores` a process forked from this one works in parallel, with a copy of its memory. If no fork
+# is possible (one core, no Linux, a worker, a thread of a server), this process does all the work.
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -81,7 +81,7 @@ def measure_cpu() -> float:
 def both_cores(shared: Sequence[object]) -> Iterator[None]:
     """Let `map_parallel` use two processes.
 
-    Libraries use one thread meanwhile: their order of summation would depend on the number of cores.
+    Libraries use one thread meanwhile: else their order of summation would depend on the number of cores.
 
     Args:
         shared: large objects referenced by functions, items and results, which are not copied.
@@ -125,7 +125,7 @@ def _fork(shared: Sequence[object]) -> _Beside | None:
         line, theirs = Pipe()
         pid = os.fork()
     except OSError:
-        # A machine without room for another process.
+        # The machine has no resources for another process.
         for end in ends:
             os.close(end)
         return None

@@ -39,7 +39,7 @@ def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, obje
 def _take_number(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
-    # Of an integer, too: one of 400 digits is no double.
+    # Integers as well: one of 400 digits exceeds the range of a double.
     return float(value) if abs(value) <= sys.float_info.max else None
 
 

@@ -112,7 +112,7 @@ class Loop(Generic[Given]):
                 if os.fstat(file.fileno()).st_uid not in believed:
                     continue
                 with suppress(OSError):
-                    # Not every file system notes what is read.
+                    # Not every file system records the last access.
                     os.utime(file.fileno())
                 content = file.read()
                 code = content[_DIGEST_BYTES:]
@@ -143,8 +143,8 @@ def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[G
     """Decorator that runs a loop as machine code.
 
     Args:
-        signature: types of its arguments, for example ``float64[:, :], int64``; empty for what only other
-            loops of its file call.
+        signature: types of its arguments, for example ``float64[:, :], int64``; empty for a loop that only
+            other loops of its file call.
     """
 
     def decorate(function: Callable[Given, Any]) -> Callable[Given, Any]:
@@ -157,7 +157,7 @@ def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[G
 
 
 def compile_loops() -> Iterator[str]:
-    """Compile all imported loops without machine code; returns their names."""
+    """Compile the imported loops that have no machine code yet; yields the name of each compiled loop."""
     for loop in _loops:
         if loop.is_compiled:
             yield loop.name
@@ -242,7 +242,7 @@ def _write_entry(inner: str, arguments: list[tuple[str, int]]) -> str:
     An array object has the layout of NumPy's C interface (``PyArrayObject``): data, number of axes, lengths
     and strides, 8 bytes each, after the header of every object.
     """
-    # The loop writes that it returns nothing, and where an error is described.
+    # Output pointers of the loop: its (empty) return value and the description of an error.
     taken, passed = [], ["ptr %nothing", "ptr %error"]
     lines = ["%nothing = alloca ptr", "%error = alloca ptr"]
     for number, (kind, axes) in enumerate(arguments):

@@ -23,7 +23,7 @@ _TINY = 1e-300
 """Replacement of a zero divisor in Lentz's method: the smallest double is 2e-308."""
 _ROOT_HALF = math.sqrt(0.5)
 _ROUNDS = 1000
-"""Maximum number of steps, as a guard. Both loops end by `_EXACT`, the fraction in about sqrt(`_MANY`)."""
+"""Maximum number of steps, a guard. Both loops end by `_EXACT`, the fraction in about sqrt(`_MANY`) steps."""
 _EXACT = 1e-12
 """Relative change of the result by the last step."""
 
@@ -37,8 +37,8 @@ def student_quantile(level: float, freedom: float) -> float:
         freedom: degrees of freedom, any number above 0.
 
     Sources: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5 for many degrees of freedom;
-    else Newton's method on the tail, which is convex, from that series, or of few degrees of freedom from the
-    normal quantile, which lies below.
+    else Newton's method on the tail, which is convex, starting from that series, or for few degrees of
+    freedom from the normal quantile, which is smaller.
     """
     if not freedom > 0.0:
         return math.nan
@@ -131,7 +131,7 @@ def solve_nonnegative(design: Floats, target: Floats) -> Floats:
         free[int(push.argmax())] = True
         solved = _solve_free(design, target, free)
         while (solved[free] <= 0.0).any():
-            # As far towards the solution as no number falls below zero; those that reach it stay there.
+            # Longest step towards the solution without negative numbers; those that reach zero are fixed.
             falling = free & (solved <= 0.0)
             share = float(np.min(numbers[falling] / (numbers[falling] - solved[falling])))
             numbers += share * (solved - numbers)
@@ -171,7 +171,7 @@ def _solve_tridiagonal(diagonal: Floats, beside: Floats, solution: Floats) -> No
         diagonal[row] -= share * beside[row - 1]
         solution[row] -= share * solution[row - 1]
     for row in range(diagonal.size - 1, -1, -1):
-        # No row of an empty system may be written: there is no memory for it.
+        # Also the last row is solved in the loop: an empty system has no memory to write to.
         if row + 1 < diagonal.size:
             solution[row] -= beside[row] * solution[row + 1]
         solution[row] /= diagonal[row]

@@ -34,7 +34,7 @@ class SlipError(Exception):
     def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
         super().__init__(what)
         self.code = code
-        # What a file says is repeated in errors, and files may say anything at any length.
+        # Errors quote files, whose texts may have any length.
         self.what = shorten(what, _LONGEST)
         self.where = where
         self.hint = hint
@@ -169,7 +169,7 @@ PACKAGE = "slip-pipeline"
 
 def read_version() -> str:
     """Version of the installed package; in a checkout that is not installed, the declared one."""
-    # Every call of the program passes here, and few ask for the version.
+    # Every call of the program imports this module, and few need the version.
     import importlib.metadata  # noqa: PLC0415
     import tomllib  # noqa: PLC0415
 
@@ -181,12 +181,11 @@ def read_version() -> str:
         return str(content["project"]["version"])
 
 
-# Starting Python again, for work in a process of its own, without looking into the current folder.
+# Starting Python in a separate process, without imports from the current folder.
 #
-# ``python -c`` and ``python -m`` put the current folder before the standard library: a `tempfile.py` that
-# came with somebody's logs would run. ``-P`` leaves that folder out. ``-I`` would also drop PYTHONPATH and
-# the site packages of the user, which are the user's word, not a stranger's, and by which slip itself may be
-# installed.
+# ``python -c`` and ``python -m`` search the current folder before the standard library: a `tempfile.py` in a
+# folder with untrusted logs would run. ``-P`` excludes that folder. ``-I`` would also exclude PYTHONPATH and
+# the site packages of the user, which are trusted and may contain slip itself.
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
 """Environment variables with the number of threads of numerical libraries."""
@@ -196,7 +195,7 @@ _ORPHAN_PERIOD_S = 0.5
 
 
 def python_command(*words: str) -> list[str]:
-    """Command line of this interpreter, by its absolute path, without the current folder in its path.
+    """Command line of this interpreter, by its absolute path, without the current folder in its import path.
 
     Args:
         words: arguments, such as ``-m pipeline batch``.
@@ -214,7 +213,7 @@ def slip_command(*words: str) -> list[str]:
 
 
 def keep_current_folder_out() -> None:
-    """Exclude the current folder from the path of Python processes started by libraries."""
+    """Exclude the current folder from the import path of Python processes started by libraries."""
     os.environ["PYTHONSAFEPATH"] = "1"
 
 
@@ -222,7 +221,7 @@ def end_with(parent: int) -> None:
     """End this process when the one that started it is killed.
 
     Args:
-        parent: number of that process.
+        parent: id of that process.
     """
     threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
 

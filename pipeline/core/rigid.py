@@ -1,4 +1,4 @@
-"""Rigid motions in the plane and in space, and series of poses cut where something broke."""
+"""Rigid motions in the plane and in space, and segmentation of pose series."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def rotate(quaternion: Floats, vector: Floats) -> Floats:
 
 
 def rotation_vectors(quaternion: Floats) -> Floats:
-    """Logarithm of unit quaternions (n, 4): rotation vectors (n, 3) [rad], the short way round."""
+    """Logarithm of unit quaternions (n, 4): rotation vectors (n, 3) [rad] of at most pi."""
     flipped = np.where(quaternion[..., 3:] < 0.0, -quaternion, quaternion)
     sine = np.linalg.norm(flipped[..., :3], axis=-1, keepdims=True)
     angle = 2.0 * np.arctan2(sine, flipped[..., 3:])
@@ -135,33 +135,33 @@ def interpolate_poses(
     return between, slerp(quaternion[before], quaternion[before + 1], fraction)
 
 
-# Cutting a series of poses where something broke: holes in time, jumps of the pose.
+# Segmentation of a series of poses at gaps in time and jumps of the pose.
 #
-# A segment is a stretch in which time runs forward without a hole and the pose moves continuously. Nothing is
-# interpolated or differentiated across a segment's ends.
+# In a segment, time increases without a gap and the pose is continuous. Nothing is interpolated or
+# differentiated across the ends of a segment.
 
 _SIDE = 4
-"""Poses on each side of a jump: with two of them a line and a step take three of the four numbers there
-are."""
+"""Number of poses on each side of a jump: with two, a line and a step use three of the four degrees of
+freedom."""
 _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
-"""What a step leaves, over what a bend leaves, from which on it was a bend; half or double of it change no
-finding of three recordings (`benchmarks/constants.py`)."""
+"""Ratio of the squared residuals of a step to those of a bend above which it is a bend; half or double change
+no finding of three recordings (`benchmarks/constants.py`)."""
 LONGEST_WAIT_S = 1.5
-"""Longest time [s] between two poses in which a localization waits; after longer ones nobody knows whether it
-waited or the vehicle stood. On the recordings 99 of 100 times are up to 1.2 s. Half and double change no
-finding of two recordings."""
+"""Longest time between two poses of a waiting localization [s]; above it, waiting and a vehicle at rest are
+not distinguishable. On the recordings 99 of 100 times are at most 1.2 s. Half and double change no finding of
+two recordings."""
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
 def find_gaps(times: Floats, smallest: float) -> Flags:
-    """Whether a hole in time lies before each sample.
+    """Whether a gap in time precedes each sample.
 
-    A hole is longer than three median periods and than ``smallest`` [s].
+    A gap is longer than three median periods and than ``smallest`` [s].
 
     Args:
         times: sample times [s], shape (n,), increasing.
-        smallest: the shortest hole that counts [s].
+        smallest: minimum length of a gap [s].
 
     Returns:
         Flags of shape (n,); the first is False.
@@ -174,7 +174,7 @@ def find_gaps(times: Floats, smallest: float) -> Flags:
 
 
 def find_held(position: Floats, quaternion: Floats) -> Flags:
-    """Whether each pose repeats the one before it exactly; shapes (n, 3), (n, 4) -> (n,)."""
+    """Whether each pose is identical to the previous one; shapes (n, 3), (n, 4) -> (n,)."""
     same = np.all(np.diff(position, axis=0) == 0.0, axis=1) & np.all(
         np.diff(quaternion, axis=0) == 0.0, axis=1
     )
@@ -184,13 +184,13 @@ def find_held(position: Floats, quaternion: Floats) -> Flags:
 def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     """Indices of the poses that carry information: those that changed, and those of a vehicle at rest.
 
-    A localization slower than its topic repeats its last estimate; such repeats are dropped. A vehicle that
-    stands still repeats its pose too, for longer than the localization ever waits: those repeats are kept,
-    but for the last waiting time before the next change, which may be old again.
+    A localization slower than its topic repeats its last estimate; such repeats are dropped. A vehicle at
+    rest also repeats its pose, for longer than any wait of the localization: these repeats are retained,
+    except in the last waiting time before the next change, where they may be outdated.
 
     Args:
         times: sample times [s], shape (n,).
-        held: repeats of the pose before, shape (n,).
+        held: whether each pose repeats the previous one, shape (n,).
     """
     fresh = np.flatnonzero(~held)
     if fresh.size == held.size:
@@ -202,9 +202,9 @@ def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     longest_wait = 3.0 * float(np.median(waits))
     previous = np.maximum.accumulate(np.where(held, 0, np.arange(held.size)))
     following = np.searchsorted(fresh, np.arange(held.size), side="right")
-    # Nobody saw the next change after the last repeat: it may have come at once.
+    # The next change after the last repeat is not recorded: it may follow at once.
     next_fresh = np.append(times[fresh], times[-1])[following]
-    # Stamps on a raster meet these bounds exactly: rounding must not decide.
+    # Stamps on a raster coincide with these bounds: the result must not depend on rounding.
     stands = held & (next_fresh - times[previous] > longest_wait + ROUNDING_S)
     old_again = next_fresh - times < float(np.median(waits)) * 1.5 - ROUNDING_S
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
@@ -215,11 +215,11 @@ def find_jumps(
 ) -> Flags:
     """Whether the pose jumps before each sample: a correction of the map, not a motion.
 
-    A jump stays; vibration, and poses that are stamped late, come back. So the body's own odometer over four
-    poses before and four after is fitted by a straight line with a step in the middle. The step counts where
-    it exceeds eight robust standard deviations of all such steps, and the given floor plus the way travelled
-    in one and a half pose periods (a pose that a slow localization left out looks like that), and where a
-    bend, as of a vehicle that turns round at once, does not explain the poses far better.
+    A jump is permanent; vibration and late stamps are not. A straight line with a step in the middle is
+    therefore fitted to the sum of body increments over four poses before and four after. The step is a jump
+    if it exceeds both eight robust standard deviations of all such steps and the given minimum plus the
+    distance travelled in one and a half pose periods (the effect of a pose that a slow localization omits),
+    and if a bend, as of a vehicle that reverses at once, does not explain the poses far better.
 
     Args:
         times: sample times [s], shape (n,), strictly increasing.
@@ -241,7 +241,7 @@ def find_jumps(
         size = np.linalg.norm(step, axis=1)
         skipped = 1.5 * float(np.median(np.diff(times))) * np.linalg.norm(rate, axis=1)
         limit = np.maximum(8.0 * robust_spread(size), floor + skipped)
-        # The fits around a jump see it too; the jump is where the step is largest.
+        # Fits near a jump contain it too; the jump is at the largest step.
         padded = np.pad(size, _SIDE - 1)
         tallest = np.lib.stride_tricks.sliding_window_view(padded, 2 * _SIDE - 1).max(axis=1)
         large = np.flatnonzero((size > limit) & (size >= tallest))
@@ -250,7 +250,7 @@ def find_jumps(
 
 
 def _cut_windows(times: Floats, increment: Floats) -> tuple[Floats, Floats]:
-    """Times (n - 7, 8) and odometer (n - 7, 3, 8) of every 2 x 4 neighbouring poses, about their means."""
+    """Times (n - 7, 8) and odometer (n - 7, 3, 8) of all 2 x 4 consecutive poses, without their means."""
     odometer = np.concatenate((np.zeros((1, 3)), np.cumsum(increment, axis=0)))
     ways = np.lib.stride_tricks.sliding_window_view(odometer, 2 * _SIDE, axis=0)
     stamps = np.lib.stride_tricks.sliding_window_view(times, 2 * _SIDE)
@@ -258,7 +258,7 @@ def _cut_windows(times: Floats, increment: Floats) -> tuple[Floats, Floats]:
 
 
 def _is_stepped(along: Floats, ways: Floats) -> Flags:
-    """Whether no bend explains a window far better: a vehicle that starts, stops or turns round bends it."""
+    """Whether no bend explains a window far better: a vehicle that starts, stops or reverses makes a bend."""
     middle = 0.5 * (along[:, _SIDE - 1] + along[:, _SIDE])
     bend = np.abs(along - middle[:, None])
     bend = bend - bend.mean(axis=1, keepdims=True)
@@ -266,8 +266,8 @@ def _is_stepped(along: Floats, ways: Floats) -> Flags:
 
 
 def _fit_beside_line(along: Floats, shape: Floats, ways: Floats) -> tuple[Floats, Floats]:
-    """Coefficients (n, 3) of a shape (n, w) or (w,) and of the line beside it in windows (n, 3, w)."""
-    # Frisch and Waugh: the shape's coefficient is that of the shape cleared of the line.
+    """Coefficients (n, 3) of a shape (n, w) or (w,) and of a line, fitted jointly to windows (n, 3, w)."""
+    # Frisch and Waugh: the coefficient of the shape is that of its residual from the line.
     overlap = np.sum(along * shape, axis=1) / np.sum(along**2, axis=1)
     cleared = shape - along * overlap[:, None]
     size = np.einsum("nw,ncw->nc", cleared, ways) / np.sum(cleared**2, axis=1)[:, None]
@@ -276,7 +276,7 @@ def _fit_beside_line(along: Floats, shape: Floats, ways: Floats) -> tuple[Floats
 
 
 def _measure_rest(along: Floats, shape: Floats, ways: Floats) -> Floats:
-    """Squares (n,) that a shape and the line beside it leave in windows (n, 3, w)."""
+    """Sum of squared residuals (n,) of a shape and a line in windows (n, 3, w)."""
     size, slope = _fit_beside_line(along, shape, ways)
     shape = np.broadcast_to(shape, along.shape)
     remaining: Floats = ways - size[:, :, None] * shape[:, None, :] - slope[:, :, None] * along[:, None, :]
@@ -313,7 +313,7 @@ def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Fl
 
 
 def number_segments(breaks: Flags) -> Ints:
-    """Segment number of each sample from flags that say a break lies before it."""
+    """Segment number of each sample from flags of a break before it."""
     return np.cumsum(breaks, dtype=np.int64)
 
 
@@ -324,9 +324,9 @@ def find_runs(flags: Flags) -> list[tuple[int, int]]:
 
 
 def cut_segments(poses: pl.DataFrame) -> list[dict[str, NDArray[Any]]]:
-    """Table `poses` segment by segment in order of time, by column.
+    """Columns of table `poses` for each segment, in order of time.
 
-    Besides its own columns, as far as it has them, each has ``position``, shape (n, 3) [m], and
+    Besides the columns that the table contains, each segment has ``position``, shape (n, 3) [m], and
     ``quaternion``, shape (n, 4).
     """
     poses = poses.sort("segment", "t")

@@ -22,12 +22,12 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
     """A table as CSV, safe for spreadsheets: a text that looks like a formula gets a leading quote.
 
     Args:
-        frame: a table of plain columns; numbers stay as they are, negative ones too.
-        header: whether a line of names comes first.
-        digits: of numbers behind the point; None for all.
+        frame: a table without nested columns; numbers, also negative ones, are unchanged.
+        header: whether the first line contains the column names.
+        digits: number of decimal places; None for all.
 
     Raises:
-        PolarsError: CSV has no word for a column.
+        PolarsError: a column cannot be represented in CSV.
     """
     names = pl.Series(frame.columns, dtype=pl.String)
     safe = dict(zip(frame.columns, names.to_frame("").select(_quote(pl.col(""))).to_series(), strict=True))
@@ -41,5 +41,5 @@ def unquote_formulas(frame: pl.DataFrame) -> pl.DataFrame:
 
 
 def _quote(text: pl.Expr) -> pl.Expr:
-    # Quotes that are there already get one more: so the text comes back as it was.
+    # Existing leading quotes get one more, so that the original text can be restored.
     return text.str.replace(f"^('*[{_FORMULA}])", "'$1")

@@ -1,4 +1,4 @@
-"""Names, TOML files and folders that anybody may have made, read within bounds."""
+"""Bounded reading of untrusted names, TOML files and folders."""
 
 from __future__ import annotations
 
@@ -14,37 +14,37 @@ from typing import TYPE_CHECKING, Final, TypeVar
 
 from pipeline.core.program import SlipError, shorten
 
-# Names from outside as paths: of objects, of members of a recording, in manifests, from a browser.
+# Untrusted names as paths: of objects, of members of a recording, in manifests, from a browser.
 #
-# Whoever writes such a name decides where a file is read or written, unless it is held inside the folder that
-# it belongs to. Every such name goes through `resolve_inside`.
+# Without a check, the author of such a name decides where a file is read or written. `resolve_inside` checks
+# every such name and confines it to its folder.
 
 if TYPE_CHECKING:
     AnyPath = TypeVar("AnyPath", bound=Path)
 
 _LONGEST_PART = 255
-"""Bytes of a file's name on Linux (NAME_MAX)."""
+"""Maximum length of a file name on Linux [bytes] (NAME_MAX)."""
 _LONGEST_PATH = 4095
-"""Bytes of a path on Linux (PATH_MAX, less the zero at its end)."""
+"""Maximum length of a path on Linux [bytes] (PATH_MAX without the terminating zero)."""
 _SHOWN = 80
-"""Characters of a name from outside that an error shows: a line of a screen."""
+"""Maximum number of characters of an untrusted name in an error: a line of a screen."""
 _CONTROL = re.compile(r"[\x00-\x1f\x7f]")
 _ABSOLUTE = re.compile(r"[/\\]|[A-Za-z]:")
 _SEPARATORS = re.compile(r"[/\\]")
 
 
 class PathError(SlipError):
-    """A name from outside that does not stay inside its folder."""
+    """Rejection of an untrusted name."""
 
 
 def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> AnyPath:
-    """The path that a name from outside stands for, held inside a folder.
+    """Path of an untrusted name, confined to a folder.
 
     Args:
-        root: the folder, whose own place is trusted.
-        name: relative to it, with ``/`` between its parts.
-        follow_links: whether links below the folder may lead out of it: where the user's own arrangement of
-            files is read, not where anything is written.
+        root: the folder; its own path is trusted.
+        name: path relative to it, with ``/`` between its parts.
+        follow_links: whether links below the folder may lead out of it: allowed for reading files that the
+            user arranged, not for writing.
 
     Raises:
         PathError: ``path_outside``: the name is empty, absolute, has a drive letter, a backslash, a control
@@ -60,18 +60,18 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
     mode, has_link = _look_at(root, name)
     if has_link and not follow_links and not path.resolve().is_relative_to(root.resolve()):
         raise _outside(str(root), name, "is a link that leads out of its folder")
-    # Opening a pipe would wait for ever, reading a device as well.
+    # Opening a pipe or reading a device could block forever.
     if mode and not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
         raise _refuse("not_a_file", str(root), name, "is a pipe, a socket or a device, not a file")
     return path
 
 
 def check_name(name: str, *, where: str) -> None:
-    """Refuse what `resolve_inside` refuses whatever there is on the disk.
+    """Reject the names that `resolve_inside` rejects independently of the files on disk.
 
     Args:
-        name: as of `resolve_inside`.
-        where: what to name in the error.
+        name: as in `resolve_inside`.
+        where: location for the error message.
 
     Raises:
         PathError: ``path_outside``.
@@ -82,7 +82,7 @@ def check_name(name: str, *, where: str) -> None:
 
 
 def _find_problem(name: str) -> str:
-    """Why a name may lead elsewhere, for the end of a sentence; empty when it cannot."""
+    """Reason to reject a name, as the end of a sentence; empty if there is none."""
     try:
         sizes = [len(part.encode()) for part in name.split("/")]
     except UnicodeEncodeError:
@@ -97,12 +97,12 @@ def _find_problem(name: str) -> str:
 
 
 def may_lead_out(name: str) -> bool:
-    """Whether a part of a name is ``.`` or ``..``, or is where spaces or look-alikes do not count."""
+    """Whether a part of a name is ``.`` or ``..``, also if spaces and look-alike characters are ignored."""
     return any(part and not part.strip(". ") for part in _SEPARATORS.split(_fold(name)))
 
 
 def _fold(name: str) -> str:
-    """What a careless reader may take a name for: look-alikes made plain, invisible characters dropped."""
+    """A name with look-alike characters normalized and invisible ones removed."""
     if name.isascii():
         return name
     visible = "".join(character for character in name if unicodedata.category(character) != "Cf")
@@ -110,7 +110,7 @@ def _fold(name: str) -> str:
 
 
 def _look_at(root: Path, name: str) -> tuple[int, bool]:
-    """Mode of what a name stands for, 0 where there is nothing, and whether a link is in its way."""
+    """Mode of the named file, 0 if there is none, and whether its path contains a link."""
     path, mode, has_link = os.fspath(root), 0, False
     try:
         for part in name.split("/"):
@@ -132,29 +132,29 @@ def _refuse(code: str, where: str, name: str, problem: str) -> PathError:
     return PathError(code, f"the name {shown!r} {problem}", where=where, hint=hint)
 
 
-# Reading TOML that anybody may have written: bounded size, depth and numbers, one kind of error.
+# Reading untrusted TOML: bounded size, depth and numbers, one class of errors.
 #
-# The parser of the standard library ends with a recursion error on deep nesting, takes the square of the time
-# on long dotted keys, and knows whole numbers of any length.
+# The parser of the standard library raises a recursion error on deep nesting, takes quadratic time on long
+# dotted keys, and accepts integers of any length.
 
 LONGEST = 2_000_000
-"""Characters of a TOML text, which takes Python two seconds to parse."""
+"""Maximum number of characters of a TOML text: Python parses it in two seconds."""
 DEEPEST = 16
-"""Tables and lists within each other; no file of this repository has more than five."""
+"""Maximum depth of nested tables and lists; no file of this repository has more than five."""
 _LARGEST = 2**63
-"""Whole numbers stay below it, as TOML 1.0 asks."""
+"""Bound of integers: 64 bits with sign, as TOML 1.0 requires."""
 _LINE = re.compile(r"\(at line (\d+)")
 _PART = r"""(?:[\w-]++|"[^"\n]*"|'[^'\n]*')[ \t]*"""
 _LONG_KEY = re.compile(rf"(?<![\w-])(?:{_PART}\.[ \t]*){{{DEEPEST}}}")
 
 
 class TomlError(Exception):
-    """A text that is no TOML, or none that anybody would write.
+    """A text that is not valid TOML or exceeds the bounds.
 
     Args:
         what: what is wrong, one line without a full stop.
-        line: where, counted from one; None for the whole text.
-        key: dotted name of the key it concerns; empty where there is none.
+        line: number of the line, from one; None for the whole text.
+        key: dotted name of the key it concerns; empty if there is none.
     """
 
     def __init__(self, what: str, line: int | None = None, key: str = "") -> None:
@@ -168,7 +168,7 @@ def parse_toml(text: str) -> dict[str, object]:
     """The tables of a TOML text.
 
     Raises:
-        TomlError: it is not TOML, too long, nested too deeply, or holds a number beyond 64 bits.
+        TomlError: it is not TOML, too long, nested too deeply, or contains a number of more than 64 bits.
     """
     if len(text) > LONGEST:
         raise TomlError(f"longer than {LONGEST} characters")
@@ -192,7 +192,7 @@ def parse_toml(text: str) -> dict[str, object]:
 
 
 def walk(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
-    """Every value that is no table and no list, with its dotted key.
+    """Every value other than tables and lists, with its dotted key.
 
     Raises:
         TomlError: nested too deeply.
@@ -211,7 +211,7 @@ def walk(tree: Mapping[str, object]) -> Iterator[tuple[str, object]]:
 
 
 def require_finite(tree: Mapping[str, object]) -> None:
-    """Refuse ``inf`` and ``nan`` where they can mean nothing.
+    """Reject the non-finite numbers ``inf`` and ``nan``.
 
     Raises:
         TomlError: with the key.
@@ -222,10 +222,10 @@ def require_finite(tree: Mapping[str, object]) -> None:
 
 
 MOST_LEVELS: Final = 100
-"""Levels of folders that are looked through: results have 6, recorders and people need fewer than 20."""
+"""Maximum depth of searched folders: results have 6 levels, recorders and people use fewer than 20."""
 
 MOST_ENTRIES: Final = 20_000_000
-"""Files and folders that are looked at: 100 times what a season of 10,000 runs leaves in its results."""
+"""Maximum number of searched files and folders: 100 times those of the results of 10,000 runs."""
 
 Location = TypeVar("Location")
 Answer = TypeVar("Answer")
@@ -236,13 +236,13 @@ def walk_tree(
     look: Callable[[Location], tuple[Answer, Sequence[Location], int] | None],
     skip: Callable[[Location, str], None],
 ) -> Iterator[Answer]:
-    """What is found in a folder and in every folder below it, in the order of a reader.
+    """Answers for a folder and all folders below it; a folder precedes those below it.
 
     Args:
-        top: where to begin.
-        look: finds what is in a folder: the answer, the folders right below, and the count of entries; None
-            where it cannot be looked into.
-        skip: told of each folder that is left out because of the bounds, and why.
+        top: the first folder.
+        look: reads a folder: the answer, the direct subfolders and the number of entries; None if the folder
+            cannot be read.
+        skip: called with each folder that is omitted because of the bounds, and the reason.
 
     Yields:
         The answers.
@@ -266,11 +266,11 @@ def walk_tree(
 
 
 def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirEntry[str]]:
-    """Everything below a folder that is not a folder itself; links are not followed.
+    """All entries below a folder except folders; links are not followed.
 
     Args:
         top: the folder.
-        skip: told of each folder that is left out, and why; not of one that is gone by now.
+        skip: called with each folder that is omitted, and the reason; not for one that no longer exists.
     """
 
     def look(folder: str) -> tuple[list[os.DirEntry[str]], list[str], int] | None:

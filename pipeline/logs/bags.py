@@ -1,6 +1,6 @@
-"""Recordings that are not MCAP: bags of ROS 1 and the SQLite files of rosbag2, read through rosbags.
+"""Recordings other than MCAP: ROS 1 bags and SQLite files of rosbag2, read with the rosbags library.
 
-Their messages come one by one and are decoded in blocks, as those of MCAP files are.
+Their messages are read one by one and decoded in blocks, like those of MCAP files.
 """
 
 from __future__ import annotations
@@ -42,37 +42,37 @@ _MAGICS: Final = {b"#ROSBAG V": ROS1_BAG, b"SQLite format 3\0": SQLITE_BAG}
 
 LONGEST_MAGIC: Final = max(map(len, _MAGICS))
 LONGEST_HEAD: Final = 1 << 12
-"""So many bytes at the start of a bag tell what it is and how long it should be."""
+"""Number of bytes at the start of a bag that state its kind and its length."""
 
 _INDEX_PLACE: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
 
 _REPAIRS: Final = {ROS1_BAG: "`rosbag reindex`", SQLITE_BAG: "`sqlite3 FILE .recover`"}
 
 _TOGETHER: Final = 4 << 20
-"""Payload bytes that are handed on at once."""
+"""Size of the payloads that are passed on together [bytes]."""
 
 _LAST_TIME: Final = (1 << 63) - 1
 
 
 def detect_container(head: bytes) -> str:
-    """What kind of bag a file is that begins so; empty for everything else."""
+    """Kind of bag of a file that starts with ``head``; empty for other files."""
     return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
 
 
 def is_whole(head: bytes, size: int) -> bool:
-    """Whether a bag is as long as it says of itself.
+    """Whether a bag is at least as long as its head states.
 
     Args:
         head: its first `LONGEST_HEAD` bytes.
-        size: bytes of all of it.
+        size: size of the file [bytes].
     """
     if detect_container(head) == ROS1_BAG:
-        # The recorder tells where the index stands when it has written it.
+        # The recorder states the position of the index once it has written it.
         match = _INDEX_PLACE.search(head)
         return match is not None and 0 < int.from_bytes(match[1], "little") <= size
     page = int.from_bytes(head[16:18], "big")
     pages = int.from_bytes(head[28:32], "big")
-    # A page of 64 KiB is written as 1.
+    # A page size of 64 KiB is stored as 1.
     return size >= max(pages, 1) * (page if page > 1 else 1 << 16)
 
 
@@ -82,7 +82,7 @@ def is_written_to(path: Path) -> bool:
 
 
 def catalog_bag(source: ByteSource, container: str) -> Catalog:
-    """Find out what a bag holds.
+    """Catalog the contents of a bag.
 
     Args:
         source: the file.
@@ -113,7 +113,7 @@ def _note_connection(connection: Connection, catalog: Catalog) -> None:
     if catalog.container == SQLITE_BAG:
         encoding = str(getattr(connection.ext, "serialization_format", ""))
         form = "ros2idl" if connection.msgdef.format.name == "IDL" else "ros2msg"
-    # Columns of SQLite hold what somebody put there, whatever their type says.
+    # SQLite does not enforce the declared types of columns.
     if not all(isinstance(name, str) and name for name in (connection.topic, connection.msgtype)):
         raise ValueError("a topic has no name or no type")
     catalog.schemas[number] = Schema(number, connection.msgdef.data.encode(), form, connection.msgtype)
@@ -122,21 +122,21 @@ def _note_connection(connection: Connection, catalog: Catalog) -> None:
 
 
 class _BudgetError(Exception):
-    """More would be inflated than a file of this size may hold."""
+    """The inflated size exceeds the limit of the file."""
 
 
 @dataclass(slots=True)
 class _Allowance:
-    """How many bytes a bag may still inflate to, of ``most``."""
+    """Remaining bytes that a bag may inflate to, out of ``most``."""
 
     most: int
     remaining: int
 
     def take(self, size: int) -> None:
-        """Count what came out.
+        """Charge inflated bytes.
 
         Raises:
-            _BudgetError: it is too much.
+            _BudgetError: they exceed the limit.
         """
         self.remaining -= size
         if self.remaining < 0:
@@ -146,11 +146,11 @@ class _Allowance:
             )
 
     def inflate_chunk(self, name: str, stored: bytes) -> bytes:
-        """Inflate a chunk by the name of its compression, to no more than is plausible.
+        """Inflate a chunk with the named compression, up to a plausible size.
 
         Raises:
-            InflateError: it is cut, or holds more.
-            _BudgetError: it is too much.
+            InflateError: it is cut, or larger.
+            _BudgetError: it exceeds the limit.
         """
         decompressor = _list_decompressors()[name]()
         most = min(largest_plausible(len(stored)), self.remaining + 1)
@@ -163,20 +163,20 @@ class _Allowance:
 
 @dataclass(slots=True)
 class BagMessages:
-    """Some messages of a bag: payloads by channel number, and what was lost up to here."""
+    """Some messages of a bag: payloads by channel number, and the losses so far."""
 
     payloads: dict[int, Payloads] = field(default_factory=dict)
     losses: list[Loss] = field(default_factory=list)
 
 
 def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -> Iterator[BagMessages]:
-    """Read the messages of some channels in the order of their times, a few megabytes at once.
+    """Read the messages of some channels in the order of their times, a few megabytes at a time.
 
     Args:
         path: the file.
         container: `ROS1_BAG` or `SQLITE_BAG`.
-        numbers: of the channels.
-        most: bytes that its chunks, or its messages where each is compressed alone, may inflate to.
+        numbers: channel numbers.
+        most: limit of the inflated size of its chunks, or of individually compressed messages [bytes].
 
     Raises:
         LogError: ``log_unreadable``.
@@ -207,7 +207,7 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
 
 @dataclass(slots=True)
 class _Collected:
-    """Messages that wait to be handed on."""
+    """Messages that are not yet passed on."""
 
     allowance: _Allowance
     size: int = 0
@@ -243,7 +243,7 @@ class _Collected:
 
 @contextmanager
 def _refuse_damage(path: Path, container: str) -> Iterator[None]:
-    """Whatever is wrong with a bag is one error."""
+    """Convert every failure to open a bag to one error."""
     try:
         yield
     except (MemoryError, LogError):
@@ -277,16 +277,16 @@ def _open(path: Path, container: str, allowance: _Allowance | None = None) -> It
 
 
 class _BoundedFile(BufferedReader):
-    """A file that is not asked for more than it holds: lengths in a bag may be damaged."""
+    """A file whose reads are limited to its remaining size: lengths in a bag may be damaged."""
 
     def read(self, size: int | None = -1, /) -> bytes:
-        """The next bytes; memory is taken for no more than are there."""
+        """The next bytes; allocates no more memory than there are bytes."""
         remaining = os.fstat(self.fileno()).st_size - self.tell()
         return super().read(remaining if size is None or size < 0 else min(size, remaining))
 
 
 class _BoundedPath(PosixPath):
-    """A path as rosbags takes it, whose file is bounded."""
+    """A path for rosbags that opens a bounded file."""
 
     def open(self, *_args: object, **_options: object) -> _BoundedFile:  # type: ignore[override]
         """Open it for reading."""
@@ -300,20 +300,20 @@ def _make_reader(path: Path, container: str) -> Opened:
         return Reader(_BoundedPath(path))
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader  # noqa: PLC0415 - few logs need it
 
-    # It is made part of an address, where marks such as ? and % have a meaning.
+    # The path becomes part of a URI, in which characters such as ? and % are special.
     return Sqlite3Reader(Path(quote(str(path.absolute()))))
 
 
 @cache
 def _list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
-    """What makes a decompressor, by the name of a compression."""
+    """Factories of decompressors by the name of the compression."""
     from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
 
     return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
 
 
 def _bound_chunks(chunks: dict[int, Chunk], allowance: _Allowance) -> None:
-    """Have the chunks of a ROS 1 bag inflated to no more than is plausible, alone and in all."""
+    """Limit the inflated sizes of the chunks of a ROS 1 bag to plausible values, each and in total."""
     for key, chunk in chunks.items():
         name = _name_compression(chunk)
         if name:
@@ -328,5 +328,5 @@ def _name_compression(chunk: Chunk) -> str:
 
 
 def _format_error(error: Exception) -> str:
-    # The cause says what is wrong without the path, which is told anyway.
+    # The cause describes the error without the path, which is reported separately.
     return " ".join(str(error.__cause__ or error).split()) or type(error).__name__

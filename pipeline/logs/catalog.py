@@ -1,4 +1,4 @@
-"""What is known of a file, and how far its chunks may inflate in all."""
+"""The catalog of a file's contents, and the limit of the total inflated size of its chunks."""
 
 from __future__ import annotations
 
@@ -15,39 +15,39 @@ from pipeline.logs.spans import Span, SpanKind
 
 
 class Cover(IntEnum):
-    """What speaks for a record that describes a channel, from little to much.
+    """Evidence that a schema or channel record is undamaged, in ascending order.
 
-    Damage does not change two copies alike, so that agreement is as good as a checksum.
+    Damage does not change two copies alike, so agreement of two copies is as good as a checksum.
     """
 
     SUMMARY = 0
-    """It stands in a summary without checksum, or with one that does not match."""
+    """It is in a summary without a checksum, or with one that does not match."""
     DATA = 1
-    """It stands in the data section, and no checksum of a chunk covers it."""
+    """It is in the data section, and no checksum of a chunk covers it."""
     AGREED = 2
-    """It stands in the file twice, and both copies agree."""
+    """It is in the file twice, and both copies agree."""
     CHECKSUM = 3
     """The checksum of a chunk or of the summary covers it."""
 
 
 _MAX_EXTRAS: Final = 100_000
-"""Entries of metadata and attachments of a file; recorders write tens, and each takes 3 us to read."""
+"""Maximum number of metadata and attachment entries per file; recorders write tens, each read in 3 us."""
 
 _MAX_ENTRIES: Final = 10_000
-"""Entries of one metadata record, so that one alone does not use up what the others need."""
+"""Maximum number of entries of one metadata record, so that one record cannot use up `_MAX_EXTRAS`."""
 
 _MAX_EXTRA_BYTES: Final = 64 << 20
-"""Bytes of metadata of a file; the largest that is recorded is a robot description of some megabytes."""
+"""Maximum size of a file's metadata [bytes]; the largest recorded is a robot description of some MB."""
 
 
 @dataclass(slots=True)
 class Extras:
-    """How much more of metadata and attachments is read: they stand beside the messages, in any number.
+    """Remaining budget for metadata and attachments, of which a file may contain any number.
 
     Attributes:
-        entries: how many more.
-        size: of how many more bytes.
-        omitted: records that were more.
+        entries: remaining number of entries.
+        size: remaining size [bytes].
+        omitted: number of records beyond the budget.
     """
 
     entries: int = _MAX_EXTRAS
@@ -56,11 +56,11 @@ class Extras:
 
     @property
     def most(self) -> int:
-        """Entries of the next record."""
+        """Maximum number of entries of the next record."""
         return min(self.entries, _MAX_ENTRIES)
 
     def take(self, entries: int | None, size: int) -> bool:
-        """Whether a record may be kept; ``entries`` is None where it has more than the most."""
+        """Charge a record; returns whether it fits. ``entries`` is None if it has more than `most`."""
         fits = entries is not None and self.entries > 0 and size <= self.size
         self.entries -= min(self.entries, 1 + (self.most if entries is None else entries))
         self.size -= size if fits else 0
@@ -68,7 +68,7 @@ class Extras:
         return fits
 
     def find_losses(self) -> list[Loss]:
-        """What was left out."""
+        """The loss for the omitted records, if any."""
         if not self.omitted:
             return []
         text = (
@@ -81,14 +81,13 @@ class Extras:
 
 @dataclass(slots=True)
 class Catalog:
-    """What is known of a file.
+    """Contents of a file.
 
-    ``container`` is what kind of file it is, empty for MCAP, and ``most_inflated`` are the bytes that a bag
-    may inflate to by the user's word, counted as it is read. ``metadata`` and ``attachments`` keep the order
-    of the file, ``side_records`` are their places, lengths and names; ``counts`` are messages by channel
-    number; ``covers`` say of each schema and channel of an MCAP file what speaks for it,
-    ``contradicted`` are those that it holds in two ways, and ``rivals`` the copies of a summary that others
-    of the data section were preferred to.
+    ``container`` is the kind of file, empty for MCAP. ``most_inflated`` is the user's limit of the inflated
+    size of a bag [bytes], counted while it is read. ``metadata`` and ``attachments`` are in the order of the
+    file, ``side_records`` are their offsets, lengths and names. ``counts`` are messages by channel number.
+    ``covers`` is the evidence for each schema and channel of an MCAP file, ``contradicted`` are those with
+    differing copies, and ``rivals`` are the copies in the summary that lost to copies in the data section.
     """
 
     container: str = ""
@@ -115,7 +114,7 @@ class Catalog:
     extras: Extras = field(default_factory=Extras)
 
     def add_description(self, record: Schema | Channel, cover: Cover) -> None:
-        """Take a schema or channel; of copies that differ the one wins that more speaks for, or the first."""
+        """Add a schema or channel; of differing copies the one with more evidence is used, or the first."""
         key = (type(record), record.id)
         known = self._find(record)
         before = self.covers.get(key)
@@ -136,17 +135,17 @@ class Catalog:
             self.losses.append(_note_contradiction(record, before, cover))
 
     def distrust_data(self) -> None:
-        """Believe the summary where the data section contradicts it and has no checksum that holds."""
+        """Use the summary where the data section contradicts it without a valid checksum."""
         for key, record in self.rivals.items():
             if self.covers[key] is Cover.DATA:
                 self._set(record)
 
     def find_contradictions(self, records: Iterable[Schema | Channel], cover: Cover) -> list[Loss]:
-        """What a chunk describes otherwise than the rest of the file does.
+        """Losses for schemas and channels of a chunk that differ from those of the rest of the file.
 
         Args:
-            records: of the chunk.
-            cover: what speaks for them.
+            records: schemas and channels of the chunk.
+            cover: evidence for them.
         """
         losses = []
         for record in records:
@@ -156,11 +155,11 @@ class Catalog:
         return losses
 
     def is_covered(self, number: int, *, data_holds: bool) -> bool:
-        """Whether something speaks for what a channel is read by.
+        """Whether there is evidence for the records that a channel is decoded by.
 
         Args:
-            number: of the channel.
-            data_holds: whether the checksum of the data section holds.
+            number: channel number.
+            data_holds: whether the checksum of the data section is valid.
         """
         channel = self.channels[number]
         least = Cover.DATA if data_holds else Cover.AGREED
@@ -180,17 +179,17 @@ class Catalog:
 
 
 def is_alike(one: Schema | Channel, other: Schema | Channel) -> bool:
-    """Whether two records of one number say the same of all that messages are decoded by."""
+    """Whether two records of one number agree in everything that messages are decoded by."""
     if one == other:
         return True
     if not isinstance(one, Channel) or not isinstance(other, Channel):
         return False
-    # Recorders may add to a channel's own notes, which nothing is decoded by.
+    # Recorders may add to a channel's metadata, which decoding does not use.
     return replace(one, metadata={}) == replace(other, metadata={})
 
 
 def _note_contradiction(record: Schema | Channel, *covers: Cover) -> Loss:
-    """A schema or channel that the file holds in two ways, of which such covers speak for each."""
+    """Loss for a schema or channel with two differing copies, with the evidence for each copy."""
     name = f"channel {record.id}" if isinstance(record, Channel) else f"schema {record.id}"
     end = "one of the two is damaged, and its messages may be wrong"
     if min(covers) < Cover.AGREED < max(covers):
@@ -199,33 +198,33 @@ def _note_contradiction(record: Schema | Channel, *covers: Cover) -> Loss:
 
 
 OVER_BUDGET: Final = "max_inflated"
-"""Kind of the loss of chunks that are beyond the limit."""
+"""Kind of the loss of chunks beyond the limit of the inflated size."""
 
 _LEAST: Final = 512 << 20
-"""Bytes that any file may inflate to: some seconds of work, whatever they hold."""
+"""Inflated size [bytes] that is allowed for any file: some seconds of work, whatever its content."""
 
 _RATIO: Final = 200
-"""Times its size that a file may inflate to. The drives of 703 recordings reach 9, images that hardly change
-50; a file of nothing but empty maps may reach more."""
+"""Maximum ratio of the inflated size to the size of a file. The drives of 703 recordings reach 9, nearly
+constant images 50; a file of only empty maps may reach more."""
 
 _MOST: Final = 1 << 40
-"""Bytes that no file may inflate to: the largest recordings are some hundred gigabytes."""
+"""Maximum default limit of the inflated size [bytes]: the largest recordings are some hundred GB."""
 
 
 def limit_inflated(size: int, most: int | None) -> int:
-    """Bytes that a file of a size may inflate to: what the user allows, else what is plausible."""
+    """Limit of the inflated size of a file [bytes]: the user's limit ``most``, else a plausible one."""
     return min(_MOST, max(_LEAST, _RATIO * size)) if most is None else most
 
 
 def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
-    """Leave out of a catalog the chunks that inflate to more than its file may, and say so.
+    """Remove the chunks beyond the limit of the inflated size from a catalog, and report them as a loss.
 
-    Nothing is inflated for it: a chunk that holds more than it says is refused when it is read.
+    Nothing is inflated here: a chunk that exceeds its stated size is refused when it is read.
 
     Args:
-        catalog: of the file.
-        size: bytes of the file.
-        most: bytes that it may inflate to; None for what is plausible for its size.
+        catalog: catalog of the file.
+        size: size of the file [bytes].
+        most: limit of the inflated size [bytes]; None for one that is plausible for the file's size.
     """
     allowed = limit_inflated(size, most)
     total = sum(_work(span.inflated, span.length) for span in catalog.spans)
@@ -258,7 +257,7 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
 
 
 def _work(inflated: int, stored: int) -> int:
-    """Bytes that inflating a chunk gives; none where its size is refused."""
+    """Inflated size of a chunk [bytes]; 0 if it is implausible, since such a chunk is refused."""
     return inflated if inflated <= largest_plausible(stored) else 0
 
 

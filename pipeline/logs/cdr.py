@@ -1,9 +1,9 @@
-"""Reading many serialized messages at once: one cursor that stands in every row.
+"""Reading many serialized messages at once, with one cursor for all rows.
 
-All rows hold messages of one type. As long as they are laid out alike the cursor's place is one number and a
-field of all rows is one strided copy; where a length differs between rows it becomes an array and a field
-is one gather. Every read is checked against the end of its row first: rows that do not fit are named, none
-is read beyond its end.
+All rows are messages of one type. While their layouts agree, the cursor's position is one number and a field
+of all rows is one strided copy; once a length differs between rows, the position is an array and a field is
+one gather. Every read is first checked against the end of its row: rows that do not fit are reported, and no
+row is read beyond its end.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from pipeline.logs.schema import NUMBER_TYPES, SIZES
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """How numbers and sequences are laid out.
+    """Layout of numbers and sequences.
 
     Attributes:
         order: ``"<"`` or ``">"``, the byte order.
-        max_align: numbers are aligned to their size, at most to this; 8 in XCDR1, 4 in XCDR2, 1 in ROS 1.
-        header: bytes before the first field, which alignment does not count.
-        terminated: whether strings end in a null byte that their length counts.
-        sized: whether sequences of anything but numbers carry their size in bytes first (XCDR2).
+        max_align: maximum alignment; numbers align to their size. 8 in XCDR1, 4 in XCDR2, 1 in ROS 1.
+        header: bytes before the first field, which do not count for the alignment.
+        terminated: whether strings end in a null byte, which their length includes.
+        sized: whether sequences other than of numbers start with their size in bytes (XCDR2).
     """
 
     order: Literal["<", ">"]
@@ -46,7 +46,7 @@ DIALECTS: Final[dict[int, Dialect]] = {
     0x0010: Dialect(">", 4, 4, terminated=True, sized=True),
     0x0011: Dialect("<", 4, 4, terminated=True, sized=True),
 }
-"""Plain CDR encapsulations that are decoded, by their identifier (RTPS 2.5, section 10.2.1.2; XTypes 1.2)."""
+"""Decoded plain CDR encapsulations, by identifier (RTPS 2.5, section 10.2.1.2; XTypes 1.2)."""
 
 OTHER_ENCAPSULATIONS: Final[dict[int, str]] = {
     0x0002: "PL_CDR_BE",
@@ -61,16 +61,16 @@ OTHER_ENCAPSULATIONS: Final[dict[int, str]] = {
     0x0014: "D_CDR2_BE",
     0x0015: "D_CDR2_LE",
 }
-"""Encapsulations that exist and are named, not decoded."""
+"""Encapsulations that are reported by name but not decoded."""
 
 ROS1: Final = Dialect("<", 1, 0, terminated=False, sized=False)
 
 
 class MisfitError(Exception):
-    """Some rows do not hold what their type says.
+    """Some rows do not match their type.
 
     Attributes:
-        rows: numbers of these rows.
+        rows: indices of these rows.
     """
 
     def __init__(self, rows: Ints) -> None:
@@ -79,13 +79,13 @@ class MisfitError(Exception):
 
 
 MAX_TEXT: Final = 1 << 16
-"""Longest string that is kept whole [bytes]; frame ids, joint names and states have tens."""
+"""Maximum length of a string [bytes], longer ones are cut; frame ids, joint names and states have tens."""
 
 MAX_TEXTS: Final = 256 << 20
-"""Most bytes of all distinct strings of one field."""
+"""Maximum total size of the distinct strings of one field [bytes]."""
 
 _LONG_TEXT: Final = 1 << 10
-"""Strings from here on are looked at one by one, not side by side."""
+"""Minimum length of strings [bytes] that are compared one by one instead of as an array."""
 
 
 class Vocabulary:
@@ -95,7 +95,7 @@ class Vocabulary:
         path: the field, for messages.
 
     Attributes:
-        shortened: strings that were longer than ``MAX_TEXT`` and were cut there.
+        shortened: number of strings longer than ``MAX_TEXT``, which were cut there.
     """
 
     def __init__(self, path: str = "") -> None:
@@ -105,7 +105,7 @@ class Vocabulary:
         self.shortened = 0
 
     def code(self, text: Buffer) -> int:
-        """Code of a string, a new one when it was not met before.
+        """Code of a string; a string that is not yet in the vocabulary gets a new one.
 
         Raises:
             LogError: ``too_many_strings``.
@@ -127,22 +127,22 @@ class Vocabulary:
         return number
 
     def texts(self) -> tuple[str, ...]:
-        """The strings by code; bytes that are no UTF-8 are shown as replacement characters."""
+        """The strings by code; bytes that are not UTF-8 become replacement characters."""
         return tuple(text.decode("utf-8", "replace") for text in self._codes)
 
 
 @dataclass(slots=True)
 class Cursor:
-    """A place in each of n rows.
+    """A position in each of n rows.
 
     Attributes:
-        data: the bytes all rows stand in, uint8, shape (m,).
+        data: buffer of all rows, uint8, shape (m,).
         base: where each row's alignment starts, int64, shape (n,).
-        limit: bytes of each row from its base, int64, shape (n,).
-        rows: the number of each row, to be named when it does not fit, int64, shape (n,).
-        stride: distance between neighbouring bases when it is the same everywhere, else None.
-        dialect: how the rows are laid out.
-        position: bytes from the base; one number, or int64 of shape (n,).
+        limit: length of each row from its base [bytes], int64, shape (n,).
+        rows: index of each row, reported if it does not fit, int64, shape (n,).
+        stride: distance between adjacent bases if it is constant, else None.
+        dialect: layout of the rows.
+        position: offset from the base [bytes]; one number, or int64 of shape (n,).
     """
 
     data: NDArray[np.uint8]
@@ -154,36 +154,36 @@ class Cursor:
     position: int | Ints = 0
 
     def select(self, chosen: Ints) -> Cursor:
-        """A cursor on some of the rows."""
+        """Cursor for some of the rows."""
         position = self.position if isinstance(self.position, int) else self.position[chosen]
         return Cursor(
             self.data, self.base[chosen], self.limit[chosen], self.rows[chosen], None, self.dialect, position
         )
 
     def align(self, size: int) -> None:
-        """Step to the next multiple of ``size``, as far as the dialect aligns."""
+        """Step to the next multiple of ``size`` or of the dialect's maximum alignment, if that is less."""
         step = min(size, self.dialect.max_align)
         self.position = (self.position + step - 1) // step * step if step > 1 else self.position
 
     def require(self, size: int | Ints) -> None:
-        """Check that ``size`` bytes are left in every row.
+        """Check that every row has ``size`` more bytes.
 
         Raises:
-            MisfitError: naming the rows where they are not.
+            MisfitError: with the rows that do not.
         """
         self.reject(self.position + size > self.limit)
 
     def reject(self, wrong: Flags) -> None:
-        """Name the rows where ``wrong`` holds.
+        """Report the rows where ``wrong`` is true.
 
         Raises:
-            MisfitError: when there is one.
+            MisfitError: if there are any.
         """
         if wrong.any():
             raise MisfitError(np.unique(self.rows[wrong]))
 
     def advance(self, size: int | Ints) -> None:
-        """Step over ``size`` bytes that were required before."""
+        """Step over ``size`` bytes that were checked with ``require``."""
         position = self.position + size
         if not isinstance(position, int) and (position == position[0]).all():
             position = int(position[0])
@@ -201,13 +201,13 @@ class Cursor:
         return values.astype(np.bool_) if kind == "bool" else values
 
     def read_lengths(self) -> int | Ints:
-        """The next length prefix (u32) of every row: one number when it is the same everywhere."""
+        """The next length prefix (u32) of every row; one number if all rows have the same."""
         lengths = self.read_numbers("uint32", 1)[:, 0].astype(np.int64)
         first = int(lengths[0])
         return first if (lengths == first).all() else lengths
 
     def read_ragged(self, kind: str, counts: Ints) -> NDArray[np.generic]:
-        """The next ``counts[i]`` numbers of row i, all end to end."""
+        """The next ``counts[i]`` numbers of row i, concatenated over the rows."""
         size = SIZES[kind]
         before = self.position
         self.align(size)
@@ -238,7 +238,7 @@ class Cursor:
         self.advance(0)
 
     def read_text(self, vocabulary: Vocabulary | None) -> NDArray[np.int32] | None:
-        """The next string of every row as codes, shape (n,); only stepped over without a vocabulary."""
+        """Codes of the next string of every row, shape (n,); without a vocabulary it is only skipped."""
         lengths = self.read_lengths()
         self.require(lengths)
         tail = 1 if self.dialect.terminated else 0

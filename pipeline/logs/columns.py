@@ -1,7 +1,7 @@
 """Columns of messages, the field paths that name them, and payloads copied out of chunks.
 
-A field that is a number in every message is a plain array; a fixed array is ``(n, k)``. Sequences keep
-their values end to end with offsets. Strings are codes into the tuple of the distinct ones.
+A field with one number per message is a plain array; a fixed-size array is ``(n, k)``. Sequences are
+concatenated values with offsets. Strings are codes into the tuple of the distinct strings.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ Scalar = TypeVar("Scalar", bound=np.generic)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ragged:
-    """A sequence a message.
+    """One sequence per message.
 
     Attributes:
-        values: all values end to end, shape (m,) or (m, k).
-        offsets: message i owns ``values[offsets[i]:offsets[i + 1]]``; int64, shape (n + 1,).
+        values: values of all messages, concatenated, shape (m,) or (m, k).
+        offsets: message i has ``values[offsets[i]:offsets[i + 1]]``; int64, shape (n + 1,).
     """
 
     values: Numbers
@@ -45,11 +45,11 @@ class Ragged:
         return self.values[self.offsets[index] : self.offsets[index + 1]]
 
     def fixed(self) -> Numbers | None:
-        """The values as (n, k, ...) when every message holds equally many, else None."""
+        """The values as (n, k, ...) if every message has equally many, else None."""
         return _fold_equal_rows(self.values, self.offsets)
 
     def at(self, position: int) -> Floats:
-        """Value number ``position`` of every message, NaN where a message is shorter; shape (n,)."""
+        """Value at index ``position`` of every message, NaN where a message is shorter; shape (n,)."""
         values = np.full(len(self), np.nan)
         there = np.diff(self.offsets) > position
         values[there] = self.values[self.offsets[:-1][there] + position]
@@ -58,11 +58,11 @@ class Ragged:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Strings:
-    """A string a message.
+    """One string per message.
 
     Attributes:
         codes: index into ``values``, int32, shape (n,); -1 where the message has none.
-        values: the distinct strings.
+        values: distinct strings.
     """
 
     codes: NDArray[np.int32]
@@ -72,18 +72,18 @@ class Strings:
         return self.codes.size
 
     def to_list(self) -> list[str]:
-        """The string of every message; empty where there is none."""
+        """String of every message; empty if it has none."""
         return [self.values[code] if code >= 0 else "" for code in self.codes.tolist()]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RaggedStrings:
-    """A sequence of strings a message.
+    """One sequence of strings per message.
 
     Attributes:
-        codes: index into ``values``, all messages end to end, int32, shape (m,).
+        codes: indices into ``values`` of all messages, concatenated, int32, shape (m,).
         values: the distinct strings.
-        offsets: message i owns ``codes[offsets[i]:offsets[i + 1]]``; int64, shape (n + 1,).
+        offsets: message i has ``codes[offsets[i]:offsets[i + 1]]``; int64, shape (n + 1,).
     """
 
     codes: NDArray[np.int32]
@@ -98,11 +98,11 @@ class RaggedStrings:
         return [self.values[code] for code in self.codes[self.offsets[index] : self.offsets[index + 1]]]
 
     def fixed(self) -> NDArray[np.int32] | None:
-        """The codes as (n, k) when every message holds equally many, else None."""
+        """The codes as (n, k) if every message has equally many, else None."""
         return _fold_equal_rows(self.codes, self.offsets)
 
     def at(self, position: int) -> Strings:
-        """String number ``position`` of every message, code -1 where a message is shorter."""
+        """String at index ``position`` of every message, code -1 where a message is shorter."""
         codes = np.full(len(self), -1, dtype=np.int32)
         there = np.diff(self.offsets) > position
         codes[there] = self.codes[self.offsets[:-1][there] + position]
@@ -120,23 +120,23 @@ Column: TypeAlias = Numbers | Ragged | Strings | RaggedStrings
 
 
 STAMPS: Final = ("header.stamp.", "timestamp.")
-"""Where messages carry the time they are about: ROS headers, and the protobuf and JSON types of Foxglove."""
+"""Paths of the stamps in messages: ROS headers, and the protobuf and JSON types of Foxglove."""
 
 _LATEST_S: Final = 1 << 33
-"""Seconds beyond the year 2242, and as many before 1970: no stamp of a recording."""
+"""Largest magnitude of a valid stamp [s]: up to the year 2242, and as long before 1970."""
 
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
 
 
 def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> Ints | None:
-    """Stamps [ns] of seconds and nanoseconds, None where one of them is no time at all."""
+    """Stamps [ns] from seconds and nanoseconds; None if any of them is not a valid time."""
     if not ((np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)).all():
         return None
     return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
 
 
 def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where: str) -> set[str]:
-    """Leaf fields that the wanted paths need.
+    """Leaf fields required by the wanted paths.
 
     Args:
         leaves: every leaf field of the type.
@@ -161,10 +161,10 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
 def derive_columns(
     columns: Mapping[str, Column], fields: Sequence[str] | None, leaves: Sequence[str]
 ) -> dict[str, Column]:
-    """The columns that the wanted paths name, from those of the leaf fields.
+    """Columns of the wanted paths, from those of the leaf fields.
 
     Args:
-        columns: by leaf field.
+        columns: columns by leaf field.
         fields: wanted paths, None for all.
         leaves: every leaf field of the type.
     """
@@ -201,23 +201,23 @@ def _element(column: Column, number: int) -> Column:
 
 
 IN_PLACE: Final = 1 << 13
-"""Payloads from this size on are not copied but decoded where they stand [bytes]."""
+"""Minimum size of payloads that are decoded in place instead of copied [bytes]."""
 
 
 _COMMON: Final = 16
-"""A length that fewer rows share is decoded together with other rare ones."""
+"""Minimum number of rows of one length; payloads of rarer lengths are decoded together."""
 
 
 @dataclass(slots=True, eq=False)
 class Group:
-    """Equally long payloads of one channel in one span.
+    """Payloads of equal length of one channel in one span.
 
     Attributes:
-        count: how many.
-        size: bytes of each.
-        data: uint8; the payloads end to end, or the whole chunk when ``start`` is given.
-        rows: their numbers among the span's messages of the channel, None when they are all of them.
-        start: where each payload starts in ``data``, None when they stand end to end.
+        count: number of payloads.
+        size: size of each payload [bytes].
+        data: uint8; the concatenated payloads, or the whole chunk if ``start`` is given.
+        rows: their indices among the span's messages of the channel, None if they are all of them.
+        start: start of each payload in ``data``, None if they are concatenated.
     """
 
     count: int
@@ -232,9 +232,9 @@ class Payloads:
     """The messages of one channel in one span.
 
     Attributes:
-        log_time: [ns], int64, shape (n,), in the order of the file.
+        log_time: [ns], int64, shape (n,), in file order.
         publish_time: [ns], int64.
-        groups: the payloads, by length.
+        groups: payloads by length.
     """
 
     log_time: Ints
@@ -248,9 +248,9 @@ class Block:
 
     Attributes:
         data: uint8, shape (m,).
-        start: where each payload starts in ``data``, int64, shape (n,).
-        size: bytes of each payload, int64, shape (n,).
-        stride: distance of neighbouring payloads when they stand end to end and are equally long, else None.
+        start: start of each payload in ``data``, int64, shape (n,).
+        size: size of each payload [bytes], int64, shape (n,).
+        stride: distance of adjacent payloads if they are concatenated and of equal length, else None.
     """
 
     data: NDArray[np.uint8]
@@ -263,8 +263,8 @@ def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -
     """Copy the payloads of some channels out of a chunk.
 
     Args:
-        chunk: its inflated records.
-        messages: where its messages stand.
+        chunk: inflated records of the chunk.
+        messages: positions of its messages.
         numbers: channel numbers.
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
@@ -282,7 +282,7 @@ def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -
 
 
 def join_payloads(log_time: list[int], payloads: list[Buffer]) -> Payloads:
-    """Messages of one channel that came one by one; recorded when they were published [ns]."""
+    """Join messages of one channel that were read one by one; their log and publish times [ns] are equal."""
     time = np.array(log_time, dtype=np.int64)
     size = np.array([len(payload) for payload in payloads], dtype=np.int64)
     data = np.frombuffer(b"".join(payloads) or bytes(1), dtype=np.uint8)
@@ -306,13 +306,13 @@ def _gather(data: NDArray[np.uint8], rows: Ints | None, start: Ints, size: int) 
 
 
 def join_groups(groups: list[tuple[int, Group]]) -> list[tuple[Ints, Block]]:
-    """Join groups for decoding: equal lengths end to end, rare lengths into one mixed block.
+    """Join groups for decoding: one block per length, rare lengths in one mixed block.
 
     Args:
-        groups: with the number that the span's first message has in the channel.
+        groups: groups, each with the index of the span's first message in the channel.
 
     Returns:
-        Blocks with the numbers of their rows in the channel.
+        Blocks, each with the indices of its rows in the channel.
     """
     by_size: dict[int, list[tuple[int, Group]]] = {}
     joined: list[tuple[Ints, Block]] = []
@@ -346,21 +346,21 @@ def _numbers(first: int, group: Group) -> Ints:
     return first + (np.arange(group.count) if group.rows is None else group.rows)
 
 
-# Messages that stand in a recording more than once: doubled chunks, ranges that were copied into the file.
+# Messages that occur more than once in a recording: duplicated chunks, ranges copied into the file.
 #
-# Two messages of one channel are the same when all bytes of their records are: number, times, content. Where
-# no two share their times, which is nearly always so, nothing is read for it.
+# Two messages of one channel are equal if all bytes of their records are: number, times, content. If no two
+# messages have equal times, as in nearly all recordings, nothing is read for this check.
 
 Key = tuple[int, int, bytes]
 
 _DIGEST: Final = 16
 
 _MOST_ALIKE: Final = 1000
-"""More messages with the same times are no copies: the clock that gave them stands still."""
+"""Maximum number of copies of a message: more messages with equal times mean that the clock stood still."""
 
 
 def share_times(log_time: Ints, publish_time: Ints) -> Ints:
-    """Numbers of the messages that share both times [ns] with a few others, ascending."""
+    """Indices of the messages with the same log and publish time [ns] as a few others, ascending."""
     if (log_time[1:] > log_time[:-1]).all():
         return np.empty(0, dtype=np.int64)
     order = np.lexsort((publish_time, log_time))
@@ -372,12 +372,12 @@ def share_times(log_time: Ints, publish_time: Ints) -> Ints:
 
 
 def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]) -> dict[int, list[Key]]:
-    """Log time, publish time and digest of the messages logged at certain times, in the order of the file.
+    """Log time, publish time and digest of the messages logged at certain times, in file order.
 
     Args:
         chunk: inflated records.
-        messages: where its messages stand.
-        times: by channel number the log times [ns] that are looked for, ascending.
+        messages: positions of its messages.
+        times: log times to search for [ns] by channel number, ascending.
     """
     digests_of: dict[int, list[Key]] = {}
     view = memoryview(chunk)
@@ -394,7 +394,7 @@ def digest_messages(chunk: Buffer, messages: Messages, times: Mapping[int, Ints]
 
 
 def find_repeated(keys: Iterable[Key]) -> list[int]:
-    """Positions of those that stood there before."""
+    """Positions of the keys that occurred before."""
     seen: set[Key] = set()
     repeated = []
     for position, key in enumerate(keys):

@@ -1,4 +1,4 @@
-"""Columns to CDR: the ways to give a column made one, then serialized in blocks."""
+"""Columns to CDR: normalizes the accepted forms of a column, then serializes in blocks."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,21 +14,21 @@ from pipeline.logs.records import LogError
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure, leaf_paths
 
 Given: TypeAlias = "NDArray[np.generic] | Ragged | RaggedStrings | Strings | float | str | Sequence[object]"
-"""A value for all messages, or one for each."""
+"""One value for all messages, or one per message."""
 
 
 def normalize_columns(
     structure: Structure, rows: int, fields: Mapping[str, Given], *, where: str
 ) -> dict[str, Column]:
-    """Bring given values into the columns that reading would return.
+    """Convert given values to the columns that reading would return.
 
-    A single number or string stands for all messages, and so does one list of strings for a sequence of
-    strings. For a field in a sequence of structures, one value a message makes sequences of one, an array
-    (n, k) sequences of k; the sequences of one message are equally long.
+    A single number or string applies to all messages, and so does one list of strings for a sequence of
+    strings. For a field in a sequence of structures, one value per message gives sequences of length one, an
+    array (n, k) sequences of length k; the sequences of one message have equal lengths.
 
     Args:
         structure: the type.
-        rows: how many messages.
+        rows: number of messages.
         fields: values by leaf path.
         where: topic, for messages.
 
@@ -146,17 +146,17 @@ def _match_sequences(columns: Mapping[str, Column], rows: int, where: str) -> No
             )
 
 
-# Serializing columns as CDR, rows that are laid out alike as one block.
+# Serializing columns as CDR, rows of the same layout as one block.
 #
-# The rows are grouped by the lengths of their strings and sequences; within a group every field stands at one
-# place, and writing it is one strided copy. Little-endian XCDR1, as ROS 2 recorders write.
+# The rows are grouped by the lengths of their strings and sequences; within a group every field has one
+# offset, and writing it is one strided copy. Little-endian XCDR1, as ROS 2 recorders write.
 
 _ENCAPSULATION: Final = b"\x00\x01\x00\x00"
 
 
 @dataclass(slots=True)
 class _Buffer:
-    """Rows of one layout being written: what goes where, from the start of the payload."""
+    """Rows of one layout being written: blocks of bytes with their offsets after the encapsulation."""
 
     rows: int
     position: int = 0
@@ -192,13 +192,13 @@ def encode_rows(
     """Serialize messages.
 
     Args:
-        structure: their type.
-        rows: how many.
-        fields: values by leaf path; what is absent is zero or empty.
+        structure: type of the messages.
+        rows: number of messages.
+        fields: values by leaf path; absent fields are zero or empty.
         where: topic, for messages.
 
     Yields:
-        Numbers of the rows of one layout, and their payloads as (m, length) bytes.
+        Indices of the rows of one layout, and their payloads as (m, length) bytes.
 
     Raises:
         LogError: ``field_not_found``, ``bad_column``.
@@ -260,7 +260,7 @@ class _Writer:
     buffer: _Buffer
 
     def write(self, structure: Structure, rows: Ints, prefix: str, element: int | None) -> None:
-        """Write one structure of every row; ``element`` is its number within the sequence it stands in."""
+        """Write one structure of every row; ``element`` is its index in the enclosing sequence."""
         if not structure.members:
             self.buffer.put("uint8", np.zeros((rows.size, 1), dtype=np.uint8))
         for member in structure.members:

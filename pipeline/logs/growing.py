@@ -1,4 +1,4 @@
-"""A recording that is still being written: only what was added since the last look is walked."""
+"""A recording that is still being written: only data added since the last update is scanned."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from pipeline.logs.source import open_source, usable_threads
 
 @dataclass
 class _GrowingFile:
-    """One file of it.
+    """One file of a growing recording.
 
     Attributes:
         path: the file.
-        catalog: what its whole records hold.
-        offset: where the first record begins that was not whole.
-        size: bytes at the last look.
-        finished: whether its recorder has put an end to it.
+        catalog: contents of its complete records.
+        offset: first byte of the first incomplete record.
+        size: bytes at the last update.
+        finished: whether the recorder has finished it.
     """
 
     path: Path
@@ -33,7 +33,7 @@ class _GrowingFile:
     finished: bool = False
 
     def follow(self) -> bool:
-        """Walk what was added; whether anything was."""
+        """Scan the data that was added; returns whether there is any."""
         try:
             size = self.path.stat().st_size
         except FileNotFoundError as error:
@@ -52,7 +52,7 @@ class _GrowingFile:
                 hint = "Record with `ros2 bag record -s mcap`, or analyze the log when it is complete"
                 raise LogError("not_mcap", what, where=str(self.path), hint=hint)
             known = self.catalog
-            # Descriptions of channels are shared: what comes later is decoded by what came first.
+            # Schemas and channels are shared: the first ones also decode later messages.
             fresh = Catalog(
                 profile=known.profile,
                 library=known.library,
@@ -69,7 +69,7 @@ class _GrowingFile:
 
 
 def _join(known: Catalog, fresh: Catalog) -> Catalog:
-    """The catalog of a file with what was added to it."""
+    """Catalog of a file, extended by the data that was added."""
     starts = [one for one in (known.start_ns, fresh.start_ns) if one is not None]
     ends = [one for one in (known.end_ns, fresh.end_ns) if one is not None]
     numbers = known.counts.keys() | fresh.counts.keys()
@@ -89,8 +89,8 @@ def _join(known: Catalog, fresh: Catalog) -> Catalog:
 class GrowingLog:
     """A recording that is followed while it is written: a file, or the folder of a split recording.
 
-    Held are the places of chunks, never their messages, so that memory grows by some hundred bytes a chunk.
-    A record whose end is not there yet is no damage: it is read when it is whole.
+    It stores the positions of chunks, never their messages: memory grows by some hundred bytes per chunk.
+    An incomplete record at the end is not damage: it is read once it is complete.
 
     Args:
         path: an MCAP file, or a folder of the files of one recording.
@@ -102,16 +102,16 @@ class GrowingLog:
 
     @property
     def note(self) -> str:
-        """What is worth saying of where the recording comes from; empty of a file."""
+        """Status of the recording's source; empty for a file."""
         return ""
 
     @property
     def cpu_s(self) -> float:
-        """CPU time of a process that writes it for the watch [s]; 0 of a file that others write."""
+        """CPU time of the process that writes it for the watch [s]; 0 for a file written by others."""
         return 0.0
 
     def update(self) -> bool:
-        """Walk what was added since the last time; whether anything was.
+        """Scan the data added since the last call; returns whether there is any.
 
         Raises:
             LogError: ``log_not_found``, ``not_a_recording``, ``not_mcap``, ``log_changed``,
@@ -128,25 +128,25 @@ class GrowingLog:
 
     @property
     def is_closed(self) -> bool:
-        """Whether its recorder has put an end to it; a split recording ends with its listing."""
+        """Whether the recorder has finished it; a split recording ends with its `LISTING`."""
         files = self._files.values()
         listed = not self.path.is_dir() or (self.path / LISTING).exists()
         return bool(files) and listed and all(file.finished for file in files)
 
     @property
     def size(self) -> int:
-        """Bytes of all its files."""
+        """Total size of its files [bytes]."""
         return sum(file.size for file in self._files.values())
 
     @property
     def start_ns(self) -> int:
-        """First log time [ns]; 0 while there is none."""
+        """First log time [ns]; 0 before the first message."""
         starts = (file.catalog.start_ns for file in self._files.values())
         return min((one for one in starts if one is not None), default=0)
 
     @property
     def end_s(self) -> float:
-        """Last log time, since the first [s]."""
+        """Last log time, relative to the first [s]."""
         return (self._end_ns - self.start_ns) * 1e-9
 
     @property
@@ -155,10 +155,10 @@ class GrowingLog:
         return max((one for one in ends if one is not None), default=0)
 
     def make_index(self, seconds: float | None = None) -> LogIndex:
-        """What the recording holds so far.
+        """Index of the recording so far.
 
         Args:
-            seconds: only messages of about so many last seconds; None for all.
+            seconds: approximate length of the part at the end to index [s]; None for all.
         """
         since = None if seconds is None else self._end_ns - round(seconds * 1e9)
         parts = [
@@ -170,6 +170,6 @@ class GrowingLog:
 
 
 def _cut(catalog: Catalog, since_ns: int | None) -> Catalog:
-    """A catalog whose chunks end no sooner than a time; its own dictionaries stay its own."""
+    """Catalog without the chunks that end before a time; it shares its dictionaries with the original."""
     spans = [one for one in catalog.spans if since_ns is None or one.end_ns is None or one.end_ns >= since_ns]
     return replace(catalog, spans=spans)

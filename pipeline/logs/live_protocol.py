@@ -1,10 +1,10 @@
 """Messages of a live server: the Foxglove WebSocket protocol and rosbridge.
 
-Each protocol turns what a server sends into messages with the channel they belong to, and says what to send
-back. It opens no connection and knows no message type: whoever calls it says which topics are wanted.
+Each protocol converts the frames of a server to messages with their channels, and returns the frames to send
+back. It opens no connection and knows no message type: the caller selects the topics.
 
-Sources: the specification of `foxglove.websocket.v1` (docs/spec.md of foxglove/ws-protocol), of which
-`foxglove.sdk.v1` has the same advertisements, subscriptions and message data; the rosbridge v2.0 protocol
+Sources: the specification of `foxglove.websocket.v1` (docs/spec.md of foxglove/ws-protocol), whose
+advertisements, subscriptions and message data are the same in `foxglove.sdk.v1`; the rosbridge v2.0 protocol
 (ROSBRIDGE_PROTOCOL.md of RobotWebTools/rosbridge_suite).
 """
 
@@ -21,10 +21,10 @@ from typing import Final, Protocol, TypeVar
 import msgspec
 
 FOXGLOVE_NAMES: Final = ("foxglove.sdk.v1", "foxglove.websocket.v1")
-"""Subprotocols of a Foxglove server, the newer first; a rosbridge server chooses none."""
+"""Subprotocols of a Foxglove server, newest first; a rosbridge server selects none."""
 
 MOST_TOPICS: Final = 200
-"""Topics that are recorded: of a robot's motion there are a dozen, and a server may name any number."""
+"""Maximum number of recorded topics: a robot's motion has about a dozen; a server may list any number."""
 
 _MESSAGE_DATA: Final = 1
 _HEAD: Final = struct.Struct("<BIQ")
@@ -32,26 +32,26 @@ _BINARY_SCHEMAS: Final = frozenset({"protobuf", "flatbuffer"})
 _USUAL_SCHEMAS: Final = {"json": "jsonschema", "protobuf": "protobuf", "ros1": "ros1msg", "cdr": "ros2msg"}
 _ROSAPI: Final = "/rosapi/topics"
 _QUEUE: Final = 100
-"""Messages of a topic that rosbridge keeps for a slow reader."""
+"""Length of the queue of a topic in rosbridge for a slow reader [messages]."""
 
 
 _Kind = TypeVar("_Kind")
 
 
 class FrameError(ValueError):
-    """A frame that is none of the protocol."""
+    """A frame that does not conform to the protocol."""
 
 
 @dataclass(frozen=True)
 class LiveChannel:
-    """A topic as its server describes it.
+    """A topic as described by its server.
 
     Attributes:
-        topic: its name.
-        type_name: of its messages.
-        encoding: of its messages: ``cdr``, ``json``, ``protobuf``, ``ros1``.
+        topic: name of the topic.
+        type_name: message type.
+        encoding: message encoding: ``cdr``, ``json``, ``protobuf``, ``ros1``.
         schema_encoding: ``ros2msg``, ``jsonschema``, ``protobuf``, ...
-        schema: the definition of the type.
+        schema: definition of the type.
     """
 
     topic: str
@@ -63,7 +63,7 @@ class LiveChannel:
 
 @dataclass(frozen=True)
 class LiveMessage:
-    """One message; `log_time` [ns] is when the server recorded it, 0 where it does not say."""
+    """One message; `log_time` [ns] is the time of recording by the server, 0 if not stated."""
 
     channel: LiveChannel
     log_time: int
@@ -71,13 +71,13 @@ class LiveMessage:
 
 
 class LiveProtocol(Protocol):
-    """What is common to both.
+    """Interface of both protocols.
 
     Attributes:
-        name: for people.
-        channels: what is subscribed to.
-        is_recognized: whether the server has sent anything that only this protocol has.
-        warning: the last error that the server told of; empty where it told none.
+        name: display name.
+        channels: subscribed channels.
+        is_recognized: whether the server has sent a frame that only this protocol has.
+        warning: last error reported by the server; empty if there is none.
     """
 
     name: str
@@ -86,18 +86,18 @@ class LiveProtocol(Protocol):
 
     @property
     def channels(self) -> list[LiveChannel]:
-        """What is subscribed to."""
+        """Subscribed channels."""
         ...
 
     def ask(self) -> list[str]:
-        """Frames that ask the server what it has; sent first, and again every few seconds."""
+        """Frames that request the server's topics; sent first, and again every few seconds."""
         ...
 
     def take(self, frame: str | bytes) -> tuple[list[str], LiveMessage | None]:
-        """Take a frame: what to answer, and the message in it.
+        """Process a frame; returns the frames to answer with, and the message in it.
 
         Raises:
-            FrameError: it is none of the protocol.
+            FrameError: it does not conform to the protocol.
         """
         ...
 
@@ -105,12 +105,12 @@ class LiveProtocol(Protocol):
 def choose_protocol(
     subprotocol: str | None, is_wanted: Callable[[str, str], bool], given: Mapping[str, str]
 ) -> LiveProtocol:
-    """The protocol that a server speaks.
+    """Protocol of a server.
 
     Args:
-        subprotocol: what the server chose of `FOXGLOVE_NAMES`; None where it chose none.
+        subprotocol: selection of the server from `FOXGLOVE_NAMES`; None if it selected none.
         is_wanted: whether a topic is recorded, by its name and type.
-        given: types by topic, where the user named them.
+        given: types by topic as given by the user.
     """
     return Foxglove(is_wanted) if subprotocol in FOXGLOVE_NAMES else Rosbridge(is_wanted, given)
 
@@ -125,7 +125,7 @@ class _Advertised(msgspec.Struct, rename="camel"):
 
 
 class _FoxgloveText(msgspec.Struct, rename="camel"):
-    """The texts of a server; `channels` are described where it is an advertisement."""
+    """Text frame of a server; `channels` is set in an advertisement."""
 
     op: str
     channels: msgspec.Raw = msgspec.Raw(b"[]")
@@ -136,7 +136,7 @@ class _FoxgloveText(msgspec.Struct, rename="camel"):
 
 @dataclass
 class Foxglove:
-    """A client of a Foxglove server; subscriptions have the numbers of their channels."""
+    """A client of a Foxglove server; a subscription has the id of its channel."""
 
     is_wanted: Callable[[str, str], bool]
     name: str = "Foxglove WebSocket"
@@ -146,18 +146,18 @@ class Foxglove:
 
     @property
     def channels(self) -> list[LiveChannel]:
-        """What is subscribed to."""
+        """Subscribed channels."""
         return list(self._subscribed.values())
 
     def ask(self) -> list[str]:
-        """Nothing: the server advertises on its own."""
+        """No frames: the server advertises its topics without a request."""
         return []
 
     def take(self, frame: str | bytes) -> tuple[list[str], LiveMessage | None]:
-        """Take a frame: what to answer, and the message in it.
+        """Process a frame; returns the frames to answer with, and the message in it.
 
         Raises:
-            FrameError: it is none of the protocol.
+            FrameError: it does not conform to the protocol.
         """
         if isinstance(frame, bytes):
             return [], self._take_data(frame)
@@ -176,13 +176,13 @@ class Foxglove:
         if not frame:
             raise FrameError("an empty frame")
         if frame[0] != _MESSAGE_DATA:
-            # Times, services and assets: nothing that was asked for.
+            # Times, services and assets, which are not requested.
             return None
         if len(frame) < _HEAD.size:
             raise FrameError("a message without a head")
         _, number, log_time = _HEAD.unpack_from(frame)
         channel = self._subscribed.get(number)
-        # Messages of a topic that was just taken back may still be on their way.
+        # Messages of a topic that was just unadvertised may still arrive.
         return None if channel is None else LiveMessage(channel, log_time, frame[_HEAD.size :])
 
     def _subscribe(self, advertised: list[_Advertised]) -> list[str]:
@@ -207,7 +207,7 @@ def _describe_channel(one: _Advertised) -> LiveChannel:
 
 
 class _RosbridgeText(msgspec.Struct):
-    """The texts of a server; a message is kept as it was written."""
+    """Text frame of a server; a message stays raw JSON."""
 
     op: str
     topic: str = ""
@@ -225,7 +225,7 @@ class _Topics(msgspec.Struct):
 
 @dataclass
 class Rosbridge:
-    """A client of a rosbridge server: topics by `/rosapi/topics`, or as given with their types."""
+    """A client of a rosbridge server; topics come from `/rosapi/topics` or are given with their types."""
 
     is_wanted: Callable[[str, str], bool]
     given: Mapping[str, str]
@@ -236,21 +236,21 @@ class Rosbridge:
 
     @property
     def channels(self) -> list[LiveChannel]:
-        """What is subscribed to."""
+        """Subscribed channels."""
         return list(self._subscribed.values())
 
     def ask(self) -> list[str]:
-        """Subscribe to what was given; ask for the topics, which may have become more."""
+        """Frames that subscribe to the given topics and request the list of topics, which may have grown."""
         return [
             *self._subscribe(self.given),
             json.dumps({"op": "call_service", "service": _ROSAPI, "id": _ROSAPI}),
         ]
 
     def take(self, frame: str | bytes) -> tuple[list[str], LiveMessage | None]:
-        """Take a frame: what to answer, and the message in it.
+        """Process a frame; returns the frames to answer with, and the message in it.
 
         Raises:
-            FrameError: it is none of the protocol.
+            FrameError: it does not conform to the protocol.
         """
         text = _decode(frame, _RosbridgeText)
         if text.op == "publish":

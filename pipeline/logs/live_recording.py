@@ -1,4 +1,4 @@
-"""A recording written while messages arrive: a folder of MCAP files, as rosbag2 splits one."""
+"""A recording written while messages arrive: a folder of MCAP files, like a split rosbag2 recording."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from pipeline.logs.records import LogError
 from pipeline.logs.writer import LIBRARY
 
 _CHUNK_S: Final = 1.0
-"""Longest time that a message waits in memory: what a killed program loses, and how late a watch sees it."""
+"""Maximum time of a message in memory [s]: the loss of a killed program, and the delay of a watch."""
 _CHUNK_BYTES: Final = 1 << 20
 
 
 class _Writer(Writer):
-    """A writer whose chunks can be ended before they are full."""
+    """An MCAP writer that can end a chunk before it is full."""
 
     def end_chunk(self) -> None:
-        """Write the messages so far.
+        """Write the messages so far as a chunk.
 
-        The method is the base class's own; its mangled name is the same here, since mangling leaves out the
-        underscore that the name of this class begins with.
+        The called method is private to the base class. Its mangled name is the same here, because mangling
+        drops the leading underscore of a class name.
         """
         self.__finalize_chunk()  # type: ignore[no-untyped-call]
 
 
 @dataclass
 class _Part:
-    """One file while it is written.
+    """One file that is being written.
 
     Attributes:
         stream: the file.
-        writer: writes to it.
-        numbers: of the channels in it.
-        start_s: when its present chunk began [s of `time.monotonic`].
-        waiting: messages in that chunk.
+        writer: MCAP writer of the file.
+        numbers: channel numbers in the file.
+        start_s: start of the current chunk [s of `time.monotonic`].
+        waiting: number of messages in that chunk.
     """
 
     stream: BinaryIO
@@ -55,10 +55,10 @@ class _Part:
 
 
 def lock_folder(folder: Path) -> int | None:
-    """Lock a folder for one writer: the number of an open file that holds the lock; None where another does.
+    """Lock a folder for one writer; returns the file descriptor of the lock, None if it is already locked.
 
     Raises:
-        OSError: the folder cannot be opened, or its disk has no locks.
+        OSError: the folder cannot be opened, or its file system has no locks.
     """
     number = os.open(folder, os.O_RDONLY)
     try:
@@ -73,17 +73,17 @@ def lock_folder(folder: Path) -> int | None:
 
 
 class LiveRecording:
-    """Writes messages into a folder of MCAP files, one for each connection to a server.
+    """Writes messages to a folder of MCAP files, one per connection to a server.
 
-    A file grows at least every `_CHUNK_S`, so that a reader can follow it. What a killed program left in the
-    folder stays as it is, and the next file goes on with the recording.
+    A file grows at least every `_CHUNK_S`, so that a reader can follow it. Files of a killed program stay
+    unchanged in the folder; the next file continues the recording.
 
     Args:
-        folder: made where it is not there.
+        folder: created if it does not exist.
 
     Raises:
-        LogError: ``recording_unwritable``; ``recording_ended``, the folder holds a recording that has ended;
-            ``recording_in_use``, another program writes it.
+        LogError: ``recording_unwritable``; ``recording_ended``, the folder has a finished recording;
+            ``recording_in_use``, another program writes to it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -99,7 +99,7 @@ class LiveRecording:
         if lock is None:
             hint = "End the other watch, or name another folder with --record"
             raise LogError("recording_in_use", "another watch writes there", where=str(folder), hint=hint)
-        # Held until this process ends, however it ends.
+        # The lock lasts until this process ends, in whatever way.
         self._lock = lock
 
     def _naming_os_errors(self) -> AbstractContextManager[None]:
@@ -111,9 +111,9 @@ class LiveRecording:
         """Add a message.
 
         Args:
-            channel: it belongs to.
+            channel: channel of the message.
             log_time: [ns].
-            data: as its server sent it.
+            data: payload as sent by the server.
 
         Raises:
             LogError: ``recording_unwritable``.
@@ -141,7 +141,7 @@ class LiveRecording:
         return _Part(stream, writer)
 
     def flush(self) -> None:
-        """Write what has waited long enough.
+        """Write the current chunk if it is at least `_CHUNK_S` old.
 
         Raises:
             LogError: ``recording_unwritable``.
@@ -155,7 +155,7 @@ class LiveRecording:
         part.start_s, part.waiting = time.monotonic(), 0
 
     def end_part(self) -> None:
-        """Put an end to the present file; the next message begins another.
+        """Finish the current file; the next message starts another.
 
         Raises:
             LogError: ``recording_unwritable``.
@@ -167,7 +167,7 @@ class LiveRecording:
             part.writer.finish()  # type: ignore[no-untyped-call]
 
     def close(self) -> None:
-        """Put an end to the recording; a folder without a message is taken away.
+        """Finish the recording; a folder without messages is removed.
 
         Raises:
             LogError: ``recording_unwritable``.
@@ -181,13 +181,13 @@ class LiveRecording:
             (self.folder / LISTING).write_text(listing, encoding="utf-8")
 
     def abandon(self) -> None:
-        """Take the folder away where nothing was written to it."""
+        """Remove the folder if it is empty."""
         with suppress(OSError):
             self.folder.rmdir()
 
 
 def _spell_listing(index: LogIndex, files: list[Path]) -> str:
-    """The text of rosbag2's listing, version 4: what `ros2 bag play` needs to know of a recording."""
+    """Text of the rosbag2 metadata file, version 4, as `ros2 bag play` requires it."""
     import yaml  # noqa: PLC0415 - once, at the end
 
     topics = [

@@ -1,4 +1,4 @@
-"""What one file holds: from its summary where that is whole, else by walking its records."""
+"""Catalog of one file: from its summary if that is complete, else by scanning its records."""
 
 import os
 import struct
@@ -27,11 +27,11 @@ _MAX_SUMMARY: Final = 1 << 29
 
 
 class _NoSummaryError(Exception):
-    """The summary is absent or does not say everything; the text says what."""
+    """The summary is absent or incomplete; the text states what is missing."""
 
 
 class _DamagedSummaryError(_NoSummaryError):
-    """The summary was there once; the text says what is wrong."""
+    """The summary is damaged or cut off; the text states the damage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,15 +44,15 @@ class _Summary:
 
 
 def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | None = None) -> Catalog:
-    """Find out what a file holds.
+    """Catalog the contents of a file.
 
     Args:
         source: the file.
-        threads: how many chunks are inflated at once where the summary is missing.
-        max_inflated: bytes that all its chunks may inflate to; None for what is plausible for its size.
+        threads: number of chunks that are inflated at once if the summary is missing.
+        max_inflated: limit of the total inflated size [bytes]; None for one plausible for its size.
 
     Raises:
-        LogError: ``not_mcap``; of a bag, ``log_unreadable``; of a text table, ``too_large``.
+        LogError: ``not_mcap``; for a bag, ``log_unreadable``; for a text table, ``too_large``.
     """
     described = find_table(to_location(source.name))
     if described is not None:
@@ -96,13 +96,13 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
 
 
 def _data_holds(source: ByteSource, catalog: Catalog) -> bool:
-    """Whether the data section has a checksum that holds."""
+    """Whether the data section has a valid checksum."""
     end = catalog.data_end
     return end is not None and bool(catalog.data_crc) and checksum_holds(source, end, catalog.data_crc)
 
 
 def is_finished(path: Path) -> bool:
-    """Whether a recorder has put an end to a file, as far as its first and last bytes tell.
+    """Whether a recorder has finished a file, judged by its first and last bytes.
 
     Raises:
         OSError: it cannot be read.
@@ -117,7 +117,7 @@ def is_finished(path: Path) -> bool:
 
 
 _FARM_NG: Final = b"\x0a\x08protobuf"
-"""How the address in the first event begins, behind its length."""
+"""Start of the address in the first event, after its length."""
 
 
 def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
@@ -167,7 +167,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
 
 
 def _compare_chunks(source: ByteSource, chunks: list[ChunkIndex]) -> None:
-    """Look whether chunks stand where a summary without checksum says."""
+    """Check that chunks are at the offsets stated by a summary without a checksum."""
     for chunk in chunks:
         head = source.read_at(chunk.chunk_start_offset, rec.HEAD_SIZE)
         if head != rec.HEAD.pack(rec.CHUNK, chunk.chunk_length - rec.HEAD_SIZE):
@@ -237,7 +237,7 @@ def _check_summary(statistics: Statistics, chunks: list[ChunkIndex], start: int,
 
 
 def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> None:
-    """Walk what no chunk index vouches for: metadata, attachments, messages outside chunks."""
+    """Scan the ranges that no chunk index covers: metadata, attachments, messages outside chunks."""
     listed = list(catalog.spans)
     spans: list[Span] = []
     position = start
@@ -253,14 +253,14 @@ def _scan_gaps(source: ByteSource, catalog: Catalog, start: int, stop: int) -> N
 
 
 def _compare_side_records(catalog: Catalog, summary: _Summary) -> None:
-    """Look whether metadata and attachments are where the summary says, and named so."""
+    """Check that metadata and attachments have the offset, length and name stated in the summary."""
     for _, _, name in sorted(summary.side_records - catalog.side_records):
         text = f"the metadata or attachment {name!r} that the summary lists is damaged or missing"
         catalog.losses.append(Loss("contradiction", text))
 
 
 def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
-    """Whether the summary counts all messages; its counts and times are then taken."""
+    """Use the counts and times of the summary if it lists all chunks; returns whether it does."""
     statistics = summary.statistics
     unlisted = {chunk.chunk_start_offset for chunk in summary.chunks}
     extra = [s for s in catalog.spans if s.kind is not SpanKind.LOOSE and s.offset not in unlisted]
@@ -274,9 +274,9 @@ def _take_statistics(catalog: Catalog, summary: _Summary) -> bool:
 
 
 def _compare_descriptions(source: ByteSource, catalog: Catalog, threads: int) -> None:
-    """Hold what a summary without checksum says of channels against the chunks that they begin in.
+    """Compare the channels in a summary without a checksum with the chunks in which they begin.
 
-    Recorders repeat there what they say of a channel.
+    Recorders repeat the records of a channel there.
     """
     sought = set(catalog.channels)
     chosen: list[Span] = []
@@ -300,7 +300,7 @@ def _forget_chunk(span: Span, loaded: Loaded) -> tuple[Span, Loaded]:
 
 
 def examine_spans(source: ByteSource, catalog: Catalog, threads: int) -> None:
-    """Inflate every span for what no index tells: channels, counts, times."""
+    """Inflate every span to determine what no index states: channels, counts, times."""
     catalog.counts = {}
     examined: list[Span] = []
     losses = dict.fromkeys(catalog.losses)

@@ -1,4 +1,4 @@
-"""The records of an MCAP file, the next one behind damage, and what can go wrong with a log."""
+"""Records of an MCAP file, the search for the next record after damage, and the errors of a log."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from pipeline.core.program import SlipError
 
 
 class LogError(SlipError):
-    """A log, topic or field that cannot be served.
+    """A log, topic or field that cannot be read.
 
     Codes: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``,
     ``topic_not_found``, ``field_not_found``, ``frame_not_found``, ``unknown_type``, ``bad_column``,
@@ -27,22 +27,22 @@ class LogError(SlipError):
 
 
 def unsupported(what: str, where: str, hint: str = "Leave the topic out") -> LogError:
-    """The error for messages that cannot be decoded."""
+    """Error for messages that cannot be decoded."""
     return LogError("unsupported_encoding", what, where=where, hint=hint)
 
 
 @dataclass(frozen=True, slots=True)
 class Loss:
-    """Something that stood in the log and did not come out of it whole.
+    """Part of a log that could not be read completely.
 
     Attributes:
         kind: stable identifier, for example ``truncated``, ``chunk_crc``, ``damaged_record``,
             ``undecodable``, ``unsupported_encoding``, ``unchecked``.
-        text: one clear line.
-        bytes: bytes of the file concerned.
-        chunks: chunks concerned.
-        start_ns: first log time concerned, None when unknown.
-        end_ns: last log time concerned, None when unknown.
+        text: description, one line.
+        bytes: number of affected bytes of the file.
+        chunks: number of affected chunks.
+        start_ns: first affected log time, None if unknown.
+        end_ns: last affected log time, None if unknown.
     """
 
     kind: str
@@ -53,9 +53,9 @@ class Loss:
     end_ns: int | None = None
 
 
-# The records of an MCAP file: opcodes, and mcap's own records read from bodies whose lengths nobody trusts.
+# The records of an MCAP file: opcodes, and mcap's own records parsed from bodies with untrusted lengths.
 #
-# Layout after the MCAP specification, version 0x30: a record is an opcode (u8), a length (u64) and the body.
+# Layout according to the MCAP specification, version 0x30: a record is an opcode (u8), a length (u64) and the body.
 
 Buffer = bytes | memoryview
 
@@ -85,7 +85,7 @@ LEAST_BODY: Final[Mapping[int, int]] = {
     SUMMARY_OFFSET: 17,
     DATA_END: 4,
 }
-"""Fewest bytes of the body of every kind of record."""
+"""Minimum size of the body by kind of record [bytes]."""
 
 _KINDS: Final[Mapping[int, Any]] = {
     HEADER: records.Header,
@@ -102,12 +102,12 @@ _ENTRY_SIZE: Final = 16
 
 
 class RecordError(ValueError):
-    """A record whose body does not hold what its opcode promises."""
+    """A record whose body does not match its opcode."""
 
 
 @dataclass(frozen=True, slots=True)
 class ChunkHead:
-    """What a chunk says of itself before its compressed records.
+    """Head of a chunk, before its compressed records.
 
     ``body`` is the distance from the start of the record to the compressed records.
     """
@@ -122,7 +122,7 @@ class ChunkHead:
 
 
 class _Body(ReadDataStream):
-    """One record's body; where mcap takes what is there, this refuses what is too short."""
+    """Body of one record; refuses a read beyond its end, where mcap returns fewer bytes."""
 
     def __init__(self, body: Buffer) -> None:
         super().__init__(BytesIO(body))
@@ -132,7 +132,7 @@ class _Body(ReadDataStream):
         """The next bytes.
 
         Raises:
-            RecordError: the body ends before.
+            RecordError: the body has fewer bytes.
         """
         if length > self._remaining:
             raise RecordError("a length points beyond the end of its record")
@@ -143,7 +143,7 @@ class _Body(ReadDataStream):
         """The next string (u32 length, UTF-8).
 
         Raises:
-            RecordError: it is none.
+            RecordError: it is not a valid string.
         """
         try:
             return super().read_prefixed_string()
@@ -152,20 +152,20 @@ class _Body(ReadDataStream):
 
 
 def parse_record(opcode: int, body: Buffer) -> records.McapRecord | None:
-    """The record of a kind that says what a file holds; None for other kinds.
+    """Parsed record of a kind that describes the contents of a file; None for other kinds.
 
     Raises:
-        RecordError: the body does not hold what the opcode promises.
+        RecordError: the body does not match the opcode.
     """
     kind = _KINDS.get(opcode)
     return None if kind is None else cast("records.McapRecord", kind.read(_Body(body)))
 
 
 def parse_metadata(body: Buffer, most: int) -> tuple[str, dict[str, str] | None]:
-    """Name and entries of a metadata record; None in place of more than ``most`` entries.
+    """Name and entries of a metadata record; None instead of more than ``most`` entries.
 
     Raises:
-        RecordError: the body does not hold what the opcode promises.
+        RecordError: the body does not match the opcode.
     """
     stream = _Body(body)
     name = stream.read_prefixed_string()
@@ -183,7 +183,7 @@ def parse_attachment_name(body: Buffer) -> str:
     """Name of an attachment, from the first bytes of its record's body.
 
     Raises:
-        RecordError: they do not hold it.
+        RecordError: they do not contain it.
     """
     stream = _Body(body)
     stream.read(16)
@@ -226,56 +226,56 @@ def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
 
 # Finding the next record after damage.
 #
-# Every byte may be the start of a record. A place is taken when its opcode and length are possible and the
-# records that follow from it are possible too, several in a row or up to the very end.
+# Every byte may be the start of a record. A position is accepted if its opcode and length are possible and so
+# are those of the records after it, for several in a row or up to the end.
 
 _CHAIN: Final = 4
-"""Records in a row that must be possible; a random place passes one with a chance below 1e-4."""
+"""Number of successive records that must be possible; a random position passes one with p < 1e-4."""
 
 FIRST_BLOCK: Final = 1 << 12
 LAST_BLOCK: Final = 1 << 20
-"""A search looks at little first and at ever more, so that dense damage does not make it slow."""
+"""First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
 
 _SEARCH: Final = 16
-"""Units of effort of a search, which are for its first block; a place that is tried takes one."""
+"""Effort of a search for its first block [units]; each position that is tried takes one more."""
 
 _LEAST_EFFORT: Final = 1 << 6
-"""Units for any chunk: four places of damage are looked behind in the smallest."""
+"""Minimum effort for a chunk [units]: up to four searches after damage in the smallest chunk."""
 
 
 @dataclass(slots=True)
 class Effort:
-    """How much longer records are searched for in a chunk.
+    """Remaining effort of the search for records in a chunk.
 
-    It grows with the bytes that are stored, as damage does, and not with what they inflate to: that costs
-    nothing to whoever writes a file that shall take long. A unit takes about 2 us.
+    It is proportional to the stored size, as damage is, and not to the inflated size, which a malicious file
+    can increase at no cost. A unit takes about 2 us.
 
     Attributes:
-        remaining: units.
+        remaining: remaining effort [units].
     """
 
     remaining: int
 
     @classmethod
     def for_bytes(cls, stored: int) -> Self:
-        """What so many stored bytes are worth."""
+        """Effort for a chunk of ``stored`` bytes."""
         return cls(_LEAST_EFFORT + stored // 2)
 
     def spend(self, units: int) -> bool:
-        """Whether there was so much left."""
+        """Spend units; returns whether they were available."""
         self.remaining -= units
         return self.remaining >= 0
 
 
 def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], effort: Effort) -> int:
-    """The next place from ``start`` where records go on, ``end`` when there is none.
+    """Position of the next record at or after ``start``; ``end`` if there is none.
 
     Args:
         buffer: bytes in memory.
-        start: first place to try.
-        end: where the records must end.
-        opcodes: kinds of record that may stand there.
-        effort: how long to search.
+        start: first position to try.
+        end: end of the records.
+        opcodes: possible kinds of record.
+        effort: remaining effort of the search.
     """
     data = np.frombuffer(buffer, dtype=np.uint8)
     low, block = start, FIRST_BLOCK
@@ -293,12 +293,12 @@ def find_record(buffer: Buffer, start: int, end: int, opcodes: Sequence[int], ef
 
 
 def possible_places(data: NDArray[np.uint8], low: int, high: int, end: int, opcodes: Sequence[int]) -> Ints:
-    """Places in [low, high) whose opcode and length are possible for a record that ends by ``end``."""
+    """Positions in [low, high) whose opcode and length are possible for a record that ends by ``end``."""
     least = np.full(256, np.iinfo(np.int64).max, dtype=np.int64)
     for opcode in opcodes:
         least[opcode] = LEAST_BODY[opcode]
     first = min(opcodes)
-    # Most bytes are no opcode: lengths are looked at only behind those that may be one.
+    # Most bytes are not an opcode: lengths are checked only after those that may be one.
     places = np.flatnonzero(data[low:high] - np.uint8(first) <= np.uint8(max(opcodes) - first)) + low
     heads: NDArray[np.uint64] = np.ndarray((data.size - 8,), "<u8", data, offset=1, strides=(1,))
     length = heads[places]

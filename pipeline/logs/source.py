@@ -1,4 +1,4 @@
-"""Where the bytes of a log come from, local files or object stores, and reads on several threads."""
+"""Byte sources of logs (local files and object stores), and reading on several threads."""
 
 import hashlib
 import os
@@ -17,23 +17,23 @@ from pipeline.logs.remote import RemotePath, RemoteSource
 
 _HASH_BLOCK: Final = 1 << 20
 _MOST_NEIGHBOURS: Final = 1000
-"""Files of a folder that a mistyped name is compared with: more would take longer than looking oneself."""
+"""Maximum number of folder entries compared with a mistyped name: more take longer than a manual look."""
 
 
 class ByteSource(Protocol):
-    """Bytes that can be read anywhere, from several threads at once."""
+    """Bytes with random access, readable from several threads at once."""
 
     size: int
     """Count of bytes."""
     name: str
-    """What to call it in messages."""
+    """Name used in messages."""
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
 
 
 def _list_neighbours(path: Path) -> list[str]:
-    """Names of the folders beside a place, and of files with its suffix: a picture is no log."""
+    """Names of the folders beside a path, and of the files with its suffix (all files if it has none)."""
     with suppress(OSError), os.scandir(path.parent) as entries:
         beside = [(entry.name, entry.is_dir()) for entry in islice(entries, _MOST_NEIGHBOURS)]
         return [name for name, is_dir in beside if is_dir or path.suffix in {"", Path(name).suffix}]
@@ -41,7 +41,7 @@ def _list_neighbours(path: Path) -> list[str]:
 
 
 class FileSource(AbstractContextManager["FileSource"]):
-    """A local file, held open for the length of a block.
+    """A local file, open for the duration of a `with` block.
 
     Args:
         path: the file.
@@ -57,7 +57,7 @@ class FileSource(AbstractContextManager["FileSource"]):
     def __init__(self, path: Path) -> None:
         self.name = str(path)
         try:
-            # Opening a pipe would wait for somebody to write into it.
+            # Without O_NONBLOCK, opening a pipe would wait for a writer.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
             hint = f"{guess_names(path.name, _list_neighbours(path))}Check the path"
@@ -93,7 +93,7 @@ class FileSource(AbstractContextManager["FileSource"]):
         return data
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         os.close(self._descriptor)
 
     def __exit__(self, *_exception: object) -> None:
@@ -105,7 +105,7 @@ def open_source(path: Path, version: str | None = None) -> AbstractContextManage
 
     Args:
         path: the file or object.
-        version: of an object, what `version_of` told when it was opened before; another one is refused.
+        version: of an object, the result of `version_of` when it was last opened; another is refused.
 
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
@@ -114,24 +114,24 @@ def open_source(path: Path, version: str | None = None) -> AbstractContextManage
 
 
 def version_of(source: ByteSource) -> str | None:
-    """Which version of an object is open; None for a file."""
+    """Version of the open object; None for a file."""
     return source.version if isinstance(source, RemoteSource) else None
 
 
 def is_fetched(source: ByteSource) -> bool:
-    """Whether every byte has to come from an object store."""
+    """Whether every byte is fetched from an object store."""
     return isinstance(source, RemoteSource)
 
 
 def count_fetched(sources: Sequence[ByteSource]) -> int:
-    """Bytes that were fetched from object stores."""
+    """Number of bytes fetched from object stores."""
     return sum(source.fetched for source in sources if isinstance(source, RemoteSource))
 
 
 def hash_sources(sources: Sequence[ByteSource]) -> str:
-    """SHA-256 (hex) of the bytes of the sources, one after the other.
+    """SHA-256 (hex) of the concatenated bytes of the sources.
 
-    An object is not fetched for it: its version and size, as its store tells them, stand for its bytes.
+    An object is not fetched: the version and size reported by its store represent its bytes.
     """
     if len(sources) == 1 and isinstance(sources[0], RemoteSource):
         return sources[0].version
@@ -150,10 +150,10 @@ Result = TypeVar("Result")
 
 
 def usable_threads() -> int:
-    """How many threads this process may keep busy.
+    """Number of threads that this process may use.
 
-    The cores it may run on, or fewer where ``POLARS_MAX_THREADS`` says so: who runs many processes at once
-    limits with it what each does to its data.
+    This is the number of cores it may run on, or ``POLARS_MAX_THREADS`` if that is less: a caller that runs
+    many processes at once sets it to limit each of them.
     """
     affinity = getattr(os, "sched_getaffinity", None)
     cores = len(affinity(0)) if affinity else os.cpu_count() or 1
@@ -169,14 +169,14 @@ def map_in_order(
     weigh: Callable[[Item], int] = lambda _item: 0,
     limit: int = 0,
 ) -> Iterator[Result]:
-    """Apply ``function`` to every item; results in order, at most twice as many waiting as run.
+    """Apply ``function`` to every item; yields results in order, about two per thread waiting at most.
 
     Args:
         function: called on other threads; with one thread it is called on this one.
         items: its arguments.
-        threads: how many calls run at once.
-        weigh: what an item takes while it is worked on and until its result has been used.
-        limit: most weight at once; an item that is heavier alone is worked on alone.
+        threads: number of calls that run at once.
+        weigh: weight of an item, from the start of its processing until its result has been used.
+        limit: maximum total weight at once; an item that exceeds it is processed alone.
     """
     if threads <= 1:
         for item in items:
@@ -189,7 +189,7 @@ def map_in_order(
             for item in items:
                 weight = weigh(item)
                 while waiting and (len(waiting) > 2 * threads or held + weight > limit):
-                    # What is given out is held by the caller until it asks for more.
+                    # The caller uses a yielded result until it asks for the next one.
                     future, freed = waiting.popleft()
                     yield future.result()
                     held -= freed

@@ -1,6 +1,6 @@
-"""Transforms between frames out of ``/tf`` and ``/tf_static``, as whole series.
+"""Time series of transforms between frames, from ``/tf`` and ``/tf_static``.
 
-Every frame has one parent. A chain is answered at the stamps of its last moving link, the one next to the
+Every frame has one parent. A chain is evaluated at the stamps of its last moving link, the one next to the
 child; slower links above it, such as map to odom, are interpolated there.
 """
 
@@ -37,14 +37,14 @@ TRANSFORM_FIELDS: Final = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Link:
-    """A frame in its parent.
+    """Pose of a frame in its parent.
 
     Attributes:
-        parent: frame the transform is given in.
-        child: frame it places.
-        fixed: whether it never moves; then there is one row.
+        parent: frame in which the pose is expressed.
+        child: frame whose pose it is.
+        fixed: whether it never moves; it then has one row.
         time: stamps [ns], int64, strictly increasing, shape (n,).
-        log_time: when they were recorded [ns], int64.
+        log_time: log times of these stamps [ns], int64.
         position: [m], shape (n, 3).
         quaternion: unit, shape (n, 4).
     """
@@ -63,13 +63,13 @@ class TransformSeries:
     """Pose of one frame in another over time.
 
     Attributes:
-        parent: frame the poses are given in.
-        child: frame they place.
+        parent: frame in which the poses are expressed.
+        child: frame whose poses they are.
         time: stamps [ns], int64, strictly increasing, shape (n,).
-        log_time: when the link next to the child was recorded [ns], int64, shape (n,).
+        log_time: log times of the link next to the child [ns], int64, shape (n,).
         position: [m], shape (n, 3).
         quaternion: (x, y, z, w), unit, shape (n, 4).
-        notes: what was held, left out, or ambiguous.
+        notes: held, omitted or ambiguous transforms.
     """
 
     parent: str
@@ -82,7 +82,7 @@ class TransformSeries:
 
 
 def wanted_transforms(topics: Iterable[str]) -> list[Wanted]:
-    """What to read for a buffer, of the topics of a log: those named ``tf`` or ``tf_static``."""
+    """Topics and fields to read for a buffer: the topics of a log named ``tf`` or ``tf_static``."""
     return [Wanted(topic, TRANSFORM_FIELDS) for topic in topics if _base_name(topic) in ("tf", "tf_static")]
 
 
@@ -90,8 +90,8 @@ class TransformBuffer:
     """All transforms of a recording.
 
     Args:
-        topics: columns of TFMessage topics, others are passed over; what is published on ``tf_static``
-            never moves, wherever in the recording it stands.
+        topics: columns of TFMessage topics, others are ignored; a transform on ``tf_static`` is fixed for
+            the whole recording.
     """
 
     def __init__(self, topics: Iterable[TopicColumns]) -> None:
@@ -125,14 +125,14 @@ class TransformBuffer:
         """Pose of ``child`` in ``parent`` over time.
 
         Args:
-            parent: frame the poses are given in.
-            child: frame they place.
-            at: stamps [ns] to answer at; by default those of the moving link next to the child.
+            parent: frame in which the poses are expressed.
+            child: frame whose poses they are.
+            at: stamps of the poses [ns]; by default those of the moving link next to the child.
 
         Returns:
-            Poses where every link of the chain is known. Between its stamps a link is interpolated; beyond
-            its first and last it is held for three of its intervals and for as long as its stamps run ahead
-            of their recording (a future-dated map to odom), rows further out are left out.
+            Poses where every link of the chain is known. A link is interpolated between its stamps. Beyond
+            its first and last stamp it is held for three of its intervals plus the time by which its stamps
+            are ahead of their log times (a future-dated map to odom); rows further out are omitted.
 
         Raises:
             LogError: ``frame_not_found``.
@@ -215,7 +215,7 @@ class TransformBuffer:
 
 
 def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, int]]:
-    """Links with their valid rows, and how many rows are invalid."""
+    """Links with their valid rows, and the number of invalid rows of each."""
     parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
     children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
     numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
@@ -252,7 +252,7 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
 
 
 def _join(links: list[Link]) -> Link:
-    """One link of several between the same frames; of equal stamps and of fixed links the last row counts."""
+    """Join links between the same frames; of equal stamps and of fixed links the last row is used."""
     time = np.concatenate([link.time for link in links])
     order = np.argsort(time, kind="stable")
     last = order[np.r_[np.diff(time[order]) > 0, True]]
@@ -266,7 +266,7 @@ def _join(links: list[Link]) -> Link:
 
 
 def _covers(link: Link, time: Ints) -> Flags:
-    """Where a link can answer: between its stamps, and as far beyond as it may be held."""
+    """Stamps at which a link is known: within its own, and as far beyond as it is held."""
     if link.fixed or link.time.size == 1:
         return np.ones(time.size, dtype=np.bool_)
     interval = float(np.median(np.diff(link.time)))

@@ -1,4 +1,4 @@
-"""Writing MCAP from columns: messages in the order of their log times, indexed, atomically."""
+"""Atomic writing of indexed MCAP files from columns, with messages in the order of their log times."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class _Type(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Serialized messages of one length of one channel: times [ns] and numbers (n,), payloads (n, length)."""
+    """Messages of one channel and one length: times [ns] and sequence numbers (n,), payloads (n, length)."""
 
     channel: int
     log_time: Ints
@@ -39,16 +39,16 @@ class _Rows(NamedTuple):
 
 
 class LogWriter:
-    """Writes one MCAP file; it appears under its name when it is whole.
+    """Writes one MCAP file, which gets its name only when it is complete.
 
     Args:
         path: the file; an existing one is replaced.
-        chunk_size: bytes of records in a chunk before compression.
+        chunk_size: size of a chunk before compression [bytes].
         compression: ``"zstd"``, ``"lz4"`` or ``""``.
 
     Raises:
-        LogError: ``unsupported_encoding`` for another compression, ``log_unreadable`` where nothing can be
-            written.
+        LogError: ``unsupported_encoding`` for another compression, ``log_unreadable`` if the file cannot
+            be written.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class LogWriter:
             topic: name of the topic.
             type_name: ``package/msg/Name``.
             log_time: [ns], int64, shape (n,), in any order.
-            fields: values by leaf path (see ``normalize_columns``); what is absent is zero or empty.
+            fields: values by leaf path (see ``normalize_columns``); absent fields are zero or empty.
             publish_time: [ns]; the log times by default.
             header_time: stamps [ns] for ``header.stamp``, or for ``transforms[].header.stamp``.
             definition: ``ros2msg`` definition of a type that is not bundled.
@@ -130,10 +130,10 @@ class LogWriter:
             self._waiting.append(_Rows(channel, log[rows], publish[rows], first + rows, payloads))
 
     def write_before(self, log_time: int) -> None:
-        """Write what was logged before a time, so that memory holds only what comes later.
+        """Write the messages logged before a time and free their memory.
 
-        Messages that are added afterwards should be later: earlier ones are written too, but then stand in a
-        chunk that overlaps those before it.
+        Messages added afterwards should be later: earlier ones are written too, but in a chunk that overlaps
+        the previous ones.
 
         Args:
             log_time: [ns].
@@ -144,7 +144,7 @@ class LogWriter:
         self._waiting = [rows for rows in later if rows.log_time.size]
 
     def close(self) -> None:
-        """Write everything and put the file in its place."""
+        """Write all remaining messages and rename the file to its final name."""
         self._write(self._waiting)
         self._waiting = []
         self._mcap.finish()  # type: ignore[no-untyped-call]
@@ -158,7 +158,7 @@ class LogWriter:
         log = np.concatenate([empty, *(rows.log_time for rows in waiting)])
         owner = np.concatenate([empty, *(np.full(rows.log_time.size, n) for n, rows in enumerate(waiting))])
         inside = np.concatenate([empty, *(np.arange(rows.log_time.size) for rows in waiting)])
-        # Of one time, what was given first comes first.
+        # Messages with equal times stay in the order in which they were added.
         order = np.argsort(log, kind="stable")
         for number, row in zip(owner[order].tolist(), inside[order].tolist(), strict=True):
             rows = waiting[number]
@@ -171,7 +171,7 @@ class LogWriter:
             )
 
     def discard(self) -> None:
-        """Leave no trace."""
+        """Delete the unfinished file."""
         self._file.close()
         self._draft.unlink(missing_ok=True)
 

@@ -12,10 +12,10 @@ from pipeline.core.machine_code import compiled
 from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
-_SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; what lasts less than a window is bridged
-SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; shorter stretches and longer holes hold none
-_ALIKE = 1e-6  # [rad/s] between sides that are asked for the same: above the rounding of sums
-_BEFORE = 1.0  # [s] before a span, from which its first command is held; lags begin as wheels say
+_SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged
+SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; no window fits into a shorter span or bridges a longer gap
+_ALIKE = 1e-6  # [rad/s] between sides with equal commands: above the rounding of sums
+_BEFORE = 1.0  # [s] before a span, from which its first command is held; lags start at the wheel speeds
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ def _interpolate(at: Floats, knots: Floats, values: Floats, signals: Floats) -> 
     """Signals at times, linear between knots and constant outside.
 
     Args:
-        at: times [s], quickest in order, shape (n,).
+        at: times [s], fastest if sorted, shape (n,).
         knots: increasing [s], shape (m,).
         values: of each signal at the knots, shape (k, m).
         signals: the result, shape (k, n).
@@ -158,13 +158,13 @@ class HeldDrive:
 
     Args:
         series: held commands.
-        cells: the grid.
+        grid: the grid.
     """
 
     def __init__(self, series: DriveSeries, grid: Grid) -> None:
         self._grid = grid
         following = np.minimum(np.searchsorted(series.times, grid.starts - 1e-6), series.times.size - 1)
-        # At a hole nobody knows what was asked meanwhile; at the start of the recording nothing was.
+        # Commands in a gap are unknown; before the recording there are none.
         ends_before = np.concatenate(([-np.inf], grid.ends[:-1]))
         stamp = np.maximum(ends_before + 1e-3, grid.starts - _BEFORE)
         inside = np.flatnonzero(grid.find_span(series.times) >= 0)
@@ -213,7 +213,7 @@ def average_held(times: Floats, values: Floats, grid: Grid) -> Floats:
 
     Args:
         times: stamps [s], increasing, shape (m,).
-        values: from each stamp on, shape (m,).
+        values: value from each stamp to the next, shape (m,).
         grid: the grid.
     """
     held, means = np.ascontiguousarray(values), np.empty(grid.times.size)
@@ -241,20 +241,20 @@ def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float,
         means[cell] = (area + values[held] * (end - at)) / step_s
 
 
-# The heading that models are judged with: of the gyro where there is a good one, else of the poses.
+# Heading against which models are compared: from the gyro if there is a good one, else from the poses.
 #
-# A gyro is a better heading and a better clock than a localization, once its sign, scale and bias are known
-# and it is brought into the map's frame by the slow part of its difference from the reported heading.
+# A gyro provides a better heading and a better clock than a localization once its sign, scale and bias are
+# known and the slow part of its difference from the reported heading aligns it with the map.
 
 _LARGEST_DELAY = 0.7  # [s] of poses: those of the recordings are 0.17 to 0.55
-_DELAY_STEP = 0.01  # [s] of the derivative by the delay; five of them are a step of the search
-_FEWEST = 40  # messages, and windows: four seconds at 10 Hz
-_REFINEMENTS = 4  # Gauss-Newton steps from a start that is 25 ms off at most
-_REWEIGHTED = 3  # Huber's weights of each step
-_LEAST_TURNING = 0.02  # [rad] in 0.5 s, median and deviation together: ten times a pose's noise of 2 mrad
-_GOOD = 0.35  # share of turning that poses may leave; half and double change no finding of two recordings
+_DELAY_STEP = 0.01  # [s] of the derivative with respect to the delay; the search uses steps of five times it
+_FEWEST = 40  # minimum number of messages, and of windows: four seconds at 10 Hz
+_REFINEMENTS = 4  # Gauss-Newton steps from a start with an error of at most 25 ms
+_REWEIGHTED = 3  # iterations of Huber's weights per step
+_LEAST_TURNING = 0.02  # [rad] in 0.5 s, median plus standard deviation: ten times the pose noise of 2 mrad
+_GOOD = 0.35  # maximum residual over turning; half and double change no finding of two recordings
 _ALIGN_S = 3.0  # [s] to each side: localizations correct a heading over seconds, vehicles turn faster
-_LEAST_COVERED = 0.95  # share of the poses with a gyro beside them
+_LEAST_COVERED = 0.95  # minimum share of poses with a gyro message nearby
 
 
 class HeadingSource(enum.Enum):
@@ -269,10 +269,10 @@ class Heading:
     """Heading on the cells and at the poses.
 
     Attributes:
-        gyro: how the gyro was used; None where the poses' own heading is.
+        gyro: fit of the gyro; None if the heading is that of the poses.
         edges: gyro heading at the cell edges [rad], shape (n + 1,); empty without a gyro.
-        offset: what is added to the gyro's heading to stand in the map, at every pose [rad]; or the reported
-            heading itself without a gyro, shape (m,).
+        offset: added to the gyro heading to align it with the map, at every pose [rad]; without a gyro, the
+            reported heading, shape (m,).
     """
 
     gyro: GyroFit | None
@@ -301,9 +301,9 @@ def align_heading(track: Track, difference: Floats, good: Flags, span: Ints | No
 
     Args:
         track: the poses.
-        difference: of the reported heading from the other one, shape (n,).
-        good: poses that count, shape (n,); where a piece has none all of its poses do.
-        span: number of the span of each pose; by default holes in the stamps end a span.
+        difference: reported heading minus the other one [rad], shape (n,).
+        good: poses to use, shape (n,); in a piece without any, all poses are used.
+        span: number of the span of each pose; by default gaps in the stamps end a span.
     """
     if span is None:
         span = np.concatenate(([0], np.cumsum(np.diff(track.times) > SPAN_S + ROUNDING_S)))
@@ -348,7 +348,7 @@ def fit_gyro(run: MotionRun) -> GyroFit | None:  # noqa: PLR0911 - each way out 
     if residual > _GOOD or not 0.5 < abs(scale) < 2.0:  # noqa: PLR2004 - no gyro is that wrong
         return None
     _, _, delay, error = _refine((times, angle), (start, end), turned, (scale, bias, best))
-    # The poses' own errors are no reason to distrust the sensor's scale by a fraction of a percent.
+    # Pose errors must not change the scale by a fraction of a percent: it is fitted to longer stretches.
     return GyroFit(*_fit_scale(run, (times, angle), delay), delay, error, residual)
 
 
@@ -375,7 +375,7 @@ def _refine(
     error = np.inf
     unit = np.unique(arrays.number_stretches(start - times[0]), return_inverse=True)[1]
     for _ in range(_REFINEMENTS):
-        # The turning rate is the slope over the delay.
+        # Derivative of the turned angle with respect to the delay.
         slope = scale * (turn(delay + _DELAY_STEP) - turn(delay - _DELAY_STEP)) / (2.0 * _DELAY_STEP)
         design = np.column_stack((turn(delay), end - start, slope))
         target = turned - design[:, :2] @ np.array([scale, bias])
@@ -398,7 +398,7 @@ def _refine(
 def _fit_scale(run: MotionRun, gyro: tuple[Floats, Floats], delay: float) -> tuple[float, float]:
     """Scale and bias [rad/s] from headings over stretches of ten seconds, each with its own offset.
 
-    Over half a second a pose that grows older while it turns has turned too little; over ten that is nothing.
+    Over half a second, poses of growing age show too small a turn; over ten seconds the error is negligible.
 
     Args:
         run: with its poses.
@@ -460,9 +460,9 @@ def fit_turning(gyro: Floats, span: Floats, turned: Floats) -> tuple[float, floa
     """Scale, bias [rad/s] and robust spread [rad] of turned = scale * gyro + bias * span.
 
     Args:
-        gyro: what a sensor turned in every window [rad], shape (n,).
+        gyro: angle measured by a sensor in every window [rad], shape (n,).
         span: length of every window [s], shape (n,).
-        turned: what the vehicle turned [rad], shape (n,).
+        turned: angle turned by the vehicle [rad], shape (n,).
     """
     keep = np.ones(gyro.size, dtype=bool)
     scale = bias = spread = 0.0

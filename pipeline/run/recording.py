@@ -26,16 +26,16 @@ class MotionError(SlipError):
     """Error of a model, an effect, a formula or a fit."""
 
 
-# One run as arrays, ready for models: commands, wheels, poses, gyro, and which stretches count.
+# Conversion of stored tables to a run.
 #
-# This is the only place where stored tables become a run. What is wrong with a recording was corrected when
-# it was aligned (stage `align`); nothing is corrected here.
+# Only this module converts stored tables to a run. The stage `align` has corrected the errors of a recording;
+# nothing is corrected here.
 
 _DEAD = 1e-9
 """Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
 _REPEATED_SHARE = 0.2
-"""Share of repeated poses from which on the stamps' period is an uncertainty of their time: the recordings
-have none, or 0.49 to 0.80."""
+"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
+recordings have none, or 0.49 to 0.80."""
 _ROLLS = 0.3
 """Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 cm/s of a Warthog."""
 _INPUTS = ("command", "measured")
@@ -48,7 +48,7 @@ class Track:
     Attributes:
         times: stamps [s], shape (n,).
         segment: number of the segment, shape (n,).
-        path: position x + iy [m] in the plane, unrolled from body increments, shape (n,).
+        path: position x + iy [m] in the plane, integrated from body increments, shape (n,).
         heading: accumulated rotation about the body's own z axis [rad], shape (n,).
         attitude: roll, pitch, yaw [rad], yaw unwrapped, shape (n, 3).
         position: x, y in the map [m], shape (n, 2).
@@ -69,13 +69,13 @@ class GyroFit:
     """Yaw rate = signed_scale * gyro + bias.
 
     Attributes:
-        signed_scale: negative where the gyro turns the other way.
+        signed_scale: negative if the gyro has the opposite sign.
         bias: [rad/s].
-        yaw_delay_s: how late the heading of the track is against the gyro: none once a recording is aligned.
+        yaw_delay_s: delay of the heading of the track relative to the gyro; zero in an aligned recording.
         delay_error_s: standard error of that delay, from stretches of ten seconds.
         residual: robust spread of the residual over that of the turning itself.
-        moved_s: how late the gyro's own stamps are: at most half the time between two of them, which says
-            nothing of the poses' clock.
+        moved_s: delay of the gyro's own stamps: at most half their period, and independent of the clock of
+            the poses.
     """
 
     signed_scale: float
@@ -95,15 +95,15 @@ class Alignment:
     """Corrections of the clocks, scales and signs of a recording.
 
     Attributes:
-        hold_s: how long after its last command the controller stops; None without commands.
+        hold_s: time from the last command until the controller stops; None without commands.
         command_scale: factor by which the recorded command was multiplied.
-        track_multiplier: by which the controller multiplies the track width.
-        gyro: how the gyro fits the poses; None without a good one.
-        heading_delay_s: how late the reported heading was against the gyro: taken off the poses.
-        wheel_delay_s: how late the encoders were against the gyro: taken off the wheels.
-        latency_spread_s: standard deviation of the latencies that were taken off the poses.
-        outlier_s: time in which the localization contradicts the wheels, beside bad stretches.
-        recorded_moduli: median slip speed with L = 1 m by input before anything was corrected [m/s].
+        track_multiplier: factor by which the controller multiplies the track width.
+        gyro: fit of the gyro to the poses; None without a good one.
+        heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
+        wheel_delay_s: delay of the encoders relative to the gyro, removed from the wheels.
+        latency_spread_s: standard deviation of the latencies removed from the poses.
+        outlier_s: duration of contradictions of localization and wheels, except bad stretches.
+        recorded_moduli: median slip speed with L = 1 m by input before the corrections [m/s].
     """
 
     hold_s: float | None = None
@@ -125,17 +125,17 @@ class MotionRun:
         name: of the run.
         sha256: of its recording, empty when unknown.
         terrain: its terrain.
-        commands: held commands, with stops where the controller fell silent; None without.
-        wheels: measured wheels; None without, or when they are dead.
+        commands: held commands, with stops after the hold time; None without.
+        wheels: measured wheels; None without, or if they never move.
         gyro: times [s] and yaw rate [rad/s], as recorded; None without.
         track: the poses.
-        streams: stamps of everything recorded [s], increasing: where they pause, the recording has a hole.
-        step_starts: where command steps begin [s].
+        streams: stamps of poses, commands and wheels [s], increasing; a pause is a gap of the recording.
+        step_starts: start times of command steps [s].
         excluded: times [s] of samples in bad stretches or without a live command.
         duration_s: length of the run.
-        alignment: how the recording was corrected.
-        repeats_s: time between two published poses where they are repeated until the next one is
-            computed [s]; zero where each is new.
+        alignment: corrections of the recording.
+        repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
+            if each is new.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
     """
 
@@ -326,9 +326,9 @@ def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: In
 
     Args:
         times: stamps of a segment's poses [s], shape (n,).
-        held: repeats of the pose before, shape (n,).
+        held: whether each pose repeats the previous one, shape (n,).
         wheel_times: stamps of measured wheels [s], shape (m,).
-        turned: in how many samples before each of them they turn, and in all, shape (m + 1,).
+        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
     """
     waits = np.zeros(times.size, dtype=bool)
     first, end = np.array(rigid.find_runs(held), dtype=np.int64).reshape(-1, 2).T
@@ -341,7 +341,7 @@ def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: In
 def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
     """Poses of one segment in the plane of motion; headings continue from the previous segment.
 
-    How often a heading has gone round since the map's x axis must not matter between segments.
+    Headings are shifted by full turns, so that consecutive segments differ by less than one.
     """
     position, quaternion = piece["position"], piece["quaternion"]
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
@@ -417,8 +417,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
     starts = times[np.concatenate(([True], np.diff(step) != 0))]
     excluded = [slip.filter(slip["suspect"])["t"].to_numpy()]
-    # Rows are missing where no live command stands beside the motion: such stretches are not scored either.
-    # Before the first command nobody knows what was asked.
+    # Motion without a live command has no rows: such stretches are not scored either. Commands before the
+    # first one are unknown.
     known = np.concatenate(
         ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
     )

@@ -1,8 +1,8 @@
-"""The signals on a command's way: commands, wheels, rolling, velocity; and what surrounds them.
+"""Signals from commands to motion: commands, wheels, rolling and velocity, and their context.
 
-Commands stand at their own stamps. Everything after them stands on cells: short stretches of equal length
-whose values are means over the cell, so that a held command enters exactly wherever its stamp falls. Cells
-are grouped in spans; between spans the recording had a hole.
+Commands have their own stamps. All later signals are on cells: short intervals of equal length with the mean
+of the signal, so that held commands are exact for any stamp. Cells are grouped in spans; between spans the
+recording has a gap.
 """
 
 from __future__ import annotations
@@ -73,8 +73,8 @@ class Wheels:
         steering: steering angle [rad], shape (n,).
         sideways: speed of the wheels that moves the vehicle to the left [rad/s], shape (n,); None on one that
             cannot move sideways.
-        straight: share of each cell in which no turn is asked for, the sides alike, shape (n,); None where
-            what is asked for is not known by its stamps.
+        straight: share of each cell in which the commands of the sides are equal, shape (n,); None if the
+            commands are not known by their stamps.
     """
 
     left: Floats
@@ -134,8 +134,8 @@ class Rolling:
     Attributes:
         v0: forward [m/s], shape (n,).
         w0: yaw rate [rad/s], shape (n,).
-        wheels: the drivetrain's output it came from.
-        s0: to the left [m/s], shape (n,); plain zero on a vehicle that cannot move sideways.
+        wheels: output of the drivetrain from which it is computed.
+        s0: to the left [m/s], shape (n,); scalar zero for a vehicle that cannot move sideways.
     """
 
     v0: Floats
@@ -180,10 +180,10 @@ class Resets:
     """Resets of internal states, and their start values.
 
     Attributes:
-        number: which reset each cell follows, shape (n,).
-        first: first cell that follows each reset: nothing is carried over into it, shape (k,).
+        number: number of the last reset before each cell, shape (n,).
+        first: first cell after each reset, into which no state is carried over, shape (k,).
         at: cell before which the state is set, shape (k,).
-        start: the state, one column a signal; NaN for the input's own value, shape (k, m).
+        start: state, one column per signal; NaN for the value of the input, shape (k, m).
     """
 
     number: Integers
@@ -202,9 +202,9 @@ class RunContext:
         start_s: start of the run [s].
         step_s: width of a cell [s].
         duration_s: length of the run [s].
-        spans: begin where the recording begins anew; states unknown.
-        wheels: begin where wheel speeds are known: (left, right, sideways) [rad/s].
-        body: begin where the body velocity is known: (v_x, v_y, v_w).
+        spans: resets at the starts of spans; states unknown.
+        wheels: resets with known wheel speeds: (left, right, sideways) [rad/s].
+        body: resets with known body velocity: (v_x, v_y, v_w).
         attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
         position: x, y as reported [m], shape (n, 2).
     """
@@ -229,7 +229,7 @@ class RunContext:
 
     @property
     def slope_rad(self) -> float:
-        """Half of the range of pitch over nine tenths of the run [rad]."""
+        """Half of the range of pitch in the central nine tenths of its values [rad]."""
         low, high = np.quantile(self.attitude[:, 1], (0.05, 0.95))
         return 0.5 * float(high - low)
 
@@ -240,17 +240,17 @@ class RunContext:
 
 
 STILL_MPS = 0.02
-"""Slower [m/s], a wheel or a vehicle stands: encoders' rounding, wheels that a motor winds up, poses that
-wander; half and double change no finding of two recordings."""
+"""Speed [m/s] below which a wheel or vehicle is at rest: encoder rounding, wheels wound up by a motor,
+drifting poses; half and double change no finding of two recordings."""
 MOVING_MPS = 0.1
-"""Faster [m/s], a vehicle moves, and its velocity has a direction and is a divisor: 4 mm of noise over 0.75 s
-are 5 % of it."""
+"""Speed [m/s] above which a vehicle moves, and its velocity has a direction and can be a divisor: 4 mm of
+noise over 0.75 s are 5 % of it."""
 LIVE_SHARE = 0.1
-"""Share of the usual largest speed from which on a side turns, and its sign and ratios say something: what is
-less may be noise, friction or poses that wander."""
+"""Share of the usual largest speed above which a side turns and its sign and ratios are significant: a lower
+speed may be noise, friction or drift of the poses."""
 ANSWERS_S = 2.0
-"""Time [s] in which a drive does what it is asked: longer than dead times and pauses; of a step behind a lag
-of 1.2 s, 19 % are left."""
+"""Time [s] in which a drive follows a command: longer than dead times and pauses; with a lag of 1.2 s, 19 %
+of a step remain after it."""
 LEAST_RIM_SPEED = 0.01
 """Speed of the fastest rim [m/s] above which effects of driving act."""
 
@@ -270,7 +270,7 @@ def name_inputs(drive: Drive, vehicle: Vehicle) -> dict[str, Floats]:
 
 
 def roll_ideally(wheels: Wheels, context: RunContext) -> Rolling:
-    """Ideal velocity of the drivetrain's output, without the sideways motion of a lever."""
+    """Ideal velocity of the drivetrain's output, without the sideways motion of a lever arm."""
     vehicle = context.vehicle
     forward, sideways, turning = vehicle.kinematics.forward(name_inputs(wheels, vehicle), vehicle)
     return Rolling(forward, turning, wheels, 0.0 if wheels.sideways is None else sideways)

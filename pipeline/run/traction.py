@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-# What tells an event at a moment is known at that moment: the rule runs forward in time, and the same source
-# is exported for robots (`export/targets/data_formats.py`). Shares are of the motion that the wheels
-# usually bring on this ground, so that deep snow that takes half all the time is no event. Turning is left
-# out: what a skid-steered vehicle slips in turns is its drive.
+# The rule is causal: it uses past and present samples only. The same source is exported for robots
+# (`export/targets/data_formats.py`). Ratios refer to the usual speed of the body at given wheel speeds on
+# this terrain: deep snow that always takes half of it is no event. Turns are excluded, because skid-steered
+# vehicles always slip in turns.
 
 
 @dataclass(frozen=True)
@@ -16,19 +16,19 @@ class Limits:
     """Thresholds of `trace_traction`; `make events` measures misses, false alarms and lead times with them.
 
     Attributes:
-        live: wheels that bring less tell nothing of the ground [m/s].
-        margin: a body that slides is faster than its wheels by so much [m/s], or by half of it for longer.
-        window_s: wheels turn alike for so long before the body is compared with them [s]: lags are over then.
-        steady: share by which their speed changes in it at most [1].
-        falls_s: the body's share of the wheels' motion is set against that of so long ago, and up to three
-            times as long [s].
-        drop: by which it falls in that time [1].
-        half: share below which wheels that dig in are told [1].
-        lost: share below which wheels spin, however they came to it [1].
-        excess: times the wheels' speed that a sliding body has [1]; poses that have it on steady wheels jump.
-        dig_hold_s: how long the motion is lost before it is told [s].
-        sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
-        hold_s: how long wheels spin or a body slides before it is told [s].
+        live: usual body speed above which traction is judged [m/s].
+        margin: speed of a sliding body above `excess` times its wheels [m/s]; half of it is detected later.
+        window_s: duration of steady wheel speed before body and wheels are compared [s]: lags have decayed.
+        steady: maximum relative change of wheel speed in this window [1].
+        falls_s: minimum age of the ratios of body to wheel speed with which the present one is compared [s];
+            the maximum age is three times as long.
+        drop: decrease of this ratio in that time when wheels dig in [1].
+        half: ratio below which wheels dig in [1].
+        lost: ratio below which wheels spin, with or without a decrease [1].
+        excess: minimum ratio of a sliding body [1]; with steady wheels, a larger one is a jump of the poses.
+        dig_hold_s: duration of the loss after which digging in is reported [s].
+        sudden_s: longest time with a ratio below `lost` when wheels dig in [s]; above it, they broke loose.
+        hold_s: duration of spinning or sliding after which it is reported [s].
     """
 
     live: float
@@ -46,10 +46,10 @@ class Limits:
 
 
 LEAST_SHARE = 0.125
-"""Of the usual largest speed, which wheels must bring: slower ones tell nothing of the ground. Also the least
-gain that a limit is divided by."""
+"""Share of the usual largest speed above which traction is judged. Also the minimum gain by which a limit is
+divided."""
 MARGIN_SHARE = 0.25
-"""Share of it by which a body must be faster than its wheels: lags and drifting poses stay below."""
+"""`Limits.margin` as a share of the usual largest speed: lags and drifting poses stay below it."""
 
 
 def find_limits(top: float, gain: float) -> Limits:
@@ -57,9 +57,9 @@ def find_limits(top: float, gain: float) -> Limits:
 
     Args:
         top: usual largest speed [m/s].
-        gain: forward speed that the wheels usually bring, over their own.
+        gain: usual ratio of body to wheel speed, forward.
     """
-    # A body that is faster than usual but not faster than its wheels has found better ground.
+    # A body that is faster than usual, but not faster than its wheels, has better traction.
     excess = Limits.excess / min(max(gain, LEAST_SHARE), 1.0)
     return Limits(LEAST_SHARE * top, MARGIN_SHARE * top, excess=excess)
 
@@ -86,23 +86,23 @@ def trace_traction(
     """State of the wheels at every step: 0 drive, 1 dig in, 2 spin, 3 slide.
 
     Args:
-        wheels: forward speed that the wheels usually bring when they turn as they do [m/s].
-        turning: rim speed of their turning, half the track times the yaw rate that they ask for [m/s].
+        wheels: forward speed of the body that is usual at the wheel speeds [m/s].
+        turning: rim speed due to turning, half the track times the yaw rate from the wheels [m/s].
         body: forward speed of the body [m/s].
-        step_s: time between two of them [s].
-        live: wheels that bring less tell nothing [m/s].
-        margin: a sliding body is faster than its wheels by so much [m/s], or by half of it for longer.
-        window_s: wheels turn alike for so long before the body is compared with them [s].
-        steady: share by which their speed changes in it at most.
-        falls_s: the body's share of the wheels' motion is set against that of so long ago, and up to three
-            times as long [s].
-        drop: by which it falls.
-        half: share below which wheels dig in.
-        lost: share below which they spin.
-        excess: times the wheels' speed that a sliding body has.
-        dig_hold_s: how long the motion is lost before it is told [s].
-        sudden_s: wheels that brought almost nothing for so long of it broke loose: they did not dig in [s].
-        hold_s: how long they spin, or the body slides, before it is told [s].
+        step_s: time step [s].
+        live: usual body speed above which traction is judged [m/s].
+        margin: speed of a sliding body above `excess` times its wheels [m/s]; half of it is detected later.
+        window_s: duration of steady wheel speed before body and wheels are compared [s].
+        steady: maximum relative change of wheel speed in this window.
+        falls_s: minimum age of the ratios of body to wheel speed with which the present one is compared [s];
+            the maximum age is three times as long.
+        drop: decrease of this ratio when wheels dig in.
+        half: ratio below which wheels dig in.
+        lost: ratio below which they spin.
+        excess: minimum ratio of a sliding body.
+        dig_hold_s: duration of the loss after which digging in is reported [s].
+        sudden_s: longest time with a ratio below `lost` when wheels dig in [s]; above it, they broke loose.
+        hold_s: duration of spinning or sliding after which it is reported [s].
     """
     window, falls = round(window_s / step_s), round(falls_s / step_s)
     codes, shares = [], []
@@ -118,13 +118,13 @@ def trace_traction(
             slowest, fastest = -fastest, -slowest
         is_straight = abs(turning[now]) < abs(wheels[now])
         compared = compared + 1 if slowest > live and is_straight else 0
-        # While the wheels change their speed, nothing is learned of the ground and nothing is forgotten.
+        # While the wheel speed changes, the last ratio remains valid.
         is_steady = not compared or fastest - slowest < steady * fastest
         if is_steady:
             share = forward * body[now] / slowest if compared else 1.0
         if share > excess:
             surge = now
-        # Poses that ran ahead of the wheels stand still until these have caught up.
+        # Poses that jumped ahead of the wheels then stand still until the wheels have caught up.
         share = share if now - surge > falls else 1.0
         shares.append(share)
         earlier = shares[max(now - compared + 1, now - 3 * falls) : now - falls]
@@ -132,8 +132,8 @@ def trace_traction(
         digs = digs + 1 if share < half and before - share > drop else 0
         spins = spins + is_steady if share < lost else 0
         most = max(abs(slowest), abs(fastest))
-        # Page's cumulative sum with bounded steps: a body that slows down as it slides still counts, and a
-        # jump of the poses counts no more than its time.
+        # Page's CUSUM with bounded steps: a sliding body that slows down is still detected, and a jump of the
+        # poses has no more weight than its duration.
         faster = 2.0 * (abs(body[now]) - excess * most) - margin
         slid = max(slid + min(faster, margin) * step_s, 0.0)
         if spins * step_s > hold_s:

@@ -11,9 +11,9 @@ from pipeline.run.heading import SPAN_S, Grid, has_excluded
 from pipeline.run.recording import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 
-# What is compared: displacements over half a second, and two seconds of prediction from a measured pose.
+# Models are compared by displacements over half a second and predictions over two seconds from a pose.
 #
-# Poses are gathered into nodes; windows join nodes of one segment. Nothing crosses a hole, a jump, a bad
+# Poses are averaged to nodes; windows connect nodes of one segment. No window crosses a gap, a jump, a bad
 # stretch or the end of an interval with live commands.
 
 WINDOW_S = SPAN_S
@@ -24,8 +24,8 @@ HORIZON_S = 2.0
 NODE_S = 0.25
 """Step between means of poses [s]: windows overlap by half."""
 _GATHER_S = 0.066
-"""Half-width of the mean over poses [s]: of three poses at 20 Hz, which reduces noise and no motion of half a
-second."""
+"""Half-width of the mean over poses [s]: of three poses at 20 Hz, which reduces noise, but no motion of half
+a second."""
 _DENSE_S = 0.08
 """Median period of poses [s] above which they are not averaged: 0.13 s would contain one or two."""
 _LEAD_S = 0.5
@@ -36,8 +36,8 @@ _LEAST_LEAD_S = 0.02
 _SHORTEST_BLOCK_S = 5.0
 """Shortest block [s]: several times the correlation time of residuals (about a second)."""
 _LONGEST_BLOCK_S = 12.0
-"""Longest block [s]: above it, a block is cut into pieces of half of it and more, so that a run of one
-command step has folds, too."""
+"""Longest block [s]: a longer one is divided into pieces of at least half of it, so that a run of one command
+step has folds, too."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Nodes:
         first: index in `poses` of the first member of each group, shape (n,).
         count: members of each group, shape (n,).
         times: mean stamp of each group [s], shape (n,).
-        piece: number of the stretch without segment end or hole, shape (n,).
+        piece: number of the stretch without segment end or gap, shape (n,).
     """
 
     poses: Ints
@@ -89,9 +89,9 @@ class Horizons:
     """Predictions of up to two seconds: one row per predicted node.
 
     Attributes:
-        origin: node predicted from, shape (n,).
-        node: node reached, shape (n,).
-        number: which prediction a row belongs to, shape (n,).
+        origin: start node of the prediction, shape (n,).
+        node: predicted node, shape (n,).
+        number: number of the prediction, shape (n,).
         block: block of the prediction's start, shape (n,).
         times: start of the prediction and its end, shape (n, 2).
     """
@@ -152,8 +152,8 @@ def number_blocks(run: MotionRun, grid: Grid) -> Floats:
 def find_lead(run: MotionRun, delay_s: float) -> float:
     """Time after the start of a span that is not compared [s].
 
-    Where encoders say what the wheels did when the recording began, only the delay of the poses must pass:
-    they report what happened before. Without them the state of the drive must settle first.
+    With encoders, the wheel speeds at the start are known, and only the delay of the poses must pass: delayed
+    poses report earlier motion. Without encoders, the state of the drive must settle first.
     """
     return _LEAD_S if run.wheels is None else max(delay_s, 0.0) + _LEAST_LEAD_S
 
@@ -220,7 +220,7 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
     """Stamp [s] after a duration of driving [s]: wheels turn or are commanded to, and poses are known.
 
     Raises:
-        MotionError: ``too_short``: it was not.
+        MotionError: ``too_short``: the run contains less driving.
     """
     times = run.track.times[run.track.active]
     steps = np.diff(times)
@@ -241,8 +241,8 @@ def find_driven(run: MotionRun, driven_s: float) -> float:
 def cut_run(run: MotionRun, begin_s: float = -np.inf, end_s: float = np.inf) -> MotionRun:
     """The run with only the poses between two stamps [s]; earlier inputs are still known.
 
-    Recorded series end with the stretch: a fit to the first seconds of a run sees nothing of the rest but how
-    its clocks were aligned.
+    Recorded series end with the stretch: a fit to the first seconds of a run uses nothing of the rest, except
+    the alignment of its clocks.
     """
     track = run.track
     counts = track.active & (track.times >= begin_s) & (track.times <= end_s)
@@ -288,7 +288,7 @@ def find_gaps(
         first: first pose of every node, shape (k,).
         start: node at which every window begins, shape (b,).
         end: node at which it ends, shape (b,).
-        frame: turns the map into the frame of the window, shape (b,).
+        frame: rotation from the map to the frame of the window, shape (b,).
         moved: measured displacement in that frame [m], shape (b,).
         turned: measured change of heading [rad], shape (b,).
         span_s: length of the window [s], shape (b,).
@@ -372,9 +372,9 @@ def average_spans(
         signal: on cells, shape (n,).
         step_s: width of a cell.
         first: cell in which every window begins, shape (b,).
-        into_first: share of that cell that lies before it, shape (b,).
+        into_first: share of that cell before the start of the window, shape (b,).
         last: cell in which every window ends, shape (b,).
-        into_last: share of that cell that lies before its end, shape (b,).
+        into_last: share of that cell before the end of the window, shape (b,).
         width_s: length of every window [s], shape (b,).
 
     Returns:
