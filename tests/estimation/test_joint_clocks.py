@@ -134,7 +134,7 @@ def test_undecided_are_rivals_of_as_many_numbers_once_each(
     selection = SimpleNamespace(
         drop=lambda *_: model((), 0.0),
         loss=lambda _: 1.0,
-        rivals={(final.ids, "transport_delay"): [model((name,), 1.0) for name in others]},
+        rivals={(final.ids, ("transport_delay",), ()): [model((name,), 1.0) for name in others]},
         given=frozenset(),
         budget=SimpleNamespace(is_spent=lambda: False),
         weights=SimpleNamespace(scale=1.0),
