@@ -96,7 +96,7 @@ def test_a_fit_is_that_of_the_command_line(
     assert slip.Model.read(path).export("python").startswith('"""')
 
     compared = ask(run, capsys, "model", "compare", str(path), str(path), "--on", run.name)["compared"][0]
-    errors = fit.model.errors(run)
+    errors = slip.Model.read(path).errors(run)  # with the six digits of the file, as `compare` reads it
     assert errors["t_mrmse_m"].to_list() == [
         compared[key]["t_mrmse_m"] for key in ("carried", "own_fit", "ideal")
     ]
