@@ -55,7 +55,7 @@ class Loss:
 
 # The records of an MCAP file: opcodes, and mcap's own records parsed from bodies with untrusted lengths.
 #
-# Layout according to the MCAP specification, version 0x30: a record is an opcode (u8), a length (u64) and the body.
+# Layout as in the MCAP specification, version 0x30: a record is an opcode (u8), a length (u64), the body.
 
 Buffer = bytes | memoryview
 
