@@ -11,6 +11,7 @@ from pipeline.batch.request import (
     Shard,
     count_cores,
     measure_memory,
+    parse_memory_limit,
     parse_shard,
     parse_size,
 )

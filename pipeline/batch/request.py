@@ -26,6 +26,8 @@ class BatchError(SlipError):
 
 _SIZE = re.compile(r"\s*(\d+(?:\.\d+)?)\s*([kmgt]?)i?b?\s*", re.IGNORECASE)
 _SHARD = re.compile(r"(\d+)/(\d+)")
+_WORKER_BYTES = 200_000_000
+"""Memory of a worker that has imported the stages and opened a log."""
 
 
 def count_cores() -> int:
@@ -99,6 +101,22 @@ def parse_size(text: str) -> int:
             "bad_size", f"{shorten(text)!r} is not a size", hint="Write for example 500MB or 2GB"
         )
     return int(size)
+
+
+def parse_memory_limit(text: str) -> int:
+    """The memory limit of a worker [bytes], at least what a worker needs before it reads anything.
+
+    Raises:
+        BatchError: ``bad_size``, ``memory_too_small``.
+    """
+    size = parse_size(text)
+    if size < _WORKER_BYTES:
+        raise BatchError(
+            "memory_too_small",
+            f"a worker does not start within a memory limit of {shorten(text)!r}",
+            hint=f"Give at least {_WORKER_BYTES // 1_000_000}MB, or with large logs 2GB",
+        )
+    return size
 
 
 def parse_shard(text: str) -> Shard:

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_shard, parse_size
+from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_memory_limit, parse_shard, parse_size
 from pipeline.batch.request import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
     CLEAN,
@@ -123,7 +123,7 @@ def run(  # noqa: D417 - the shared choices document themselves
         timeout_s=timeout,
         memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
         if memory is None
-        else parse_size(memory),
+        else parse_memory_limit(memory),
         settle_s=settle,
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,
@@ -271,7 +271,7 @@ def serve(  # noqa: D417 - the results folder documents itself
             "can read these results and change models. Leave --host out to serve this machine only."
         )
     limits = Limits(
-        timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_size(memory)
+        timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_memory_limit(memory)
     )
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN

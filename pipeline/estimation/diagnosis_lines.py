@@ -48,7 +48,7 @@ _WIDEST = 34
 """Largest column width for the values of an effect in a table of effects."""
 _MOST_IN_LINE = 2
 """Most values in one line; an effect with more, as a servo, has one line per value."""
-_UNCHANGED = "changes no error over 2 s by as much as is shown"
+_UNCHANGED = "no visible change of the error over 2 s"
 _WHERE_SHOWN = 3
 """Regions of the error that are listed."""
 _UNOBSERVABLE_SHOWN = 8

@@ -132,8 +132,6 @@ def _make_features(part: Part) -> Floats:
 
 LAG_S = 0.25
 """Step of the lags of `average_lags` [s]: half a window, as its means do not resolve shorter times."""
-IDEAL_CHANNELS = (0, 2, 1)
-"""Index in (x, y, w) of each column of `Part.find_ideal`."""
 _NO_DELAY = Timing()
 _NARROW = 0.1
 """Share of a derivative's step for central differences: with whole steps, two fits of one model to ice differ
@@ -237,7 +235,7 @@ class Part(ABC):
         """Ideal velocity of the input averaged over windows, now and up to 2 s earlier.
 
         Returns:
-            f_x, f_w, and f_y of a vehicle that moves sideways (see `IDEAL_CHANNELS`), lags a quarter of a
+            f_x, f_w, and f_y of a vehicle that moves sideways, lags a quarter of a
             second apart, shape (n, lags, 2 or 3).
         """
         return np.concatenate([average_lags(c, c.predict_velocity((), _NO_DELAY)) for c in self.comparisons])

@@ -105,6 +105,7 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
         (("batch", "x", "--quota", "1GB"), "--quota does nothing by itself"),
         (("batch", "x", "--shard", "0/4"), "is not a shard"),
         (("batch", "x", "--memory", "lots"), "is not a size"),
+        (("batch", "x", "--memory", "1"), "a worker does not start within a memory limit of '1'"),
         (("batch", "x", "--max-inflated", "9" * 400), "is not a size"),
         (("batch", "x", "--prune", "--quota", "much"), "is not a size"),
         (("batch", "schedule", "x", "--at", "noon"), "is not a time of day"),

@@ -42,8 +42,8 @@ class BodyTurnLimit(CommandEffect):
             quantities=(Quantity.TURN_LIMIT,),
         ),
     )
-    motion = "Yaw rate limit: commands are clipped at {degrees:.3g} degrees/s"
-    clause = "clips the commanded yaw rate at {degrees:.3g} degrees/s"
+    motion = "Yaw rate limit: commands are clipped at {size:.3g} rad/s"
+    clause = "clips the commanded yaw rate at {size:.3g} rad/s"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "turn_droop")
     python = """

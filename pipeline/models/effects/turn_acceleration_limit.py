@@ -36,8 +36,8 @@ class TurnAccelerationLimit(DriveEffect):
             level=Level.VEHICLE,
         ),
     )
-    motion = "Turn acceleration limit: {degrees:.3g} degrees/s^2"
-    clause = "changes its yaw rate by at most {degrees:.3g} degrees/s^2"
+    motion = "Turn acceleration limit: {size:.3g} rad/s^2"
+    clause = "changes its yaw rate by at most {size:.3g} rad/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING)
     confused_with = ("acceleration_limit", "turn_servo", "turn_lag")
     same_in_one_motion = ("acceleration_limit",)

@@ -32,7 +32,7 @@ class TurningResistance(LinearEffect):
         ),
     )
     motion = "Turning resistance: the robot travels {share} at 1 rad/s than straight ahead"
-    clause = "travels {share} while turning at 57 degrees/s than straight ahead"
+    clause = "travels {share} while turning at 1 rad/s than straight ahead"
     share_of = (1.0, -1.0)
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("speed_slip", "wheel_radius")

@@ -19,8 +19,8 @@ class YawDrift(LinearEffect):
 
     id = "yaw_drift"
     parameters = (Parameter("c", "rad/s", (-0.5, 0.5), 0.0, "yaw rate to the left", 0.06),)
-    motion = "Yaw drift: {degrees:.2g} degrees/s to the {way} while the wheels turn"
-    clause = "turns {degrees:.2g} degrees/s to the {way} while its wheels turn"
+    motion = "Yaw drift: {size:.2g} rad/s to the {way} while the wheels turn"
+    clause = "turns {size:.2g} rad/s to the {way} while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("wheel_asymmetry", "steering_offset")
     python = "v_w = v_w + {c} * turning"
