@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
-from pipeline.batch import Pruning, Request, count_cores, measure_memory, parse_memory_limit, parse_shard, parse_size
+from pipeline.batch import (
+    Pruning,
+    Request,
+    count_cores,
+    measure_memory,
+    parse_memory_limit,
+    parse_shard,
+    parse_size,
+)
 from pipeline.batch.request import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
     CLEAN,
@@ -271,7 +279,8 @@ def serve(  # noqa: D417 - the results folder documents itself
             "can read these results and change models. Leave --host out to serve this machine only."
         )
     limits = Limits(
-        timeout_s=timeout, memory_bytes=measure_memory() // 2 if memory is None else parse_memory_limit(memory)
+        timeout_s=timeout,
+        memory_bytes=measure_memory() // 2 if memory is None else parse_memory_limit(memory),
     )
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN

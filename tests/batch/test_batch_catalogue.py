@@ -39,6 +39,7 @@ document.body.append(told);
 """
 
 
+@pytest.mark.long
 @pytest.mark.skipif(BROWSER is None, reason="there is no browser here; `make browser` installs one")
 def test_columns_sort_and_the_box_searches(season: Path, tmp_path: Path) -> None:
     batch(season, tmp_path / "out")

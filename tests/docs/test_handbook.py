@@ -74,6 +74,7 @@ def test_an_effects_page_has_formula_parameters_sentence_source_and_settings() -
     ]
 
 
+@pytest.mark.long
 def test_the_search_works_from_the_disk_and_nothing_is_asked_of_a_network(
     handbook: Path, chrome: Chrome
 ) -> None:

@@ -17,6 +17,7 @@ PAGE = """<!DOCTYPE html><html lang="en"><title>page</title>
 <meta name="viewport" content="width=device-width"><body><main><h1>page</h1>{}</main></body></html>"""
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("flaw", "found"),
     [

@@ -329,6 +329,7 @@ def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path:
     assert after < 0.7 * before  # type: ignore[operator]
 
 
+@pytest.mark.long
 def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tmp_path: Path) -> None:
     pushed = Disturbance(0.1, 0.15, correlation_s=4.0)
     scenario = replace(_SCENE, effects={"effective_track": 1.8}, disturbance=pushed, duration_s=240.0)
@@ -431,6 +432,7 @@ def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
         find_effect("effective_track")(k=-1.0)
 
 
+@pytest.mark.long
 def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_path: Path) -> None:
     hidden = {"drive_lag": 0.55, "effective_track": 1.56, "deadband": 0.235}
     found = _diagnose(replace(_SCENE, effects=hidden), tmp_path).runs[0]

@@ -24,6 +24,7 @@ def _find_circumstances(
     return [region for region in run.where if region.kind in {"time", "place"}]
 
 
+@pytest.mark.long
 def test_commands_that_differ_from_place_to_place_are_no_effect_of_place(tmp_path: Path) -> None:
     # A half of the map has two thirds of the forward error, a fifth of the time 40 % of it.
     assert _find_circumstances({"effective_track": 1.8, "drive_lag": 0.4}, 2, tmp_path) == []

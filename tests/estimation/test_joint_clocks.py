@@ -62,7 +62,7 @@ def _diagnose(
 
 @pytest.mark.parametrize(
     ("layout", "effects"),
-    [("body_command", {}), ("husky", {"drive_lag": 0.4})],
+    [("body_command", {}), pytest.param("husky", {"drive_lag": 0.4}, marks=pytest.mark.long)],
     ids=["the command alone", "encoders and a lag"],
 )
 def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(

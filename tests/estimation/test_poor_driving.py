@@ -58,6 +58,7 @@ def test_one_circle_does_not_tell_a_droop_from_a_limit(tmp_path: Path) -> None:
     assert any({"body_turn_limit", "difference_gain"} <= set(item.candidates) for item in found.undecided)
 
 
+@pytest.mark.long
 def test_a_change_of_ground_on_a_straight_is_a_change_of_speed(tmp_path: Path) -> None:
     found = _drive("straight", {"terrain_change": {"k_v": 0.8, "k_w": 0.75}}, tmp_path)
     named = {effect.id: effect for effect in found.effects}

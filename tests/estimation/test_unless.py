@@ -130,6 +130,7 @@ def test_a_plan_asks_whether_it_acts(recorded: tuple[Vehicle, Recording]) -> Non
     assert "whether body_inertia acts" in {question.text for question in asked}
 
 
+@pytest.mark.long
 def test_with_driving_enough_numbers_are_told_alone(tmp_path: Path) -> None:
     write_log(simulate_run(replace(_SKID, duration_s=150.0)), tmp_path / "run.mcap")
     options = Options(out=tmp_path / "out", report=False, diagnosis=False)

@@ -93,7 +93,8 @@ def check_form(verdict: str) -> None:
     assert 1 <= len(re.findall(r"\.(?:\s|$)", verdict)) <= 3
     assert verdict[0].isupper()
     assert verdict.endswith(".")
-    assert not re.search(r"\w_\w|\b(?:nan|inf|None|rad)\b", verdict)
+    # Angles are in degrees; rates in rad/s, as in commands.
+    assert not re.search(r"\w_\w|\b(?:nan|inf|None|rad(?!/s))\b", verdict)
 
 
 def test_the_verdict_says_how_far_off_why_and_what_remains() -> None:

@@ -36,7 +36,7 @@ def list_changed(found: list[Change]) -> list[int]:
     return [place for place, change in enumerate(found) if change.status == "changed"]
 
 
-@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("runs", [1, pytest.param(3, marks=pytest.mark.long)])
 def test_runs_that_differ_as_is_usual_raise_few_alarms(runs: int) -> None:
     draw = np.random.default_rng(7)
     usual = 0.3
@@ -96,7 +96,9 @@ def test_the_runs_that_are_asked_for_show_the_difference() -> None:
     assert 1 <= more <= 6
 
 
-@pytest.mark.parametrize("size", [0.7, 1.0, 1.4])
+@pytest.mark.parametrize(
+    "size", [pytest.param(0.7, marks=pytest.mark.long), 1.0, pytest.param(1.4, marks=pytest.mark.long)]
+)
 def test_a_change_is_found_as_often_as_is_said(size: float) -> None:
     draw = np.random.default_rng(12)
     # Spreads as they are believed to be: those of single runs cannot be told by the runs themselves.

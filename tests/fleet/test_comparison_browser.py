@@ -49,7 +49,14 @@ def results(tmp_path: Path) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("verb", ["compare", "fleet map", "fleet trend"])
+@pytest.mark.parametrize(
+    "verb",
+    [
+        "compare",
+        pytest.param("fleet map", marks=pytest.mark.long),
+        pytest.param("fleet trend", marks=pytest.mark.long),
+    ],
+)
 def test_nothing_is_cut_or_overlaps(verb: str, chrome: Chrome, results: Path, pictures: Path) -> None:
     with pytest.raises(SystemExit) as ended:
         main([*verb.split(), str(results), "--quiet"])

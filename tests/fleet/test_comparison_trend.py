@@ -195,6 +195,7 @@ def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.Capture
             assert bool(json.loads(spoken)["alerts"]) == (code == 4)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("at_bound", [False, True])
 def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *, at_bound: bool) -> None:
     wobble = [0.0, 0.004, -0.004, 0.002]

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
+import pytest
 from test_fleet_levels import ALIKE, draw
 from verbs import run_verb
 
@@ -47,6 +48,7 @@ def test_poses_that_gyros_have_dated_are_no_body_that_is_late() -> None:
     assert names[True] == ("body_inertia", ("clock_offset", "body_inertia"))
 
 
+@pytest.mark.long
 def test_late_poses_that_a_gyro_dated_are_judged_with_the_clock_once(tmp_path: Path) -> None:
     out, log = tmp_path / "out", tmp_path / "first.mcap"
     write_log(simulate_run(_SCENE), log)

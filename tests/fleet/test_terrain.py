@@ -96,6 +96,7 @@ def test_what_each_pass_changes_is_told_with_an_interval_that_holds_it(change: f
     assert "per pass [" in effects[0].describe()
 
 
+@pytest.mark.long
 def test_ground_that_does_not_change_is_seldom_said_to() -> None:
     effects = [measure(draw_laps(0.0, seed)) for seed in range(100, 180)]
     assert sum(effect.is_significant for effect in effects) <= 8

@@ -56,6 +56,7 @@ def read_truth(rings: Path) -> dict[str, Any]:
     return truth
 
 
+@pytest.mark.long
 def test_the_same_seed_gives_the_same_bytes_and_another_seed_others(rings: Path, tmp_path: Path) -> None:
     for name, seed in (("again", make_rings.SEED), ("other", make_rings.SEED + 1)):
         arguments = ["--out", str(tmp_path / name), "--rings", "open", "--tasks", "4", "--seed", str(seed)]

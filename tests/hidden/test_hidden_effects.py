@@ -287,6 +287,7 @@ def test_rigid_bodies_show_what_was_built_into_them() -> None:
     assert sum(map(is_found, records)) >= 0.8 * len(records), "\n".join(describe("rigid", records))
 
 
+@pytest.mark.long
 def test_an_effect_whose_interval_includes_no_effect_is_a_finding_and_no_name(tmp_path: Path) -> None:
     """A heading skew of 18 ms with an interval from -3 to 38 ms was named beside the three hidden effects."""
     log = tmp_path / "run.mcap"

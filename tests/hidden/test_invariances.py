@@ -35,6 +35,7 @@ def _assert_same(before: Answer, after: Answer) -> None:
         assert after.numbers[label][0] == pytest.approx(value, rel=1e-4, abs=room)
 
 
+@pytest.mark.long
 def test_neither_the_map_nor_the_recorder_s_start_changes_an_answer() -> None:
     turned, earlier = (_BY_NAME[name].change for name in _EXACT)
     both = Injection("both", lambda tables, drive: earlier(turned(tables, drive), drive))

@@ -87,7 +87,7 @@ def make_server(kind: str, messages: list[Played], port: int = 0):  # type: igno
     return {"older": OlderFoxgloveServer, "rosbridge": RosbridgeServer}[kind](messages, port)
 
 
-@pytest.mark.parametrize("kind", ["sdk", "older", "rosbridge"])
+@pytest.mark.parametrize("kind", ["sdk", pytest.param("older", marks=pytest.mark.long), "rosbridge"])
 def test_what_a_server_sends_is_recorded_as_it_is(kind: str, source: Path, tmp_path: Path) -> None:
     messages = read_messages(source)
     server = make_server(kind, messages)
@@ -304,6 +304,7 @@ def test_without_the_extra_one_line_says_what_to_install(
         receiver.run()
 
 
+@pytest.mark.long
 def test_rosbridge_without_rosapi_takes_topics_with_types(source: Path, tmp_path: Path) -> None:
     messages = read_messages(source)[:300]
     server = RosbridgeServer(messages, has_rosapi=False)

@@ -166,7 +166,7 @@ def test_topics_and_vehicle_of_a_platform_are_chosen_without_configuration(name:
     assert (*map(str, roles), chosen.vehicle.id, chosen.vehicle_source) == EXPECTED[name]
 
 
-@pytest.mark.parametrize("name", ["turtlebot4", "f1tenth", "duckiebot"])
+@pytest.mark.parametrize("name", ["turtlebot4", "f1tenth"])
 def test_hidden_effects_of_a_platform_are_named(name: str, tmp_path: Path) -> None:
     assert try_platform(name, tmp_path).named
 

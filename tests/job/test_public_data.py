@@ -32,6 +32,7 @@ def test_fomo_is_recognized_and_what_it_lacks_is_said(tmp_path: Path) -> None:
     assert "not in the folder: vectornav.csv, xsens.csv, metadata/cmd_velocity.csv" in notes
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("imu", [True, False])
 def test_a_session_of_fomo_is_analyzed(tmp_path: Path, *, imu: bool) -> None:
     session = write_session(tmp_path / "red_2025-10-14-11-41", imu=imu)
@@ -70,7 +71,7 @@ def as_bag(log: Path) -> Path:
     ("platform", "effects", "lacks"),
     [
         ("tartandrive", {"wheel_radius": 0.93}, "throttle and steering as shares"),
-        ("f1tenth_ros1", {"steering_offset": 0.05}, ""),
+        pytest.param("f1tenth_ros1", {"steering_offset": 0.05}, "", marks=pytest.mark.long),
         ("jackal_ros1", {"effective_track": 1.5}, ""),
     ],
 )

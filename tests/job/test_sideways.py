@@ -61,6 +61,7 @@ def test_what_is_hidden_in_sideways_driving_is_named(
     assert set(summary["by_input"]) == ({"command"} if bare else {"command", "measured"})  # type: ignore[call-overload]
 
 
+@pytest.mark.long
 def test_an_effect_that_costs_a_settled_heading_a_thousandth_stands_on_the_ladder(tmp_path: Path) -> None:
     # With the lag taken alone the heading over 2 s is a little better by chance; sideways it is all error.
     hidden = {"lateral_scale": 0.8, "drive_lag": 0.3}

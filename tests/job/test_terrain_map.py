@@ -132,6 +132,7 @@ def test_runs_of_one_named_map_share_places(tmp_path: Path) -> None:
     assert list(draw_up_terrain(Store(tmp_path / "results")).frames) == ["map yard"]
 
 
+@pytest.mark.long
 def test_ground_that_passes_compact_is_found(tmp_path: Path) -> None:
     program = Program("circle", speed_scale=1.0, turn_scale=0.2)
     scene = {"program": program, "duration_s": 420.0, "extra": CompactedGround(0.3, 0.85, 3.0)}

@@ -164,6 +164,7 @@ def test_a_body_that_slides_begins_predictions_with_the_velocity_it_was_seen_at(
     assert errors["twin"].t_mrmse_m == pytest.approx(errors["model"].t_mrmse_m, rel=0.1)
 
 
+@pytest.mark.long
 def test_wheels_that_slide_have_the_friction_of_the_model(tmp_path: Path) -> None:
     ice = {"friction": 0.1, "tau": 0.05, "k": 1.65, "gyration": 0.9}
     simulate_case(

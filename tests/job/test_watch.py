@@ -175,6 +175,7 @@ def test_a_page_that_cannot_be_written_is_told_in_one_line(tmp_path: Path) -> No
     assert f"{page}: the page cannot be written: No such file or directory" in told.stderr
 
 
+@pytest.mark.long
 def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
     source = make_log(tmp_path / "source.mcap", 15.0)
     folder = tmp_path / "bag"

@@ -105,7 +105,9 @@ def test_finer_cells_give_the_same_motion() -> None:
     assert np.sqrt(np.mean((one - seen) ** 2, axis=1)) == pytest.approx(0.0, abs=0.006)
 
 
-@pytest.mark.parametrize("friction", [0.1, 0.3, 0.7])
+@pytest.mark.parametrize(
+    "friction", [pytest.param(0.1, marks=pytest.mark.long), 0.3, pytest.param(0.7, marks=pytest.mark.long)]
+)
 def test_friction_comes_back_from_every_start(friction: float) -> None:
     truth = {**ICE, "friction": friction}
     run = simulate({"contact_friction": truth}, duration_s=150.0)

@@ -148,9 +148,14 @@ def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
     "effects",
     [
         {"deadband": 0.2, "reversal_pause": 0.5},
-        {"turn_lag": {"tau_mean": 0.4, "tau_diff": 1.3}, "transport_delay": 0.3},
+        pytest.param(
+            {"turn_lag": {"tau_mean": 0.4, "tau_diff": 1.3}, "transport_delay": 0.3}, marks=pytest.mark.long
+        ),
         {"body_inertia": 0.6, "effective_track": 2.6},
-        {"turn_servo": {"tau": 0.6, "reset": 0.3, "scrub": 0.4, "windup": 0.3, "effort": 1.5}},
+        pytest.param(
+            {"turn_servo": {"tau": 0.6, "reset": 0.3, "scrub": 0.4, "windup": 0.3, "effort": 1.5}},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_what_a_vehicle_always_does_is_no_incident(effects: dict[str, object]) -> None:

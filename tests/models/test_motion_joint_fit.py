@@ -30,6 +30,7 @@ def make_problem() -> Problem:
     return Problem(runs, WARTHOG, Input.COMMAND)
 
 
+@pytest.mark.long
 def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_knows() -> None:
     problem = make_problem()
     drive = problem.parts[1]

@@ -361,6 +361,7 @@ def grounds() -> list[MotionRun]:
     ]
 
 
+@pytest.mark.long
 def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list[MotionRun]) -> None:
     alike, unlike, alone = (
         Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:], grounds[:1])
@@ -377,6 +378,7 @@ def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list
     assert leave_grounds_out(alone, model) is None
 
 
+@pytest.mark.long
 def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(grounds: list[MotionRun]) -> None:
     alike, unlike = (Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
     assert make_learned_step(alike, *fit_track(alike)).refusal == ""
@@ -384,6 +386,7 @@ def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(ground
     assert "learned without ice, on seed 3 position error rises by" in refusal
 
 
+@pytest.mark.long
 def test_a_number_of_each_run_alone_is_no_difference_between_grounds(grounds: list[MotionRun]) -> None:
     name, model = "effective_track.k", Model(HUSKY, (find_effect("effective_track")(),))
     truth = {**SLOWED, "effective_track": {"k": 1.4}}

@@ -120,6 +120,7 @@ def test_the_right_model_wins_and_those_that_hold_it_are_not_told_apart(problem:
         assert behind.low > 0.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", LEARNERS)
 def test_a_learned_rival_sees_most_of_what_a_model_lacks_on_data_not_seen(
     problem: Problem, name: str

@@ -140,6 +140,7 @@ def test_it_agrees_with_motors_that_are_stepped_through(
     assert float(np.sqrt(np.mean((found - expected) ** 2))) < 0.02
 
 
+@pytest.mark.long
 def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -> None:
     """Turns below the scrub begin seconds late: no lag of a plausible size does that."""
     hidden = {"tau": 0.45, "reset": 0.35, "scrub": 1.1, "windup": 1.0, "effort": 4.0}
@@ -159,6 +160,7 @@ def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -
     assert error[0] < 0.5 * error[1]
 
 
+@pytest.mark.long
 @given(seed=st.integers(0, 2**31), late=st.floats(0.0, 0.5), name=st.sampled_from(["late", *SERVO]))
 @settings(max_examples=60, deadline=None)
 def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: float, name: str) -> None:

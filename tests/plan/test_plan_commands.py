@@ -422,6 +422,7 @@ def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> N
         assert read_preview(store.root, manifest.run, manifest.key) == {}
 
 
+@pytest.mark.long
 def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(plan: Plan) -> None:
     vehicle = _find("husky_a200")
     knowledge = assume(vehicle)

@@ -134,7 +134,9 @@ def page() -> str:
     return render_report(make_report(duration_s=120.0))
 
 
-@pytest.fixture(scope="module", params=[PHONE, LAPTOP], ids=["phone", "laptop"])
+@pytest.fixture(
+    scope="module", params=[PHONE, pytest.param(LAPTOP, marks=pytest.mark.long)], ids=["phone", "laptop"]
+)
 def seen(
     request: pytest.FixtureRequest, page: str, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, object]:
@@ -171,6 +173,7 @@ def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str
     assert {"12", "18"} <= set(seen["zoomed"])  # type: ignore[call-overload]
 
 
+@pytest.mark.long
 def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
     page: str, chrome: Chrome, tmp_path: Path
 ) -> None:
@@ -211,6 +214,7 @@ BROKEN = """
 """
 
 
+@pytest.mark.long
 def test_names_of_options_do_not_break_at_their_hyphens(tmp_path: Path, chrome: Chrome) -> None:
     report = make_report(duration_s=120.0)
     (tmp_path / "page.html").write_text(render_report(report), encoding="utf-8")

@@ -42,6 +42,7 @@ def test_the_figures_of_the_page_are_written_for_papers(
     assert all(path.read_bytes().startswith(START[kind]) for path in written)
 
 
+@pytest.mark.long
 def test_a_figure_file_does_not_depend_on_when_it_was_written(report: RunReport, tmp_path: Path) -> None:
     first, second = (write_figures(report, tmp_path / name, "svg") for name in "ab")
     assert [path.read_bytes() for path in first] == [path.read_bytes() for path in second]
@@ -143,6 +144,7 @@ def test_a_cache_that_cannot_be_written_costs_nothing_but_time(
     assert "vegaEmbed" in load_bundle()
 
 
+@pytest.mark.long
 def test_warming_fills_the_cache_without_waiting(cache: Path) -> None:
     start = time.perf_counter()
     warm_bundle()

@@ -48,6 +48,7 @@ def test_slope_follows_pitch_and_roll_of_the_body() -> None:
     np.testing.assert_allclose(pushed, -0.5 * up[:, :2], atol=2e-4)
 
 
+@pytest.mark.long
 def test_wheels_bear_the_slope_that_they_drive_over() -> None:
     hills = Ground(hill_m=0.8, hill_length_m=15.0)
     base = Scenario(duration_s=60.0, ground=hills, program=Program("slalom"))

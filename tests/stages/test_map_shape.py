@@ -18,7 +18,7 @@ def stretch(scenario: Scenario, share: float, along_rad: float = 0.5) -> Scenari
 
 
 @pytest.mark.parametrize("along_rad", [0.5, 2.2])
-@pytest.mark.parametrize("seed", [4, 5])
+@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
 def test_a_map_that_is_longer_along_one_direction_is_told_with_its_interval(
     drive: TakeThrough, seed: int, along_rad: float
 ) -> None:

@@ -176,6 +176,7 @@ def test_trap_11_a_controller_that_widens_the_track_is_found(drive: TakeThrough)
     assert slope(steady["f_w"], steady["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("program", ["smooth", "slalom", "stop_and_go", "circle"])
 def test_trap_11_a_multiplier_shows_without_steady_steps(drive: TakeThrough, program: str) -> None:
     clearpath = replace(VEHICLES["husky"], controller_track_multiplier=1.875)

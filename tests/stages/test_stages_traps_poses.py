@@ -168,6 +168,7 @@ def test_trap_18_stretches_with_a_rotated_heading_are_found(
     )
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("vehicle", "effects"),
     [

@@ -79,7 +79,12 @@ def test_what_cannot_be_split_is_refused(values: list[float], errors: list[float
 
 
 @pytest.mark.parametrize(
-    ("spread_group", "spread_run", "error"), [(0.0, 0.1, 0.05), (0.3, 0.1, 0.05), (0.3, 0.02, 0.1)]
+    ("spread_group", "spread_run", "error"),
+    [
+        pytest.param(0.0, 0.1, 0.05, marks=pytest.mark.long),
+        (0.3, 0.1, 0.05),
+        pytest.param(0.3, 0.02, 0.1, marks=pytest.mark.long),
+    ],
 )
 def test_intervals_hold_the_truth_and_tests_are_wrong_as_rarely_as_they_say(
     spread_group: float, spread_run: float, error: float

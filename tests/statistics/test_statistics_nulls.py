@@ -57,6 +57,7 @@ def test_intervals_over_runs_hold_the_truth(runs: int) -> None:
     assert 0.92 <= np.mean(hits) <= 0.97
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("memory", "seconds"), [(0.5, 200.0), (2.0, 300.0)])
 def test_blocks_of_single_runs_keep_the_level_that_plain_samples_break(memory: float, seconds: float) -> None:
     rng = np.random.default_rng(round(10 * memory))

@@ -111,6 +111,7 @@ def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_a_link_in_a_file_opens_the_page_as_well(
     chrome: Chrome, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -129,6 +130,7 @@ def test_a_link_in_a_file_opens_the_page_as_well(
     look_for_trouble(chrome)
 
 
+@pytest.mark.long
 def test_what_the_loader_of_models_warns_of_is_shown(
     chrome: Chrome, workbench: Workbench, monkeypatch: pytest.MonkeyPatch, pictures: Path
 ) -> None:
@@ -352,7 +354,11 @@ def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbenc
     look_for_trouble(chrome)
 
 
-@pytest.mark.parametrize(("width", "dark"), [(PHONE, False), (LAPTOP, True)], ids=["phone", "laptop-dark"])
+@pytest.mark.parametrize(
+    ("width", "dark"),
+    [(PHONE, False), pytest.param(LAPTOP, True, marks=pytest.mark.long)],
+    ids=["phone", "laptop-dark"],
+)
 def test_nothing_is_cut_or_overlaps(
     chrome: Chrome, workbench: Workbench, pictures: Path, width: int, *, dark: bool
 ) -> None:

@@ -205,7 +205,9 @@ def test_no_barrier_on_the_page(chrome: Chrome, workbench: Workbench, width: int
     assert chrome.errors == []
 
 
-@pytest.mark.parametrize("served", [True, False], ids=["served", "from_files"])
+@pytest.mark.parametrize(
+    "served", [True, pytest.param(False, marks=pytest.mark.long)], ids=["served", "from_files"]
+)
 def test_a_report_leads_to_all_runs_and_they_lead_back(
     chrome: Chrome, workbench: Workbench, results: Path, *, served: bool
 ) -> None:

@@ -49,9 +49,9 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     chart = layer(bars, *bounds, base.words, *names).properties(
         width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 10}
     )
-    note = "Ceiling: the ideal model."
+    note = "Ceiling: the error of the ideal model."
     if rows["ladder_floor"].height:
-        note += " Noise floor: how well the motion repeats itself. Effects can remove the error between them."
+        note += " Noise floor: the repeatability of the motion. Effects can remove the error between the two."
     return Drawing(chart, rows, note, _format_ladder(scene, rows))
 
 
