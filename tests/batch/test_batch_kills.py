@@ -24,7 +24,7 @@ from pipeline.store import STEPS, Store
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FEW_ROUNDS, MANY_ROUNDS = 8, 200
+FEW_ROUNDS, MANY_ROUNDS = 20, 200
 
 
 @pytest.fixture(scope="module")
@@ -140,7 +140,7 @@ def test_whole_commands_killed_with_their_workers_at_random_moments(
 
         return kill
 
-    seen = kill_at_random(field, out, undisturbed, start, rounds=40, longest_s=longest_s)
+    seen = kill_at_random(field, out, undisturbed, start, rounds=2 * FEW_ROUNDS, longest_s=longest_s)
     assert len(seen) > 1, "batches were killed while they published"
     assert_finished(field, out, undisturbed)
 

@@ -66,7 +66,6 @@ def test_only_the_chunks_that_matter_are_fetched(bucket: fsspec.AbstractFileSyst
     assert data.fetched_bytes < path.stat().st_size / 20
 
 
-@pytest.mark.long
 def test_a_season_in_a_bucket(bucket: fsspec.AbstractFileSystem, season: Path, tmp_path: Path) -> None:
     upload(
         bucket,

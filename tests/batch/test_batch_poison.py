@@ -77,7 +77,6 @@ def test_a_log_that_changed_leaves_the_quarantine(season: Path, tmp_path: Path) 
     assert counts(batch(log, tmp_path / "out")) == {"done": 1}
 
 
-@pytest.mark.long
 def test_a_death_is_understood_however_late_its_pool_hears_of_the_task(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

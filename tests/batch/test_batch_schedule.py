@@ -70,7 +70,6 @@ def run(command: list[str] | str, folder: Path | None) -> subprocess.CompletedPr
     )
 
 
-@pytest.mark.long
 @needs_flock
 @pytest.mark.parametrize("system", ["systemd", "cron"])
 def test_what_a_unit_runs_does_the_work_and_never_twice(season: Path, tmp_path: Path, system: System) -> None:

@@ -6,9 +6,9 @@ import hashlib
 import shutil
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import polars as pl
-import pytest
 from batch_tools import Watch, ask, batch, counts, read_tables
 
 from pipeline.batch import Pruning, Shard, batch_plan, measure_memory, parse_shard, parse_size
@@ -17,6 +17,9 @@ from pipeline.batch.season import run_batch
 from pipeline.job import keys
 from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.store import Partition, Store
+
+if TYPE_CHECKING:
+    import pytest
 
 
 def hash_all(folder: Path) -> dict[str, str]:
@@ -183,7 +186,6 @@ def test_partitions_open_only_their_files(season: Path, tmp_path: Path) -> None:
     assert store.query("SELECT run FROM slip", Partition(day="1999")).is_empty()
 
 
-@pytest.mark.long
 def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for rate in (20.0, 10.0, 5.0):

@@ -37,7 +37,6 @@ def slip(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:
     return int(ended.value.code or 0), said.out + said.err
 
 
-@pytest.mark.long
 def test_results_keep_their_key_from_command_to_command(
     tmp_path: Path, key_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -52,7 +52,6 @@ def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path:
     assert _run(cache, "-m", "pipeline", "diagnose", log, "--out", out, "--quiet") == compiled
 
 
-@pytest.mark.long
 def test_machine_code_that_is_damaged_is_made_anew(tmp_path: Path) -> None:
     code = "import numpy as np; from pipeline.models.filters import _follow as f; o = np.empty(2); "
     code += "f(np.array([0.0, 1.0]), np.array([0.0, np.nan]), 0.25, o); print(o[1])"

@@ -56,7 +56,6 @@ def test_increments_are_smooth_where_the_series_takes_over(angle: float) -> None
     assert np.allclose(move, [[1.0, 0.0, 0.0]], atol=1e-6)
 
 
-@pytest.mark.long
 @given(st.lists(st.floats(0.05, 0.4), min_size=2, max_size=30), st.integers(0, 10**6))
 def test_following_the_increments_leads_back_to_the_poses(periods: list[float], seed: int) -> None:
     generator = np.random.default_rng(seed)

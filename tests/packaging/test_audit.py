@@ -11,7 +11,6 @@ import pytest
 ROOT = Path(__file__).parents[2]
 
 
-@pytest.mark.long
 def test_all_locked_packages_have_accepted_licences_and_stand_in_the_bill(tmp_path: Path) -> None:
     lock = ROOT / "requirements.txt"
     packages = audit.list_packages(lock)

@@ -378,7 +378,6 @@ print(peak() - before)
 """
 
 
-@pytest.mark.long
 def test_csv_of_a_long_run_takes_no_more_memory_than_of_a_short_one(results: Path, tmp_path: Path) -> None:
     """Even where the table is one part of its file."""
     copy = tmp_path / "results"

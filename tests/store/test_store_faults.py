@@ -73,8 +73,8 @@ def run_rounds(store: Store, rounds: int) -> None:
     assert outcomes.count(REFUSED) > rounds // 3, "faults were met"
 
 
-def test_memory_and_disk_fail_in_twelve_rounds(store: Store) -> None:
-    run_rounds(store, 12)
+def test_memory_and_disk_fail_in_thirty_rounds(store: Store) -> None:
+    run_rounds(store, 30)
 
 
 @pytest.mark.long

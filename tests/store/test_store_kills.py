@@ -97,7 +97,7 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
 
 
 def test_killed_at_random_moments_the_run_is_whole(store: Store, start_writer: StartWriter) -> None:
-    kill_at_random(store, start_writer, rounds=10, seed=7)
+    kill_at_random(store, start_writer, rounds=20, seed=7)
 
 
 @pytest.mark.long

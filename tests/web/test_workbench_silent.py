@@ -278,7 +278,6 @@ def test_when_files_run_out_all_the_same_nothing_is_printed_and_it_goes_on(serve
     assert served.ask() < ANSWERED_S
 
 
-@pytest.mark.long
 def test_the_server_raises_its_own_limit_of_open_files(tmp_path: Path) -> None:
     with serve_apart(tmp_path, "-Sn") as served, ExitStack() as held:
         bearer = {"Authorization": f"Bearer {served.token}"}

@@ -121,7 +121,6 @@ def test_too_large_a_log_is_refused_before_it_comes(empty: Workbench) -> None:
     assert files_below(empty.results) == []
 
 
-@pytest.mark.long
 def test_logs_that_wait_have_a_quota_in_number_and_size(tmp_path: Path) -> None:
     limits = replace(LIMITS, log_bytes=1_000_000, all_bytes=1_500_000, logs=2, silence_s=3.0)
     server = Workbench(tmp_path / "results", limits=limits)
