@@ -1,19 +1,22 @@
 """The files of the program: counts for people, and what `make check` refuses.
 
-Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES`, headers
-of more than `MOST_HEADERS` of all lines, and numbers at the head of a file, in `EXPLAINED`, without a reason.
+Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES` (those of
+`BESIDE`, too), headers of more than `MOST_HEADERS` of all lines, and numbers at the head of a file, in
+`EXPLAINED`, without a reason.
 Imports inside functions count, since they only put a circle off; those for the type checker do not.
 """
 
 import ast
 import sys
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
+BESIDE = ("tests", "benchmarks", "docs", "examples")
+"""Folders of which only the length of files is checked."""
 MOST_LINES = 500  # a longer file is not read in one sitting
 MOST_HEADERS = 0.07
 """Share of all lines: where it grows, files are split into parts that import one another."""
@@ -36,11 +39,17 @@ class Source:
         return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def read_sources(root: Path) -> list[Source]:
-    """All files of the program, sorted by path."""
-    paths = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
+def read_sources(root: Path, folders: Sequence[str] = ROOMS) -> list[Source]:
+    """All Python files of some folders, by default those of the program, sorted by path."""
+    paths = sorted(path for room in folders for path in (root / room).rglob("*.py"))
     texts = [(path.relative_to(root), path.read_text("utf-8")) for path in paths]
     return [Source(path, text, ast.parse(text), len(text.splitlines())) for path, text in texts]
+
+
+def list_long_files(sources: list[Source]) -> Iterator[str]:
+    """Files of more than `MOST_LINES`, one line each."""
+    long = (source for source in sources if source.lines > MOST_LINES)
+    yield from (f"{source.path} has {source.lines} lines, more than {MOST_LINES}" for source in long)
 
 
 def list_faults(sources: list[Source]) -> Iterator[str]:
@@ -54,8 +63,7 @@ def list_faults(sources: list[Source]) -> Iterator[str]:
         if source.path.name != "__init__.py":
             paths[source.path.name].append(str(source.path))
     yield from (f"two files of one name: {', '.join(same)}" for same in paths.values() if len(same) > 1)
-    long = (source for source in sources if source.lines > MOST_LINES)
-    yield from (f"{source.path} has {source.lines} lines, more than {MOST_LINES}" for source in long)
+    yield from list_long_files(sources)
     if (share := measure_headers(sources)) > MOST_HEADERS:
         yield f"{share:.2%} of all lines are headers, more than {MOST_HEADERS:.0%}: put files together"
     yield from (
@@ -169,8 +177,9 @@ def measure_headers(sources: list[Source]) -> float:
 
 def main() -> int:
     """Print the counts and what is wrong; 1 where anything is."""
-    sources = read_sources(Path(__file__).parents[1])
-    faults = list(list_faults(sources))
+    root = Path(__file__).parents[1]
+    sources = read_sources(root)
+    faults = [*list_faults(sources), *list_long_files(read_sources(root, BESIDE))]
     lines = sum(source.lines for source in sources)
     print(f"{len(sources)} files, {lines:,} lines, {measure_headers(sources):.1%} of them headers")
     counts = Counter(find_room(source) for source in sources for _ in list_constants(source))

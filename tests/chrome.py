@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+PHONE, LAPTOP = 390, 1280  # widths of screens in pixels
 PATIENCE_S = 180.0
 """Axe looks at a page with many figures for a minute where other processes are at work."""
 

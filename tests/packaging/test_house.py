@@ -1,7 +1,16 @@
 from pathlib import Path
 
 import pytest
-from house import MOST_LINES, find_room, list_constants, list_faults, measure_headers, read_sources
+from house import (
+    BESIDE,
+    MOST_LINES,
+    find_room,
+    list_constants,
+    list_faults,
+    list_long_files,
+    measure_headers,
+    read_sources,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -66,6 +75,10 @@ def test_two_files_of_one_name_are_refused_but_for_packages(tmp_path: Path) -> N
 def test_a_file_that_is_too_long_is_refused(tmp_path: Path) -> None:
     files = {"long.py": "x = 1\n" * (MOST_LINES + 1), "short.py": "x = 1\n" * MOST_LINES}
     assert find_faults(tmp_path, files) == ["pipeline/long.py has 501 lines, more than 500"]
+
+
+def test_no_test_or_tool_of_this_project_is_too_long() -> None:
+    assert list(list_long_files(read_sources(ROOT, BESIDE))) == []
 
 
 def test_headers_are_docstrings_and_imports(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 from barriers import find_barriers
+from chrome import LAPTOP, PHONE
 
 from pipeline.cli import main
 from pipeline.job import Options
@@ -20,7 +21,6 @@ from pipeline.store import Store
 if TYPE_CHECKING:
     from chrome import Chrome
 
-PHONE, LAPTOP = 390, 1280
 DRAWN = (
     "document.readyState === 'complete' && (document.documentElement.dataset.drawn === 'yes' ||"
     " !document.querySelector('.plot'))"

@@ -12,7 +12,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from typing import TYPE_CHECKING, cast
 
 import pytest
-from chrome import BROWSER, FLAGS
+from chrome import BROWSER, FLAGS, LAPTOP, PHONE
 from report_synthesis import list_places, make_report
 
 from pipeline.report.page import render_report
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from chrome import Chrome
 
 WINDOW = "--window-size=1400,1000"
-PHONE, LAPTOP = 390, 1280
 PATIENCE_S = 40.0
 
 # Runs before anything else of the page, tries it as a reader would, and tells its parent what it saw.

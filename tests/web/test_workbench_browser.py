@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import pytest
-from workbench_server import RUN, TOKEN, TRACK, Workbench
+from chrome import LAPTOP, PHONE
+from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_for_trouble
 
 from pipeline.cli.verbs_machine import _open_browser
 from pipeline.job import Options
@@ -26,17 +27,8 @@ from pipeline.store import Store
 if TYPE_CHECKING:
     from chrome import Chrome
 
-PHONE, LAPTOP = 390, 1280
 START = 1_700_000_000_000_000_000
 EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
-SHOWN = "document.querySelector('.pane')?.dataset.drawn"
-ERROR = "Number(document.querySelector('.number.r .value').textContent)"
-
-
-def look_for_trouble(chrome: Chrome) -> None:
-    assert chrome.errors == []
-    asked = [address for address in chrome.requests if "//" in address and not address.startswith("file:")]
-    assert {address.split("/")[2].split(":")[0] for address in asked} == {"127.0.0.1"}
 
 
 def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(

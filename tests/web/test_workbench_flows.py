@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 from barriers import find_barriers
-from workbench_server import RUN, Workbench
+from chrome import LAPTOP, PHONE
+from workbench_server import ERROR, RUN, SHOWN, Workbench
 
 from pipeline.job.analyze import update_datasets
 from pipeline.job.over_runs import draw_up_map, write_map
@@ -20,13 +21,11 @@ if TYPE_CHECKING:
 
     from chrome import Chrome
 
-PHONE, LAPTOP = 390, 1280
 WIDTHS = pytest.mark.parametrize("width", [LAPTOP, PHONE])
 SETTLED = (
-    "document.querySelector('.pane')?.dataset.drawn && !document.querySelector('.pane.busy, .trying') &&"
+    f"{SHOWN} && !document.querySelector('.pane.busy, .trying') &&"
     " document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
 )
-ERROR = "Number(document.querySelector('.number.r .value').textContent)"
 WIDER = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 REACHED = """(() => {
   const shown = [...document.querySelectorAll('button, a[href], input, select, summary')]

@@ -17,14 +17,24 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
+    from chrome import Chrome
+
     from pipeline.batch.batch_work import Report, Task
 
 RUN = "field/hidden"
 TRACK = 1.6
 PATIENCE_S = 60.0
 OPEN_FILES = 1024
+SHOWN = "document.querySelector('.pane')?.dataset.drawn"
+ERROR = "Number(document.querySelector('.number.r .value').textContent)"
 TOKEN = "the-token-of-the-tests"  # noqa: S105 - of no server but these
 LIMITS = Limits(log_bytes=200_000_000, all_bytes=400_000_000, timeout_s=600.0)
+
+
+def look_for_trouble(chrome: Chrome) -> None:
+    assert chrome.errors == []
+    asked = [address for address in chrome.requests if "//" in address and not address.startswith("file:")]
+    assert {address.split("/")[2].split(":")[0] for address in asked} == {"127.0.0.1"}
 
 
 class Workbench:
