@@ -36,7 +36,7 @@ CAUSE = ". Cause: "
 class Value:
     """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
 
-    `another_run` is the expected interval of the value in another run of the vehicle on this ground.
+    `another_run`: in another run on this ground. `one_sided`: see `Parameter.is_one_sided`.
     """
 
     value: float
@@ -45,11 +45,12 @@ class Value:
     unit: str
     at_bound: bool = False
     another_run: tuple[float, float] = (math.nan, math.nan)
+    one_sided: bool = False
 
     @property
     def is_undetermined(self) -> bool:
-        """Whether the runs do not determine it: it has no finite interval or is at its bound."""
-        return self.at_bound or not math.isfinite(self.high - self.low)
+        """Whether the runs do not determine it: no finite interval, one limit only, or at its bound."""
+        return self.at_bound or self.one_sided or not math.isfinite(self.high - self.low)
 
     @property
     def half(self) -> float:

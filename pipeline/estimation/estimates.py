@@ -44,7 +44,8 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
-        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another)
+        one_sided = parameter.is_one_sided(low, high)
+        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another, one_sided)
     return values
 
 

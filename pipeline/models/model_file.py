@@ -97,7 +97,8 @@ class ModelFile:
     def find_doubt(self, effect: Effect, parameter: Parameter) -> str:
         """Reason why a value is not reliable, in words; empty where there is none.
 
-        In a fitted model, a parameter that is not fixed and has no interval is undetermined.
+        In a fitted model, a parameter that is not fixed is undetermined without an interval, and where that
+        gives one limit only.
         """
         value, label = effect.values[parameter.name], f"{effect.id}.{parameter.name}"
         if value == parameter.neutral or not math.isfinite(value) or parameter.name in effect.fixed:
@@ -107,6 +108,8 @@ class ModelFile:
         own = label in self.per_run or effect.id in self.per_run
         if self.list_fitted("runs") and label not in self.intervals and not own:
             return "undetermined: the runs of the fit leave it open"
+        if parameter.is_one_sided(*self.intervals.get(label, (math.nan, math.nan))):
+            return "undetermined: its interval reaches a limit of the search"
         return ""
 
     def list_fitted(self, key: str) -> list[dict[str, object]]:

@@ -354,6 +354,11 @@ class Parameter:
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
         return self.between_runs or Spread(USUAL_SPREAD * self.usual_size, usual)
 
+    def is_one_sided(self, low: float, high: float) -> bool:
+        """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""
+        least, most = self.bounds
+        return low <= least < self.neutral or high >= most > self.neutral
+
 
 @dataclass(frozen=True)
 class Part:

@@ -198,6 +198,9 @@ def test_what_was_not_given_is_said_to_be_needed(capsys: pytest.CaptureFixture[s
         main(["model", "add", "robot.toml", "drive_lag"])
     assert left.value.code == 2
     assert "needs --on: logs, or runs of the results folder" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["model", "export", "robot.toml"])
+    assert "needs --to: ros2_control, nav2," in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

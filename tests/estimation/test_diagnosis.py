@@ -478,3 +478,20 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())
         assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())
+
+
+def test_a_value_of_which_only_one_limit_is_known_is_undetermined() -> None:
+    limit = find_effect("body_speed_limit")().parameter("limit")
+    for effect, half, is_open in (
+        (find_effect("body_speed_limit")(limit=2.0), 1.0, False),
+        (find_effect("body_speed_limit")(limit=2.0), 2.0 - 0.5 * limit.bounds[0], True),
+        # A lag of zero is no lag, and no limit is above its largest value: both are neutral.
+        (find_effect("drive_lag")(tau=0.2), 0.3, False),
+        (find_effect("body_speed_limit")(limit=limit.bounds[1] - 2.0), 3.0, False),
+    ):
+        (name, value), (parameter,) = next(iter(effect.values.items())), effect.parameters
+        free = Free(effect.id, name, None, parameter.bounds, 0.01)
+        items = (Estimate(free, value, half, half / 2.0, at_bound=False, observable=True),)
+        (one,) = list_values(effect, Estimates(items, np.eye(1), 9)).values()
+        assert one.is_undetermined == is_open
+        assert str(one).endswith("(undetermined)") == is_open

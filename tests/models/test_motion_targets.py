@@ -420,10 +420,7 @@ def test_what_the_fit_left_open_is_a_comment_and_no_parameter() -> None:
         find_effect("transport_delay")(d=0.2),
         find_effect("drive_lag")(tau=0.3),
     )
-    intervals = {
-        f"{name}.{number}": (0.1, 40.0)
-        for name, number in (("acceleration_limit", "limit"), ("drive_lag", "tau"))
-    }
+    intervals = {"acceleration_limit.limit": (0.1, 40.0), "drive_lag.tau": (0.1, 0.5)}
     fit = FIT | {"undecided": [["acceleration_limit", "wheel_speed_limit"]]}
     file = make(*effects, intervals=intervals, fit=fit)
     text = export_model(file, "nav2")
@@ -440,6 +437,11 @@ def test_what_the_fit_left_open_is_a_comment_and_no_parameter() -> None:
     assert "doubt" not in numbers["drive_lag"]["tau"]
     fixed = make(find_effect("body_speed_limit")(limit=2.0, fixed=["limit"]), fit=FIT)
     assert take("nav2", fixed)["FollowPath.vx_max"] == 2.0
+    limit = find_effect("body_speed_limit")(limit=2.0)
+    ends = {"body_speed_limit.limit": (limit.parameters[0].bounds[0], 4.0)}
+    text = export_model(make(limit, intervals=ends, fit=FIT), "nav2")
+    assert "vx_max" not in text
+    assert "undetermined: its interval reaches a limit of the search" in text
 
 
 def test_limits_of_the_body_are_no_larger_than_it_was_driven() -> None:
