@@ -389,10 +389,11 @@ def _read_numbers(version: str) -> list[int]:
 
 
 def _look_at_loops() -> Check:
-    import pipeline.estimation  # noqa: PLC0415 - heavy; loops are known where they are imported
-    import pipeline.models.filters  # noqa: F401, PLC0415
+    import pipeline.estimation  # noqa: F401, PLC0415 - heavy; loops are known where they are imported
     from pipeline.core.machine_code import compile_loops, list_caches  # noqa: PLC0415
+    from pipeline.models import list_effects  # noqa: PLC0415
 
+    list_effects()
     name = "compiled loops"
     count = sum(1 for _ in compile_loops())
     caches = list_caches()

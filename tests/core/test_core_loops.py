@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 import time
@@ -15,11 +16,7 @@ from pipeline.core import machine_code
 from pipeline.core.machine_code import Loop
 from pipeline.models.filters import _lag
 
-COMPILE = """
-import pipeline.estimation, pipeline.models.filters
-from pipeline.core.machine_code import compile_loops
-list(compile_loops())
-"""
+MAKEFILE = Path(__file__).parents[2] / "Makefile"
 CALL = """
 import sys
 import numpy as np
@@ -45,7 +42,8 @@ def _run(cache: Path, *command: str | Path) -> set[str]:
 @pytest.mark.long
 def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    compiled = _run(cache, "-c", COMPILE)
+    (compile_all,) = re.findall(r'-c "(.*compile_loops.*)"', MAKEFILE.read_text())
+    compiled = _run(cache, "-c", compile_all)
     assert len(compiled) > 10
     assert _run(cache, "-c", CALL) == compiled
     log, out = samples / "husky_tile.mcap", tmp_path / "out"

@@ -16,6 +16,7 @@ from pipeline.estimation.comparison import Comparison
 from pipeline.export import export_model
 from pipeline.export.twin_body import build_twin_body
 from pipeline.models import Model, ModelFile, Timing, find_effect
+from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.signals import Rolling, Wheels
 from pipeline.simulate import Disturbance
 
@@ -127,3 +128,21 @@ def test_a_body_without_turning_inertia_is_exported_and_turns_with_its_wheels() 
     rolled = 0.2 * HUSKY.wheel_radius_m / HALF
     assert rows[-1, 6] == pytest.approx(rolled / ICE["k"], rel=0.02)
     assert build_twin_body(model.model).turning_inertia_kgm2 > 0.0
+
+
+def test_friction_that_makes_nothing_late_is_a_wider_track() -> None:
+    """Wheels that skid in a turn at 1.5 m/s: from 20 ms on, time stamps show that the body is late."""
+    conditions = Conditions(Largest(1.5, 1.0, 10.0, 5.0, np.zeros(11)))
+    for friction, tau, is_track in (
+        (20.0, 0.011, True),
+        (20.0, 0.025, False),
+        (0.6, 0.0, False),
+        (0.1, 0.011, False),
+    ):
+        effect = find_effect("contact_friction")(friction=friction, tau=tau, k=1.5, gyration=1.0)
+        assert effect.is_degenerate(conditions) == is_track
+        simpler = effect.collapse()
+        assert simpler is not None
+        assert (simpler.id, simpler.values["k"]) == ("effective_track", 1.5)
+    # Without skid in turns nothing but the time constant is seen of a firm ground.
+    assert find_effect("contact_friction")(friction=1.4, tau=0.011, k=1.0).is_degenerate(conditions)

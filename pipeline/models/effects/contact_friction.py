@@ -23,15 +23,18 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
-from pipeline.models.effect import INF, BodyEffect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effect import INF, BodyEffect, Effect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
-from pipeline.models.parameter import Level, Quantity, TwinRole
+from pipeline.models.effects.effective_track import EffectiveTrack
+from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 _GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
 _LEAST_TAU_S = 1e-3
 """Smallest time constant [s]: with zero the friction force without slip has no direction."""
+_LEAST_LAG_S = 0.02
+"""Smallest lag to report [s]: stamps are off by as much."""
 _STEP_S = 0.02
 """Longest integration step [s]: half of it changes velocities by less than 2 mm/s."""
 
@@ -124,6 +127,16 @@ class ContactFriction(BodyEffect):
         body_x = ahead * math.cos(turn) + aside * math.sin(turn)
         body_y = aside * math.cos(turn) - ahead * math.sin(turn)
         v_x, v_y, v_w = ((a + b) / 2.0 for a, b in zip(before, (body_x, body_y, body_w)))"""
+
+    def is_degenerate(self, conditions: Conditions) -> bool:
+        """Whether it is a wider track: even wheels that skid in the fastest turn make the body no later."""
+        tau, friction, k = (self.values[name] for name in ("tau", "friction", "k"))
+        sliding = conditions.largest.speed * math.sqrt(k - 1.0) / k
+        return math.hypot(tau, sliding / (friction * _GRAVITY)) < _LEAST_LAG_S
+
+    def collapse(self) -> Effect | None:
+        """An effective track of the same ratio."""
+        return EffectiveTrack(k=self.values["k"])
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""
