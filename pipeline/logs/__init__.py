@@ -1,7 +1,7 @@
-"""Recordings in, MCAP out: what a recording holds, its topics as columns, transforms, and writing.
+"""Reading of recordings (index, topics as columns, transforms) and writing of MCAP files.
 
-Reading is columnar and as fast as inflating the chunks; what is damaged is told, what is whole around it is
-read. Nothing here knows what the numbers mean.
+Reading is columnar and as fast as inflating the chunks. Damage is reported as losses, and the undamaged data
+around it are read. The package does not interpret the values of messages.
 """
 
 from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG

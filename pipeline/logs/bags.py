@@ -77,7 +77,7 @@ def is_whole(head: bytes, size: int) -> bool:
 
 
 def is_written_to(path: Path) -> bool:
-    """Whether a transaction is under way in an SQLite file."""
+    """Whether a transaction is in progress in an SQLite file."""
     return any(path.with_name(path.name + end).exists() for end in ("-journal", "-wal"))
 
 
@@ -146,7 +146,7 @@ class _Allowance:
             )
 
     def inflate_chunk(self, name: str, stored: bytes) -> bytes:
-        """Inflate a chunk with the named compression, up to a plausible size.
+        """Inflate a chunk with the given compression, up to a plausible size.
 
         Raises:
             InflateError: it is cut, or larger.
@@ -194,7 +194,7 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
                     yield BagMessages(collected.take())
         except MemoryError:
             raise
-        except Exception as error:  # noqa: BLE001 - what damage raises in there has no common type
+        except Exception as error:  # noqa: BLE001 - exceptions caused by damage have no common type
             text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
             text += f" ({_format_error(error)})"
             kind = OVER_BUDGET if isinstance(error, _BudgetError) else "damaged_record"

@@ -17,7 +17,7 @@ from pipeline.logs.spans import Span, SpanKind
 class Cover(IntEnum):
     """Evidence that a schema or channel record is undamaged, in ascending order.
 
-    Damage does not change two copies alike, so agreement of two copies is as good as a checksum.
+    Damage does not change two copies identically, so their agreement is equivalent to a checksum.
     """
 
     SUMMARY = 0
@@ -155,7 +155,7 @@ class Catalog:
         return losses
 
     def is_covered(self, number: int, *, data_holds: bool) -> bool:
-        """Whether there is evidence for the records that a channel is decoded by.
+        """Whether there is evidence for the schema and channel record of a channel.
 
         Args:
             number: channel number.
@@ -179,7 +179,7 @@ class Catalog:
 
 
 def is_alike(one: Schema | Channel, other: Schema | Channel) -> bool:
-    """Whether two records of one number agree in everything that messages are decoded by."""
+    """Whether two records with the same number agree in all values that decoding uses."""
     if one == other:
         return True
     if not isinstance(one, Channel) or not isinstance(other, Channel):
@@ -201,7 +201,7 @@ OVER_BUDGET: Final = "max_inflated"
 """Kind of the loss of chunks beyond the limit of the inflated size."""
 
 _LEAST: Final = 512 << 20
-"""Inflated size [bytes] that is allowed for any file: some seconds of work, whatever its content."""
+"""Inflated size [bytes] that is allowed for any file: some seconds of work for any content."""
 
 _RATIO: Final = 200
 """Maximum ratio of the inflated size to the size of a file. The drives of 703 recordings reach 9, nearly

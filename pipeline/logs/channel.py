@@ -1,4 +1,4 @@
-"""Channels as columns, whatever their messages are encoded in: CDR, ROS 1, JSON or protobuf."""
+"""Decoding of channels to columns, from messages in CDR, ROS 1, JSON or protobuf."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from pipeline.logs.schema import (
 )
 
 _ENOUGH: Final = 4 << 20
-"""Payload bytes that are collected before they are decoded together."""
+"""Size of the payloads that are collected before they are decoded together [bytes]."""
 
 _ENCAPSULATION: Final = 4
 
@@ -49,9 +49,9 @@ class Rejected:
 
     Attributes:
         kind: ``undecodable`` or ``unsupported_encoding``.
-        reason: why.
-        rows: their numbers in the channel, int64.
-        bytes: bytes of their payloads.
+        reason: cause.
+        rows: their indices in the channel, int64.
+        bytes: total size of their payloads [bytes].
     """
 
     kind: str
@@ -61,14 +61,14 @@ class Rejected:
 
 
 class StructuredDecoder:
-    """Decodes CDR and ROS 1 payloads through the type's tree.
+    """Decodes CDR and ROS 1 payloads of a type.
 
     Args:
         structure: the type.
         paths: wanted leaf fields.
         encoding: ``"cdr"`` or ``"ros1"``.
-        expected: how many messages the index promises.
-        exact: whether messages that are longer than the type are refused, because the type is a guess.
+        expected: number of messages stated in the index.
+        exact: whether messages longer than the type are rejected, for a type that is not from the log.
     """
 
     def __init__(
@@ -83,18 +83,18 @@ class StructuredDecoder:
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What is worth knowing of what was decoded."""
+        """Remarks on the decoded messages."""
         longer = self._decoder.longer
         return (f"{longer} messages hold more bytes than their type describes",) if longer else ()
 
     @property
     def shortened(self) -> dict[str, int]:
-        """Fields with strings that were too long and were cut, and how many."""
+        """Number of strings that were too long and were cut, by field."""
         vocabularies = self._decoder.vocabularies
         return {path: words.shortened for path, words in vocabularies.items() if words.shortened}
 
     def decode(self, ids: Ints, block: Block) -> None:
-        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
+        """Decode a block; ``ids`` are the indices of its rows in the channel."""
         if self._ros1:
             self._decode_alike(ids, block, ROS1, np.arange(ids.size))
             return
@@ -135,7 +135,7 @@ class StructuredDecoder:
         self.rejected.append(Rejected(kind, reason, ids[wrong], int(block.size[wrong].sum())))
 
     def columns(self, rows: Ints) -> dict[str, Column]:
-        """Columns of the given rows, in their order; to be asked once."""
+        """Columns of the given rows, in their order; may be called once, because it frees the values."""
         ids = np.concatenate([np.empty(0, dtype=np.int64), *self._ids])
         row_of = np.empty(int(ids.max(initial=-1)) + 1, dtype=np.int64)
         row_of[ids] = np.arange(ids.size)
@@ -146,11 +146,11 @@ class StructuredDecoder:
 
 @dataclass(slots=True)
 class ChannelBuffer:
-    """Collects the payloads of one channel and has them decoded a few megabytes at a time.
+    """Collects the payloads of one channel and decodes them a few megabytes at a time.
 
     Attributes:
-        decoder: does the decoding.
-        count: messages so far.
+        decoder: decoder of the channel.
+        count: number of messages so far.
     """
 
     decoder: StructuredDecoder | ObjectDecoder
@@ -161,7 +161,7 @@ class ChannelBuffer:
     count: int = 0
 
     def add(self, payloads: Payloads) -> None:
-        """Take the messages of the next span."""
+        """Add the messages of the next span."""
         self._log.append(payloads.log_time)
         self._publish.append(payloads.publish_time)
         for group in payloads.groups:
@@ -178,15 +178,15 @@ class ChannelBuffer:
         self._pending_bytes = 0
 
     def times(self) -> tuple[Ints, Ints]:
-        """Log and publish times [ns] of all messages in the order of the file."""
+        """Log and publish times [ns] of all messages, in file order."""
         empty = np.empty(0, dtype=np.int64)
         return np.concatenate([empty, *self._log]), np.concatenate([empty, *self._publish])
 
     def finish(self, repeated: Ints) -> tuple[Ints, Ints, Ints]:
-        """Decode what is left: log and publish times [ns] and numbers of the good rows, by log time.
+        """Decode the rest; returns log and publish times [ns] and indices of all valid rows, by log time.
 
         Args:
-            repeated: numbers of the messages that are left out because they stand there before.
+            repeated: indices of messages to omit because they are copies of earlier ones.
         """
         self._flush()
         log, publish = self.times()
@@ -206,15 +206,15 @@ class ChannelBuffer:
         return int(log.min()), int(log.max())
 
 
-# Channels whose messages are decoded one by one by others: JSON and protobuf.
+# Channels whose messages are decoded individually by other libraries: JSON and protobuf.
 #
-# Messages become nested values first, then columns of their leaf fields.
+# Messages are converted to nested values, then to columns of their leaf fields.
 
 Value: TypeAlias = "float | str | bool | list[Value] | dict[str, Value] | None"
 Leaf: TypeAlias = "float | str | bool"
 _LARGEST_INTEGER = 1 << 63
 _MOST_CELLS = 20_000_000
-"""Rows times fields of a topic: messages that name their fields at will would fill any memory."""
+"""Maximum number of rows times fields of a topic: arbitrary field names could otherwise exhaust memory."""
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
@@ -222,9 +222,9 @@ class ObjectDecoder:
     """Decodes payloads one by one into nested values.
 
     Args:
-        decode: from a payload to the message; raises ``ValueError`` when it cannot.
+        decode: decodes one payload; raises ``ValueError`` on failure.
         fields: wanted paths, None for all.
-        where: the topic, for messages.
+        where: topic named in errors.
     """
 
     def __init__(self, decode: Callable[[bytes], Value], fields: Sequence[str] | None, *, where: str) -> None:
@@ -238,7 +238,7 @@ class ObjectDecoder:
         self.shortened: dict[str, int] = {}
 
     def decode(self, ids: Ints, block: Block) -> None:
-        """Decode a block; ``ids`` are the numbers of its rows in the channel."""
+        """Decode a block; ``ids`` are the indices of its rows in the channel."""
         wrong: list[int] = []
         spans = zip(ids.tolist(), block.start.tolist(), block.size.tolist(), strict=True)
         for position, (row, start, size) in enumerate(spans):
@@ -265,7 +265,7 @@ class ObjectDecoder:
             return float(value) if -largest <= value <= largest else math.inf * (1 if value > 0 else -1)
         if not isinstance(value, str):
             return value
-        # JSON can spell half of a character, which no table can hold.
+        # JSON can contain a lone surrogate, which tables cannot store.
         value = value if value.isascii() else value.encode(errors="replace").decode()
         if len(value) <= MAX_TEXT:
             return value
@@ -276,7 +276,7 @@ class ObjectDecoder:
         """Columns of the given rows, in their order.
 
         Raises:
-            LogError: ``field_not_found`` when no message has a wanted field; ``too_many_fields``.
+            LogError: ``field_not_found``, no message has a wanted field; ``too_many_fields``.
         """
         messages = [self._rows[row] for row in rows.tolist()]
         leaves = tuple(dict.fromkeys(path for message in messages for path in message))
@@ -311,25 +311,25 @@ class ObjectDecoder:
 
 
 def decode_json(payload: bytes) -> Value:
-    """The value of a JSON text.
+    """Value of a JSON text.
 
     Raises:
-        ValueError: it is none.
+        ValueError: the text is not JSON.
     """
     value: Value = json.loads(payload)
     return value
 
 
 def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[bytes], Value]:
-    """A decoder of protobuf messages through ``mcap-protobuf-support``.
+    """Decoder of protobuf messages, from ``mcap-protobuf-support``.
 
     Args:
         schema: serialized ``FileDescriptorSet``.
-        type_name: full name of the message.
-        where: the topic, for messages.
+        type_name: full name of the message type.
+        where: topic named in errors.
 
     Raises:
-        LogError: ``unsupported_encoding`` when the package is absent or the schema is damaged.
+        LogError: ``unsupported_encoding``, the package is not installed or the schema is damaged.
     """
     try:
         from google.protobuf.message import (  # type: ignore[import-untyped]  # noqa: PLC0415 - an extra
@@ -360,13 +360,13 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
 
 
 def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
-    """A protobuf message, known only by its descriptor, as nested values; maps are left out.
+    """Convert a protobuf message to nested values by its descriptor; maps are omitted.
 
     Args:
         message: the message, or a value in one.
-        above: names of the types that it stands in.
+        above: names of the types that enclose it.
     """
-    # Of the class: a field may bear any name.
+    # From the class, because a field of the message may have the same name.
     descriptor = getattr(type(message), "DESCRIPTOR", None)
     if descriptor is None:
         if isinstance(message, bytes):
@@ -379,7 +379,7 @@ def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
         if isinstance(value, str | bytes | bool | int | float):
             values[declared.name] = _plain(value)
         elif hasattr(type(value), "DESCRIPTOR"):
-            # What is not set is read as its defaults, which would never end in a type that holds itself.
+            # Unset fields are read as their defaults, which would not terminate in a recursive type.
             is_set = type(message).HasField(message, declared.name)  # type: ignore[attr-defined]
             if is_set or declared.message_type.full_name not in inside:
                 values[declared.name] = _plain(value, inside)
@@ -413,12 +413,12 @@ _STAMP: Final = ("header.stamp.sec", "header.stamp.nanosec")
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Recipe:
-    """How one channel is decoded.
+    """Decoder of one channel.
 
     Attributes:
-        decoder: does it.
-        leaves: every leaf field of the type; empty where only the messages know.
-        notes: what is worth knowing.
+        decoder: the decoder.
+        leaves: all leaf fields of the type; empty if they are known only from the messages.
+        notes: remarks for the user.
     """
 
     decoder: StructuredDecoder | ObjectDecoder
@@ -433,7 +433,7 @@ def decoder_for(info: ChannelInfo, schema: bytes, fields: tuple[str, ...] | None
         info: the channel.
         schema: data of its schema.
         fields: wanted field paths, None for all.
-        where: the log, for messages.
+        where: log named in errors.
 
     Raises:
         LogError: ``unsupported_encoding``, ``field_not_found``.
@@ -482,7 +482,7 @@ def _structure_of(
 
 
 def _parse(info: ChannelInfo, schema: bytes) -> tuple[Structure | None, str]:
-    """The type as its schema defines it, or None and why not."""
+    """Type defined by a schema, and an empty text; or None and the reason."""
     text = schema.decode("utf-8", "replace")
     if not text.strip():
         return None, _EMPTY

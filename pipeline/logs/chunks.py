@@ -1,4 +1,4 @@
-"""The chunks of an MCAP file: inflated within bounds, and the messages found in them."""
+"""Chunks of an MCAP file: inflating them within size limits, and locating the messages in them."""
 
 import threading
 import zlib
@@ -17,24 +17,24 @@ from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer, Effort, find_record
 
 MAX_CHUNK: Final = 1 << 30
-"""Largest chunk that is inflated [bytes]; recorders write 1 to 100 MB."""
+"""Maximum inflated size of a chunk [bytes]; recorders write 1 to 100 MB."""
 
 _PLAUSIBLE: Final = 256 << 20
 _PLAUSIBLE_RATIO: Final = 1000
-"""No recording grows by more in chunks larger than `_PLAUSIBLE` bytes: what does was made to fill memory."""
+"""Maximum inflation ratio of a chunk larger than `_PLAUSIBLE` bytes; only malicious files exceed it."""
 
 _MAX_RATIO: Final = {"": 1, "zstd": 40_000, "lz4": 260}
-"""No block of these formats can grow by more: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
+"""Maximum inflation ratio of the formats: zstd stores 128 KiB in four bytes, LZ4 255 bytes in one."""
 
 _LZ4_FLAGS: Final = 4
 _LZ4_HAS_CHECKSUM: Final = 0x04
-"""Bit of the flags behind the magic number of an LZ4 frame."""
+"""Bit in the flags after the magic number of an LZ4 frame."""
 
 _per_thread = threading.local()
 
 
 class InflateError(ValueError):
-    """Stored bytes that do not inflate to what their chunk says."""
+    """Stored bytes that do not inflate to the size stated by their chunk."""
 
 
 @contextmanager
@@ -53,10 +53,10 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
     Args:
         stored: compressed bytes.
         compression: ``""``, ``"zstd"`` or ``"lz4"``.
-        size: bytes that must come out.
+        size: expected inflated size [bytes].
 
     Raises:
-        InflateError: another size comes out, or the bytes are damaged, or the size is absurd.
+        InflateError: the inflated size differs, the bytes are damaged, or the size is implausible.
     """
     check_size(len(stored), compression, size)
     if compression == "":
@@ -73,10 +73,10 @@ def inflate(stored: Buffer, compression: str, size: int) -> Buffer:
 
 
 def check_size(stored: int, compression: str, size: int) -> None:
-    """Refuse a size that cannot be true before memory is asked for.
+    """Check that an inflated size is plausible, before memory is allocated.
 
     Raises:
-        InflateError: with the reason.
+        InflateError: it is not, or the compression is unknown.
     """
     if compression not in _MAX_RATIO:
         raise InflateError(f"the compression {compression[:20]!r} is not known")
@@ -87,12 +87,12 @@ def check_size(stored: int, compression: str, size: int) -> None:
 
 
 def largest_plausible(stored: int) -> int:
-    """Most bytes that so many stored ones inflate to in any recording."""
+    """Maximum plausible inflated size of ``stored`` bytes [bytes]."""
     return min(MAX_CHUNK, max(_PLAUSIBLE, stored * _PLAUSIBLE_RATIO))
 
 
 def inflate_message(stored: bytes) -> Buffer:
-    """The content of a message that was compressed alone, as rosbag2 can; of others the bytes themselves.
+    """Inflate a message that rosbag2 compressed individually; other messages are returned unchanged.
 
     Raises:
         InflateError: as ``inflate``.
@@ -104,12 +104,12 @@ def inflate_message(stored: bytes) -> Buffer:
 
 
 def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
-    """Inflate the records of a chunk to where they shall stand.
+    """Inflate the records of a chunk into a given buffer.
 
     Args:
         stored: compressed bytes.
         compression: ``""``, ``"zstd"`` or ``"lz4"``.
-        target: as many bytes as must come out.
+        target: buffer of the expected inflated size.
 
     Raises:
         InflateError: as ``inflate``.
@@ -130,7 +130,7 @@ def inflate_into(stored: Buffer, compression: str, target: memoryview) -> None:
 
 
 def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
-    """As much of the first ``size`` bytes as undamaged stored bytes give; never raises for damage."""
+    """Inflate up to ``size`` bytes that precede the first damage; damage raises no error."""
     if compression == "":
         return stored[:size]
     start = bytearray()
@@ -141,10 +141,10 @@ def inflate_start(stored: Buffer, compression: str, size: int) -> Buffer:
 
 
 def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> Buffer:
-    """Inflate the first ``needed`` bytes of a chunk of ``size`` bytes and leave the rest.
+    """Inflate only the first ``needed`` bytes of a chunk of ``size`` bytes.
 
     Raises:
-        InflateError: as ``inflate``; damage behind the needed bytes is not seen.
+        InflateError: as ``inflate``; damage after the needed bytes is not detected.
     """
     check_size(len(stored), compression, size)
     if compression == "":
@@ -159,12 +159,12 @@ def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> 
 
 
 def checksum(records: Buffer) -> int:
-    """CRC-32 as MCAP stores it."""
+    """CRC-32 as stored in MCAP files."""
     return zlib.crc32(records)
 
 
 def holds_own_checksum(stored: Buffer, compression: str) -> bool:
-    """Whether inflating all of these bytes verifies a checksum of the content in the format itself."""
+    """Whether the compression format stores a checksum of the content, verified by inflating all bytes."""
     if compression == "lz4":
         return len(stored) > _LZ4_FLAGS and bool(stored[_LZ4_FLAGS] & _LZ4_HAS_CHECKSUM)
     if compression == "zstd":
@@ -176,7 +176,7 @@ def holds_own_checksum(stored: Buffer, compression: str) -> bool:
 
 
 def _zstd() -> zstandard.ZstdDecompressor:
-    """This thread's decompressor."""
+    """Decompressor of the current thread."""
     decompressor: zstandard.ZstdDecompressor | None = getattr(_per_thread, "zstd", None)
     if decompressor is None:
         decompressor = _per_thread.zstd = zstandard.ZstdDecompressor()
@@ -199,7 +199,7 @@ def _inflate_lz4(stored: Buffer, size: int) -> Buffer:
 
 
 def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO[bytes]]:
-    """A stream that gives what precedes damage before it raises."""
+    """A stream that returns the bytes before damage, then raises."""
     if compression == "zstd":
         return zstandard.ZstdDecompressor().stream_reader(stored)
     import pyarrow as pa  # noqa: PLC0415 - heavy, and few logs use lz4
@@ -210,19 +210,19 @@ def _open_damaged(stored: Buffer, compression: str) -> AbstractContextManager[IO
     return stream
 
 
-# Finding the messages among the records of one inflated chunk.
+# Locating the messages among the records of one inflated chunk.
 #
-# The message indexes beside a chunk say where its messages stand, so that no record has to be visited in
-# Python; they are believed only as far as the records agree. What they leave uncovered is walked.
+# The message indexes after a chunk state the offsets of its messages, so that Python need not visit every
+# record. They are used only if all entries agree with the records; uncovered ranges are scanned.
 
 CHUNK_RECORDS: Final = (rec.SCHEMA, rec.CHANNEL, rec.MESSAGE)
-"""Kinds of record that stand in a chunk."""
+"""Kinds of record that occur in a chunk."""
 
 _LAST_TIME: Final = np.uint64((1 << 63) - 1)
-"""Later log times are damage: they lie beyond the year 2262."""
+"""Maximum valid log time [ns], in the year 2262; later ones indicate damage."""
 
 FIRST_PRIVATE: Final = 0x80
-"""Opcodes from here on are private; the specification says to step over them."""
+"""First private opcode; the specification requires that such records are skipped."""
 
 MESSAGE_HEAD: Final = np.dtype(
     [
@@ -234,27 +234,27 @@ MESSAGE_HEAD: Final = np.dtype(
         ("publish_time", "<u8"),
     ]
 )
-"""A message record before its payload."""
+"""Layout of a message record before its payload."""
 
 MESSAGE_OVERHEAD: Final = MESSAGE_HEAD.itemsize
-"""Bytes of a message record before its payload."""
+"""Size of a message record before its payload [bytes]."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Messages:
-    """The messages of a chunk in the order they stand there.
+    """The messages of a chunk, in the order of their offsets.
 
     Attributes:
-        start: where each payload starts in the chunk, int64, shape (n,).
-        size: bytes of each payload, int64.
+        start: offset of each payload in the chunk, int64, shape (n,).
+        size: size of each payload [bytes], int64.
         channel: channel number, uint16.
-        sequence: number that the writer gave it, uint32.
+        sequence: sequence number assigned by the writer, uint32.
         log_time: [ns], int64.
         publish_time: [ns], int64.
         schemas: schema records of the chunk.
         channels: channel records of the chunk.
-        damage: stretches (start, end) of the chunk that hold no readable record.
-        walked: whether no message index told where they stand, or one that does not agree with the records.
+        damage: ranges (start, end) of the chunk without a readable record.
+        walked: whether the chunk was scanned because no message index agrees with its records.
     """
 
     start: Ints
@@ -287,12 +287,12 @@ class _WalkedChunk:
 def locate_messages(
     chunk: Buffer, entries: Sequence[tuple[int, NDArray[np.uint64]]] | None, stored: int
 ) -> Messages:
-    """Find all messages of a chunk.
+    """Locate all messages of a chunk.
 
     Args:
         chunk: its inflated records.
-        entries: channel and entries of every message index beside it; None when there are none.
-        stored: bytes that it takes in the file.
+        entries: channel and entries of every message index after it; None if there are none.
+        stored: size of the chunk in the file [bytes].
     """
     data = np.frombuffer(chunk, dtype=np.uint8)
     located = _WalkedChunk(Effort.for_bytes(stored))
@@ -341,7 +341,7 @@ def _heads(data: NDArray[np.uint8], offsets: Ints) -> NDArray[np.void]:
 def _agreeing_messages(
     data: NDArray[np.uint8], entries: Sequence[tuple[int, NDArray[np.uint64]]]
 ) -> tuple[Ints, NDArray[np.void]] | None:
-    """Offsets and heads by offset, None unless every entry of the index points to the message it names."""
+    """Sorted offsets and heads of the indexed messages, None unless all entries agree with the records."""
     joined = np.concatenate([np.empty((0, 2), dtype=np.uint64), *(entry for _, entry in entries)])
     if joined.size == 0 or data.size < MESSAGE_HEAD.itemsize:
         return None
@@ -385,7 +385,7 @@ def _walk(chunk: Buffer, start: int, end: int, located: _WalkedChunk) -> None:
 def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
     if opcode not in (rec.SCHEMA, rec.CHANNEL):
         return opcode >= FIRST_PRIVATE
-    # Some writers put the same records before every message; such as differ do not compress to nothing.
+    # Some writers repeat these records before every message; differing ones cannot be compressed to nothing.
     content = opcode, bytes(body)
     if content in located.known:
         return True
@@ -404,10 +404,10 @@ def _take_side_record(opcode: int, body: Buffer, located: _WalkedChunk) -> bool:
 
 
 def _resume(chunk: Buffer, before: int | None, position: int, end: int, located: _WalkedChunk) -> int:
-    """Note damage at ``position`` and find where records go on.
+    """Record damage at ``position``; returns the offset of the next record.
 
-    When they go on inside the message that ends there, which starts at ``before``, its length was the damage
-    and it is given up.
+    If that lies inside the message that starts at ``before`` and ends at ``position``, the length of this
+    message is damaged, and the message is dropped.
     """
     first = position + 1 if before is None else before + 1
     again = find_record(chunk, first, end, CHUNK_RECORDS, located.effort)

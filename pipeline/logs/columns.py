@@ -1,4 +1,4 @@
-"""Columns of messages, the field paths that name them, and payloads copied out of chunks.
+"""Columns of messages, their field paths, and payloads copied from chunks.
 
 A field with one number per message is a plain array; a fixed-size array is ``(n, k)``. Sequences are
 concatenated values with offsets. Strings are codes into the tuple of the distinct strings.
@@ -141,7 +141,7 @@ def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where:
     Args:
         leaves: every leaf field of the type.
         fields: wanted paths, None for all.
-        where: the topic, for messages.
+        where: topic named in errors.
 
     Raises:
         LogError: ``field_not_found``.
@@ -260,7 +260,7 @@ class Block:
 
 
 def gather_payloads(chunk: Buffer, messages: Messages, numbers: Iterable[int]) -> dict[int, Payloads]:
-    """Copy the payloads of some channels out of a chunk.
+    """Copy the payloads of some channels from a chunk.
 
     Args:
         chunk: inflated records of the chunk.
@@ -356,7 +356,7 @@ Key = tuple[int, int, bytes]
 _DIGEST: Final = 16
 
 _MOST_ALIKE: Final = 1000
-"""Maximum number of copies of a message: more messages with equal times mean that the clock stood still."""
+"""Maximum number of copies of a message: more messages with equal times indicate a stopped clock."""
 
 
 def share_times(log_time: Ints, publish_time: Ints) -> Ints:

@@ -1,4 +1,4 @@
-"""From rows of serialized messages to columns, guided by the type's tree."""
+"""Decoding of rows of serialized messages to columns, by the tree of their type."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from pipeline.logs.cdr import Cursor, Dialect, MisfitError, Vocabulary
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Scalar, Strings
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure
 
-# From rows of serialized messages to pieces of columns, guided by the type's tree.
+# Decoding of rows of serialized messages to pieces of columns.
 #
-# Only wanted fields are copied; the others are stepped over, their lengths checked all the same.
+# Only wanted fields are copied; the others are skipped, but their lengths are checked as well.
 
 _PADDING: Final = 3
-"""Serializers may pad a message to a multiple of four bytes."""
+"""Maximum padding of a message [bytes]: serializers may pad it to a multiple of four bytes."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -27,8 +27,8 @@ class Piece:
     """Values of one field in some rows.
 
     Attributes:
-        values: one entry a row, or all entries end to end when ``counts`` is given; int32 codes for strings.
-        counts: entries of each row, int64, or None.
+        values: one entry per row, or concatenated entries if ``counts`` is given; int32 codes for strings.
+        counts: number of entries of each row, int64, or None.
     """
 
     values: NDArray[np.generic]
@@ -44,7 +44,7 @@ class Plan:
 
     Attributes:
         structure: the type.
-        wanted: for each member: True for a wanted leaf, the plan of a structure below, None to step over.
+        wanted: for each member: True for a wanted leaf, the plan of a structure, None for a skipped member.
     """
 
     structure: Structure
@@ -71,9 +71,9 @@ class Decoder:
 
     Attributes:
         plan: the type and its wanted fields.
-        exact: whether a row that is longer than its type, but for padding, does not fit; always so in XCDR2.
-        vocabularies: by field path; filled while decoding.
-        longer: rows met that are longer than their type.
+        exact: whether rows longer than their type, apart from padding, are rejected; always so in XCDR2.
+        vocabularies: vocabularies by field path, filled while decoding.
+        longer: number of accepted rows that are longer than their type.
     """
 
     plan: Plan
@@ -85,10 +85,10 @@ class Decoder:
         """Decode all rows that fit.
 
         Args:
-            cursor: at the start of its rows; at least one row.
+            cursor: cursor at the start of its rows, of which there is at least one.
 
         Returns:
-            The pieces and the numbers of the rows they hold, in the cursor's order.
+            The pieces and the indices of their rows, in the cursor's order.
         """
         while cursor.base.size:
             pieces: Pieces = {}
@@ -187,7 +187,7 @@ class Decoder:
 
 @dataclass(frozen=True, slots=True)
 class Regular:
-    """Layout of a structure whose elements all look alike: alignment of the first, size, distance."""
+    """Constant layout of a sequence's elements: alignment of the first, size and distance [bytes]."""
 
     align: int
     size: int
@@ -195,7 +195,7 @@ class Regular:
 
 
 def regular_layout(structure: Structure, dialect: Dialect) -> Regular | None:
-    """Layout of a sequence's elements, None unless all are laid out alike whatever stands before them."""
+    """Layout of a sequence's elements, None unless it is independent of the position in the message."""
     alignments: list[int] = []
     size = _measure(structure, dialect, 0, alignments)
     if size is None or not alignments or alignments[0] != max(alignments):
@@ -223,7 +223,7 @@ def _measure(structure: Structure, dialect: Dialect, start: int, alignments: lis
 
 
 def least_size(structure: Structure) -> int:
-    """Fewest bytes a structure can take, padding not counted; at least one."""
+    """Minimum size of a structure without padding [bytes], at least 1."""
     total = 0
     for member in structure.members:
         if member.count == SEQUENCE or member.element in ("string", "wstring"):
@@ -280,12 +280,12 @@ def _visit_elements(cursor: Cursor, counts: int | Ints, read_one: Callable[[Curs
 
 
 def join_elements(pieces: list[tuple[Ints, Piece]], rows: int, nothing: NDArray[np.generic]) -> Piece:
-    """Put elements that were read one number after the other in the order of their rows.
+    """Sort elements by row that were read by element index.
 
     Args:
-        pieces: for each element number, the rows that have it and its values there.
-        rows: count of rows.
-        nothing: an empty array of the right type and width.
+        pieces: for each element index, the rows that have this element, and its values.
+        rows: number of rows.
+        nothing: an empty array of the values' type and width.
     """
     if not pieces:
         return Piece(nothing, np.zeros(rows, dtype=np.int64))
@@ -300,7 +300,7 @@ def join_elements(pieces: list[tuple[Ints, Piece]], rows: int, nothing: NDArray[
 
 
 def take_ragged(values: NDArray[np.generic], counts: Ints, order: Ints) -> NDArray[np.generic]:
-    """Values of ragged rows, the rows taken in another order."""
+    """Values of ragged rows, reordered by row."""
     start = np.cumsum(counts) - counts
     taken = counts[order]
     first = np.cumsum(taken) - taken
@@ -313,8 +313,8 @@ class Leaf:
 
     Attributes:
         nothing: an empty array of its type and width.
-        ragged: whether a row can hold any count of values.
-        text: whether it holds strings.
+        ragged: whether the number of values varies between rows.
+        text: whether its values are strings.
     """
 
     nothing: NDArray[np.generic]
@@ -323,12 +323,12 @@ class Leaf:
 
 
 def wanted_leaves(plan: Plan, prefix: str = "", *, inside: bool = False) -> Iterator[tuple[str, Leaf]]:
-    """Every wanted leaf with its path.
+    """All wanted leaves with their paths.
 
     Args:
         plan: the type and its wanted fields.
-        prefix: put before every path.
-        inside: whether the plan is of the elements of a sequence.
+        prefix: prefix of all paths.
+        inside: whether the plan is that of a sequence's elements.
     """
     for member, mark in zip(plan.structure.members, plan.wanted, strict=True):
         path = f"{prefix}{member.name}"
@@ -353,15 +353,15 @@ def _sum_groups(values: Ints, sizes: Ints) -> Ints:
 
 
 _FIRST_CAPACITY: Final = 64 << 20
-"""Most bytes that are set aside for a column because the index promises so many messages."""
+"""Maximum memory allocated for a column from the message count in the index [bytes]."""
 
 
 class ColumnParts:
-    """The values of one field, in the order they are decoded.
+    """The values of one field, in the order in which they are decoded.
 
     Args:
         leaf: the field.
-        expected: how many rows will come, as far as the index knows.
+        expected: number of rows stated in the index.
     """
 
     def __init__(self, leaf: Leaf, expected: int) -> None:
@@ -371,7 +371,7 @@ class ColumnParts:
         self._counts = _Growing(np.empty(0, dtype=np.int64))
 
     def add(self, piece: Piece) -> None:
-        """Copy the values of the next rows."""
+        """Append a copy of the values of the next rows."""
         rows = piece.values.shape[0] if piece.counts is None else piece.counts.size
         share = self._expected / max(rows, 1)
         self._values.append(piece.values, share)
@@ -379,11 +379,11 @@ class ColumnParts:
             self._counts.append(piece.counts, share)
 
     def take_column(self, order: Ints, vocabulary: Vocabulary | None) -> Column:
-        """The column of some rows; to be asked once, the values are given up.
+        """Column of some rows; may be called once, because it frees the values.
 
         Args:
-            order: places of the rows among those that were added.
-            vocabulary: of a string field.
+            order: indices of the rows among those that were added.
+            vocabulary: vocabulary of a string field, else None.
         """
         values, count = self._values.give_up(), self._counts.give_up()
         texts = () if vocabulary is None else vocabulary.texts()
@@ -399,7 +399,7 @@ class ColumnParts:
 
 
 class _Growing(Generic[Scalar]):
-    """An array that is appended to; what was read from a file never decides how much memory it takes."""
+    """A growing array; counts read from a file do not determine its memory beyond `_FIRST_CAPACITY`."""
 
     def __init__(self, nothing: NDArray[Scalar]) -> None:
         self._nothing = nothing
@@ -407,7 +407,7 @@ class _Growing(Generic[Scalar]):
         self._size = 0
 
     def append(self, values: NDArray[Scalar], share: float) -> None:
-        """Append values; in all about ``share`` times as many are expected."""
+        """Append values; about ``share`` times as many are expected in total."""
         need = self._size + values.shape[0]
         if need > self._data.shape[0]:
             row = max(1, self._nothing.dtype.itemsize * int(np.prod(self._nothing.shape[1:])))
@@ -420,7 +420,7 @@ class _Growing(Generic[Scalar]):
         self._size = need
 
     def give_up(self) -> NDArray[Scalar]:
-        """All values; none are kept."""
+        """Return all values and free the array."""
         values, self._data, self._size = self._data[: self._size], self._nothing, 0
         return values
 

@@ -30,7 +30,7 @@ def normalize_columns(
         structure: the type.
         rows: number of messages.
         fields: values by leaf path.
-        where: topic, for messages.
+        where: topic named in errors.
 
     Raises:
         LogError: ``field_not_found``, ``bad_column``.
@@ -195,7 +195,7 @@ def encode_rows(
         structure: type of the messages.
         rows: number of messages.
         fields: values by leaf path; absent fields are zero or empty.
-        where: topic, for messages.
+        where: topic named in errors.
 
     Yields:
         Indices of the rows of one layout, and their payloads as (m, length) bytes.

@@ -1,4 +1,4 @@
-"""What a recording holds without decoding a message, and what its checksums cover."""
+"""Index of a recording's contents, built without decoding messages, and coverage by its checksums."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ if TYPE_CHECKING:
     from concurrent.futures import Executor, Future
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
-"""Of the files that recordings are made of."""
+"""Suffixes of the files of recordings."""
 
 _LONGEST_SHOWN: Final = 100
 _MAX_LISTING: Final = 4 << 20
 LONGEST_NAME: Final = 200
-"""Characters of a name from a log that tables and sentences repeat."""
+"""Maximum length of a name from a log in tables and sentences [characters]."""
 LISTING: Final = "metadata.yaml"
-"""Which rosbag2 writes into its folder when a recording ends."""
+"""File that rosbag2 writes into its folder at the end of a recording."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,13 +46,13 @@ class ChannelInfo:
     """One channel of a recording.
 
     Attributes:
-        id: its number in the recording (over all parts of a split one).
+        id: channel number in the recording (over all parts of a split one).
         topic: name of the topic.
-        type_name: ``package/msg/Name``; empty when the channel has no schema.
+        type_name: ``package/msg/Name``; empty if the channel has no schema.
         schema_encoding: ``ros2msg``, ``ros2idl``, ``protobuf``, ...
         message_encoding: ``cdr``, ``json``, ``protobuf``, ``ros1``, ...
-        message_count: messages in the readable part of the log.
-        metadata: as written by the recorder.
+        message_count: number of messages in the readable part of the log.
+        metadata: metadata written by the recorder.
     """
 
     id: int
@@ -66,14 +66,14 @@ class ChannelInfo:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """One file of a recording, for the reader of this room.
+    """One file of a recording.
 
     Attributes:
         path: the file.
-        size_bytes: its bytes.
-        catalog: what it holds.
-        version: of an object on a store, None for a file.
-        numbers: the recording's channel number for each of the file's own, told where parts are merged.
+        size_bytes: size of the file [bytes].
+        catalog: catalog of its contents.
+        version: version of an object in an object store, None for a file.
+        numbers: channel number in the recording by that in the file, set by `merge_parts`.
     """
 
     path: Path
@@ -85,24 +85,24 @@ class Part:
 
 @dataclass(frozen=True, slots=True)
 class LogIndex:
-    """What a recording holds.
+    """Index of a recording's contents.
 
     Attributes:
         path: file or folder.
-        size_bytes: bytes of all its files.
-        profile: ``ros2``, ``ros1`` or what the recorder wrote.
-        library: what wrote it.
-        compressions: of its chunks, sorted; ``""`` is none.
-        chunk_count: chunks of all parts.
-        start_ns: first log time [ns], 0 when empty.
-        end_ns: last log time [ns], 0 when empty.
-        channels: by number.
-        metadata: name to record; of several with one name the last.
-        attachments: names.
-        losses: damage seen without reading the messages.
-        notes: what is worth knowing and no loss.
+        size_bytes: total size of its files [bytes].
+        profile: profile stated by the recorder, such as ``ros2`` or ``ros1``.
+        library: library that wrote it.
+        compressions: compressions of its chunks, sorted; ``""`` is none.
+        chunk_count: number of chunks of all parts.
+        start_ns: first log time [ns], 0 if empty.
+        end_ns: last log time [ns], 0 if empty.
+        channels: channels of all parts, by number.
+        metadata: metadata records by name; the last of several with one name.
+        attachments: names of the attachments.
+        losses: losses detected without reading the messages.
+        notes: remarks that are not losses.
         parts: the files.
-        fetched_bytes: bytes fetched from an object store to find this out.
+        fetched_bytes: number of bytes fetched from an object store to build the index.
     """
 
     path: Path
@@ -133,22 +133,22 @@ class LogIndex:
 
     @property
     def containers(self) -> frozenset[str]:
-        """What kinds of file its parts are: empty for MCAP, else the name of a kind of bag."""
+        """Kinds of its files: empty for MCAP, else the name of the kind."""
         return frozenset(part.catalog.container for part in self.parts)
 
     @property
     def complete(self) -> bool:
-        """Whether nothing is known to be lost."""
+        """Whether no losses are known."""
         return not self.losses
 
     @property
     def deployment(self) -> dict[str, str]:
-        """What the metadata record of this name tells, vehicle and terrain, in names of bearable length."""
+        """Metadata record ``deployment`` (vehicle, terrain), with its values shortened."""
         return {key: shorten(text) for key, text in self.metadata.get("deployment", {}).items()}
 
     @property
     def message_count(self) -> int:
-        """Messages of all channels."""
+        """Number of messages of all channels."""
         return sum(channel.message_count for channel in self.channels)
 
     def topics(self) -> tuple[str, ...]:
@@ -157,21 +157,21 @@ class LogIndex:
 
 
 def shorten(name: str) -> str:
-    """A name that a log gives as it can be repeated in every row; what is left out is said."""
+    """Shorten a name from a log for use in tables; a cut name states its full length."""
     if len(name) <= LONGEST_NAME:
         return name
     return f"{name[:LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
 def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -> LogIndex:
-    """Find out what a recording holds.
+    """Build the index of a recording.
 
     Args:
-        path: an MCAP file or object (``s3://bucket/key``), a bag of ROS 1 or an SQLite file of rosbag2, or
-            the folder of a recording split over several (with or without the ``metadata.yaml`` of rosbag2),
-            or of the text tables of a data set that is known.
-        max_inflated: bytes that all chunks of a file may inflate to, by default what is plausible for its
-            size; what is beyond is left out, a loss.
+        path: an MCAP file or object (``s3://bucket/key``), a ROS 1 bag, an SQLite file of rosbag2, the
+            folder of a split recording (with or without the ``metadata.yaml`` of rosbag2), or the folder of
+            text tables of a known data set.
+        max_inflated: limit of the inflated size of all chunks of a file [bytes], by default a plausible one
+            for its size; chunks beyond it are omitted and reported as a loss.
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
@@ -189,7 +189,7 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
-    """SHA-256 (hex) of a recording's bytes; of a split one, of all its parts in order.
+    """SHA-256 (hex) of a recording's bytes; for a split one, of all its parts in order.
 
     Raises:
         LogError: as ``open_log``.
@@ -200,7 +200,7 @@ def hash_log(path: str | os.PathLike[str]) -> str:
 
 
 def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
-    """The files of a recording in order, and those that are missing as losses.
+    """The files of a recording in order, and losses for missing files.
 
     Raises:
         LogError: ``not_a_recording``.
@@ -247,18 +247,18 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
 
 
 def list_files(folder: Path) -> list[Path]:
-    """Every file in a folder that may be one of a recording: MCAP first, by name and number.
+    """The files of recordings in a folder, MCAP first, by name and number.
 
-    Where there is none, the text tables of a data set that is known.
+    If there are none, the text tables of a known data set.
     """
     named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number))
     return [file for file in named if not file.is_dir()] or list_tables(folder)
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:
-    """A file of a recording by the name that its listing gives; None where it is not in the folder."""
+    """Path of a file in the listing of a recording; None if it is not in the folder."""
     try:
-        # The parts of a recording are often links, made by those who keep their logs elsewhere.
+        # Parts of a recording are often links to files in another folder.
         file = resolve_inside(folder, name, follow_links=True)
     except PathError:
         return None
@@ -266,7 +266,7 @@ def _find_listed(folder: Path, name: str) -> Path | None:
 
 
 def _show(name: str) -> str:
-    """A listed name for a message, which whoever wrote the listing chose."""
+    """Format a file name from a listing, which is untrusted, for a message."""
     plain = name.rpartition("/")[2]
     return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
 
@@ -287,7 +287,7 @@ def _listed_files(text: str) -> list[str]:
 
 
 def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetched: int) -> LogIndex:
-    """What a recording holds, by what its files hold; channels of one topic and type get one number."""
+    """Merge the catalogs of the files of a recording; channels of one topic and type get one number."""
     channels: dict[tuple[object, ...], ChannelInfo] = {}
     alone = len(parts) == 1
     catalogs = [part.catalog for part in parts]
@@ -332,16 +332,16 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
 
 _LISTED: Final = 12
-"""So many topics are named."""
+"""Maximum number of topics listed in a message."""
 
 
 class DataSection:
-    """The checksum over the data section of one file, computed once, beside the reading.
+    """Check of the checksum of a file's data section, computed once and in parallel with reading.
 
     Args:
         source: the file.
-        catalog: what it holds.
-        beside: computes it.
+        catalog: catalog of the file.
+        beside: executor of the computation.
     """
 
     def __init__(self, source: ByteSource, catalog: Catalog, beside: Executor) -> None:
@@ -349,7 +349,7 @@ class DataSection:
         self._catalog = catalog
         self._beside = beside
         self._check: Future[bool] | None = None
-        # All of an object is fetched for this only where nothing else covers its messages.
+        # The check fetches a whole object, so it is started only if no other checksum covers its messages.
         if not is_fetched(source):
             self._begin()
 
@@ -359,16 +359,16 @@ class DataSection:
             self._check = self._beside.submit(checksum_holds, self._source, end, crc)
 
     def holds(self) -> bool:
-        """Whether there is such a checksum and it holds."""
+        """Whether there is such a checksum and it is valid."""
         self._begin()
         return self._check is not None and self._check.result()
 
     def judge(self, unchecked: int, *, is_damaged: bool) -> Loss | None:
-        """What is lost because it does not hold.
+        """Loss if the checksum is invalid, else None.
 
         Args:
-            unchecked: stretches with messages that were read and have no checksum of their own.
-            is_damaged: whether damage in this file has been told already, which is reason enough.
+            unchecked: number of spans with messages that were read and have no checksum of their own.
+            is_damaged: whether damage to this file is already reported, which explains a mismatch.
         """
         if unchecked:
             self._begin()
@@ -398,9 +398,9 @@ class DataSection:
 
 @dataclass(slots=True)
 class Coverage:
-    """How many stretches with messages were read, and how many of them no checksum covers.
+    """Number of spans with messages that were read, and of those without a checksum.
 
-    ``topics`` are those whose definitions nothing covers.
+    ``topics`` are those whose definitions have neither a checksum nor a second copy.
     """
 
     spans: int = 0
@@ -408,7 +408,7 @@ class Coverage:
     topics: list[str] = field(default_factory=list)
 
     def format_coverage(self) -> str:
-        """What is unchecked, in words; empty when all that was read is covered."""
+        """Description of the unchecked data; empty if all data read is covered."""
         said = []
         if self.unchecked and self.unchecked == self.spans:
             said.append(_NOTHING_COVERED)
@@ -427,11 +427,11 @@ class Coverage:
 
 
 def count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[Loss]) -> list[Loss]:
-    """Messages that the summary counts and nobody found, where no other loss explains them.
+    """Losses of messages that the summary counts but that were not found, if no other loss explains them.
 
     Args:
         counted: channels with the number of their messages that were found.
-        losses: what is known to be lost.
+        losses: known losses.
     """
     if losses:
         return []

@@ -99,7 +99,7 @@ class LiveRecording:
         if lock is None:
             hint = "End the other watch, or name another folder with --record"
             raise LogError("recording_in_use", "another watch writes there", where=str(folder), hint=hint)
-        # The lock lasts until this process ends, in whatever way.
+        # The lock is held until this process ends, even if it is killed.
         self._lock = lock
 
     def _naming_os_errors(self) -> AbstractContextManager[None]:

@@ -1,4 +1,4 @@
-"""Reading the wanted topics of a recording as columns, channels of one topic joined."""
+"""Reading the wanted topics of a recording as columns, and joining the channels of a topic."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ if TYPE_CHECKING:
 
 
 _LISTED: Final = 12
-"""So many topics are named in an error."""
+"""Maximum number of topics listed in an error."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +57,9 @@ class Wanted:
     """A topic to read.
 
     Attributes:
-        topic: its name.
+        topic: name of the topic.
         fields: paths of fields such as ``twist.twist.linear.x``, ``velocity``, ``velocity[0]`` or
-            ``transforms[].child_frame_id``; a path of a structure stands for all below it. None reads all.
+            ``transforms[].child_frame_id``; a path of a structure selects all its fields. None selects all.
     """
 
     topic: str
@@ -72,13 +72,13 @@ class TopicColumns:
 
     Attributes:
         topic: name of the topic.
-        channel_id: its channel's number in the recording.
+        channel_id: number of the channel in the recording.
         type_name: ``package/msg/Name``.
-        log_time: when they were recorded [ns], int64, shape (n,).
-        publish_time: when they were published [ns], int64, shape (n,).
-        header_time: stamp of their headers [ns], int64, shape (n,); None when the type has no header.
-        fields: column of every wanted field.
-        notes: what is worth knowing and no loss.
+        log_time: times of recording [ns], int64, shape (n,).
+        publish_time: times of publication [ns], int64, shape (n,).
+        header_time: stamps of the headers [ns], int64, shape (n,); None if the type has no header.
+        fields: columns by wanted field.
+        notes: remarks that are not losses.
     """
 
     topic: str
@@ -96,17 +96,17 @@ class TopicColumns:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogData:
-    """What was read from a recording.
+    """Data read from a recording.
 
     Attributes:
-        index: what it holds.
+        index: index of the recording.
         topics: columns of every channel of the wanted topics that could be decoded.
-        losses: everything that is known to be missing.
-        notes: what is worth knowing and no loss.
-        sha256: of the recording's bytes (hex); of an object, of its version and size.
-        fetched_bytes: bytes fetched from an object store.
-        unchecked: what no checksum covers, in words; empty when all that was read is covered.
-        repeated: by topic, messages that stand in the recording again and were counted once.
+        losses: all known losses.
+        notes: remarks that are not losses.
+        sha256: SHA-256 of the recording's bytes (hex); for an object, of its version and size.
+        fetched_bytes: number of bytes fetched from an object store.
+        unchecked: description of the data that no checksum covers; empty if all data read is covered.
+        repeated: number of omitted duplicates of messages, by topic.
     """
 
     index: LogIndex
@@ -133,14 +133,14 @@ def read_topics(
     """Read topics of a recording.
 
     Args:
-        path: the recording, or what ``open_log`` said of it.
+        path: the recording, or its index from ``open_log``.
         wanted: topics and fields.
-        threads: chunks inflated at once; by default as many as this process may use.
-        sha256: the recording's hash when it is known; otherwise it is computed beside the reading.
+        threads: number of chunks inflated at once; by default as many as this process may use.
+        sha256: hash of the recording if known; otherwise it is computed in parallel with reading.
 
     Raises:
-        LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``. A topic in an encoding that is
-            not supported is a loss, not an error: the others are read.
+        LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``. A topic in an unsupported
+            encoding is a loss, not an error: the others are read.
     """
     index = path if isinstance(path, LogIndex) else open_log(path)
     workers = threads or usable_threads()
@@ -199,7 +199,7 @@ def read_topics(
 
 @dataclass(slots=True, eq=False)
 class _Gathered:
-    """Wanted payloads of one span by the recording's channel number, and what is to be said of it."""
+    """Wanted payloads of one span, by the recording's channel number, with its losses and coverage."""
 
     payloads: dict[int, Payloads]
     losses: list[Loss]
@@ -247,7 +247,7 @@ def _choose_channels(
 
 
 def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, tuple[str, ...] | None]:
-    """Fields by topic; a topic that is wanted twice gets the fields of both."""
+    """Fields by topic; a topic that is wanted twice has the fields of both requests."""
     merged: dict[str, tuple[str, ...] | None] = {}
     for want in wanted:
         before = merged.get(want.topic, ())
@@ -264,7 +264,7 @@ def _no_topic(index: LogIndex, topic: str) -> LogError:
 
 
 def _find_uncovered(part: Part, jobs: Mapping[int, _Job], section: DataSection) -> list[str]:
-    """Topics that are read by definitions which nothing covers."""
+    """Topics whose schema or channel record is covered by no checksum and no second copy."""
     own = [number for number, merged in part.numbers.items() if merged in jobs]
     bare = [number for number in own if not part.catalog.is_covered(number, data_holds=False)]
     holds = bool(bare) and section.holds()
@@ -276,7 +276,7 @@ def _find_uncovered(part: Part, jobs: Mapping[int, _Job], section: DataSection) 
 
 
 def _list_schemas(index: LogIndex) -> dict[int, bytes]:
-    """Definition of the messages of every channel by its number in the recording."""
+    """Schema data of every channel, by its number in the recording."""
     schemas: dict[int, bytes] = {}
     for part in index.parts:
         for own, channel in part.catalog.channels.items():
@@ -304,7 +304,7 @@ def _read_part(
         merged = {part.numbers[number]: each for number, each in payloads.items()}
         cover = Cover.DATA if loaded.unchecked else Cover.CHECKSUM
         losses = loaded.losses + part.catalog.find_contradictions(loaded.messages.descriptions, cover)
-        # The cut chunk at the end of a file is a loss already.
+        # A cut chunk at the end of a file is already reported as a loss.
         spans = int(bool(merged) and span.kind is not SpanKind.CUT_CHUNK)
         return _Gathered(merged, losses, spans, spans * loaded.unchecked, loaded.index_damaged)
 
@@ -314,7 +314,7 @@ def _read_part(
 
 def _gather_bag(part: Part, messages: BagMessages) -> _Gathered:
     merged = {part.numbers[number]: each for number, each in messages.payloads.items()}
-    # Nothing in a bag is covered by a checksum.
+    # Bags store no checksums of their messages.
     stretch = int(bool(merged))
     return _Gathered(merged, messages.losses, stretch, stretch, index_damaged=False)
 
@@ -326,7 +326,7 @@ def _spans_with(part: Part, own: set[int]) -> list[Span]:
 def _find_repeated(
     parts: Sequence[tuple[Part, ByteSource]], jobs: Mapping[int, _Job], threads: int
 ) -> dict[int, Ints]:
-    """By channel, numbers of the messages that stand in the recording before, byte for byte."""
+    """Indices of the messages that are byte-for-byte copies of earlier ones, by channel."""
     suspects = {number: share_times(*job.buffer.times()) for number, job in jobs.items()}
     suspects = {number: rows for number, rows in suspects.items() if rows.size}
     if not suspects:
@@ -334,7 +334,7 @@ def _find_repeated(
     times = {number: np.unique(jobs[number].buffer.times()[0][rows]) for number, rows in suspects.items()}
     keys: dict[int, list[Key]] = {number: [] for number in suspects}
     for part, source in parts:
-        # Reading what was wanted before, and only that, gives the same messages in the same order.
+        # Reading exactly the same channels again yields the same messages in the same order.
         own = {number for number, merged in part.numbers.items() if merged in jobs}
         asked = {number: times[part.numbers[number]] for number in own if part.numbers[number] in times}
 
@@ -402,7 +402,7 @@ def join_channels(channels: Sequence[TopicColumns]) -> TopicColumns | None:
         channels: columns of one topic, at least one.
 
     Returns:
-        The joined columns; None where the channels differ in type or fields and cannot be one series.
+        The joined columns; None if the channels differ in type or fields and cannot form one series.
     """
     first = channels[0]
     if len(channels) == 1:
@@ -448,7 +448,7 @@ def _join(columns: Sequence[Column], order: Ints) -> Column:
 
 
 def _reorder_rows(parts: Sequence[Ints], order: Ints) -> tuple[Ints, Ints]:
-    """Where each value of reordered rows comes from, and the new offsets."""
+    """Source index of each value of reordered rows, and the new offsets."""
     counts = np.concatenate([np.diff(offsets) for offsets in parts])
     starts = np.cumsum(counts) - counts
     offsets = np.concatenate(([0], np.cumsum(counts[order])))
@@ -459,7 +459,7 @@ def _reorder_rows(parts: Sequence[Ints], order: Ints) -> tuple[Ints, Ints]:
 def _merge_codes(
     parts: Sequence[tuple[NDArray[np.int32], tuple[str, ...]]],
 ) -> tuple[NDArray[np.int32], tuple[str, ...]]:
-    """Codes of several vocabularies in a common one."""
+    """Codes of several vocabularies converted to a common one, and its strings."""
     common: dict[str, int] = {}
     codes = []
     for own, values in parts:

@@ -122,7 +122,7 @@ class ChunkHead:
 
 
 class _Body(ReadDataStream):
-    """Body of one record; refuses a read beyond its end, where mcap returns fewer bytes."""
+    """Body of one record; raises an error on a read beyond its end, where mcap returns fewer bytes."""
 
     def __init__(self, body: Buffer) -> None:
         super().__init__(BytesIO(body))
@@ -237,7 +237,7 @@ LAST_BLOCK: Final = 1 << 20
 """First and largest block of a search [bytes]: blocks grow, so that dense damage does not make it slow."""
 
 _SEARCH: Final = 16
-"""Effort of a search for its first block [units]; each position that is tried takes one more."""
+"""Effort of a search for its first block [units]; each tested position adds one unit."""
 
 _LEAST_EFFORT: Final = 1 << 6
 """Minimum effort for a chunk [units]: up to four searches after damage in the smallest chunk."""

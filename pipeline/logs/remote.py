@@ -1,4 +1,4 @@
-"""Logs on object stores, such as ``s3://bucket/logs/run.mcap``, read by ranges in bounded time."""
+"""Logs in object stores, such as ``s3://bucket/logs/run.mcap``, read by byte ranges with timeouts."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ if TYPE_CHECKING:
 Info = dict[str, object]
 
 SCHEMES: Final = ("s3", "s3a", "memory")
-"""Kinds of stores that are reached; what ``memory`` holds is in this process and gone with it."""
+"""Supported URL schemes; objects of ``memory`` exist only in this process."""
 
 _LISTING_S: Final = 60
 _CONNECT_S: Final = 5
 _ANSWER_S: Final = 15
 _ATTEMPTS: Final = 3
-"""Of the request, with growing pauses, when a store is busy or gone."""
+"""Maximum number of attempts per request, with increasing pauses, if a store is busy or unreachable."""
 
 _ROUNDS: Final = 2
-"""Of those attempts: together with the times above a store that is silent costs a minute and a half."""
+"""Rounds of these attempts: with the timeouts above, an unresponsive store takes about 90 s."""
 
 
 class VersionChangedError(Exception):
-    """An object is not the one that was opened."""
+    """An object differs from the version that was opened."""
 
 
 class _Plain:
-    """A store whose every failure is an ``OSError``, whatever its libraries raise.
+    """Wrapper of a store that converts all exceptions of its libraries to ``OSError``.
 
     Args:
-        store: of fsspec.
+        store: file system of fsspec.
     """
 
     def __init__(self, store: object) -> None:
@@ -59,17 +59,17 @@ class _Plain:
             except OSError:
                 raise
             except Exception as error:
-                # Missing credentials, a name that does not resolve, an answer that is no XML: no two alike.
+                # Missing credentials, an unresolved name or invalid XML raise unrelated types of exceptions.
                 raise OSError(" ".join(str(error).split()) or type(error).__name__) from error
 
         return call
 
 
 def check_scheme(url: str) -> str:
-    """The kind of store of an address.
+    """The URL scheme of an address.
 
     Raises:
-        LogError: ``no_object_store``, it is none that is reached.
+        LogError: ``no_object_store``, the scheme is not supported.
     """
     scheme = url.partition(":")[0]
     if scheme not in SCHEMES:
@@ -79,13 +79,13 @@ def check_scheme(url: str) -> str:
 
 
 def open_store(url: str) -> AbstractFileSystem:
-    """Reach the store of an address; nothing is asked of it yet.
+    """Open the store of an address; no request is sent yet.
 
     Raises:
         LogError: ``no_object_store``.
     """
     scheme = check_scheme(url)
-    # A name without credentials or a host that is silent must be told in the time that somebody waits.
+    # Missing credentials or an unresponsive host must be reported while the user waits.
     limits: dict[str, object] = {}
     if scheme != "memory":
         retries = {"mode": "standard", "total_max_attempts": _ATTEMPTS}
@@ -95,7 +95,7 @@ def open_store(url: str) -> AbstractFileSystem:
     try:
         from fsspec import filesystem  # noqa: PLC0415 - an extra
 
-        # By its name alone: an address may chain others behind ``::``.
+        # Only the scheme is passed on, because an address may chain file systems with ``::``.
         store = filesystem(scheme, listings_expiry_time=_LISTING_S, **limits)
     except ImportError as error:
         raise LogError(
@@ -110,7 +110,7 @@ def open_store(url: str) -> AbstractFileSystem:
 
 
 def unreachable(url: str, error: OSError) -> LogError:
-    """The error for a store or an object that does not answer as it should."""
+    """Error for a store or an object that cannot be read."""
     return LogError(
         "log_unreadable",
         f"the object cannot be read ({' '.join(str(error).split())})",
@@ -121,24 +121,24 @@ def unreachable(url: str, error: OSError) -> LogError:
 
 
 class FetchCount:
-    """Bytes that this process has fetched from object stores: ``total`` so far."""
+    """Count of the bytes that this process has fetched from object stores, in ``total``."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self.total = 0
 
     def add(self, count: int) -> None:
-        """Count more."""
+        """Add to the total."""
         with self._lock:
             self.total += count
 
 
 FETCHED: Final = FetchCount()
-"""Of this process: logs, and what configures them."""
+"""Count of this process, for logs and their configuration."""
 
 
 def fetch_all(store: AbstractFileSystem, url: str) -> bytes:
-    """All of a small object, counted.
+    """Fetch all of a small object, and count its bytes.
 
     Raises:
         OSError: it cannot be read.
@@ -151,21 +151,21 @@ def fetch_all(store: AbstractFileSystem, url: str) -> bytes:
 def fetch_range(
     store: AbstractFileSystem, url: str, start: int, end: int, *, known: Info, look: Callable[[], Info]
 ) -> bytes:
-    """Bytes of the version of an object that is known, counted.
+    """Fetch a byte range of a known version of an object, and count its bytes.
 
-    S3 is asked for that version alone (``If-Match``), and what it says that it gave is compared. Stores
-    without such a question are asked afterwards whether the object is still the same.
+    An S3 request is conditional on this version (``If-Match``), and the version in the response is compared.
+    For stores without conditional requests, the version is compared after the request.
 
     Args:
-        store: where it is.
-        url: its address.
-        start: first byte.
-        end: behind the last byte.
-        known: what the store said of the object when it was opened.
-        look: asks the store what it says of the object now.
+        store: store of the object.
+        url: address of the object.
+        start: offset of the first byte.
+        end: offset after the last byte.
+        known: metadata of the object when it was opened.
+        look: requests the current metadata of the object.
 
     Raises:
-        VersionChangedError: the object is another one now.
+        VersionChangedError: the object has changed.
         OSError: it cannot be read.
     """
     tag = known.get("ETag")
@@ -183,7 +183,7 @@ def fetch_range(
 
 
 def format_version(info: Info) -> str:
-    """What tells one version of an object from another."""
+    """Identifier of an object's version: its version id, ETag or time, and its size."""
     marks = ("VersionId", "ETag", "etag", "LastModified", "created", "mtime")
     tag = next((info[mark] for mark in marks if info.get(mark)), 0)
     return f"{tag} {info.get('size')}"
@@ -207,7 +207,7 @@ def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, t
             raise VersionChangedError(url)
         try:
             fetched: bytes = sync(store.loop, reply["Body"].read)
-        except Exception as broken:  # noqa: BLE001 - a connection that breaks off raises what its library likes
+        except Exception as broken:  # noqa: BLE001 - broken connections raise exceptions of no common type
             error = broken
             continue
         return fetched
@@ -215,28 +215,28 @@ def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, t
 
 
 def _is_changed(error: OSError) -> bool:
-    # s3fs hands the answer of the store on as the cause.
+    # s3fs stores the response of the store in the cause of the error.
     answer = getattr(error.__cause__, "response", None)
     code = answer.get("Error", {}).get("Code") if isinstance(answer, dict) else None
     return code in {"PreconditionFailed", "412"}
 
 
-# Logs on object stores: paths such as ``s3://bucket/logs/run.mcap``, read by ranges.
+# Logs in object stores: paths such as ``s3://bucket/logs/run.mcap``, read by byte ranges.
 #
-# What a store says of an object (size, ETag, time) stands in the place of what a file system says of a file.
-# Only the ranges that are asked for are fetched, and they are counted.
+# The metadata of an object (size, ETag, time) replaces the status of a file. Only requested ranges are
+# fetched, and their bytes are counted.
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9+]+):/+")
 _LOCAL: Final = "file://"
 _TAIL: Final = 1 << 15
-"""A log's index stands at its end: one request fetches the end at once."""
+"""Number of bytes fetched from the end of an object when it is opened: a log's index is at its end."""
 
 _OPENINGS: Final = 3
-"""Looks at an object that changes between the look and the first read."""
+"""Maximum number of attempts to open an object that changes between its lookup and the first read."""
 
 
 class RemotePath(PosixPath):
-    """A path on an object store; it answers what a batch asks of a local one."""
+    """A path in an object store, with the methods of a local path that a batch uses."""
 
     def __str__(self) -> str:
         return _SCHEME.sub(r"\1://", super().__str__())
@@ -245,15 +245,15 @@ class RemotePath(PosixPath):
         return str(self)
 
     def resolve(self, strict: bool = False) -> Self:  # noqa: ARG002, FBT001, FBT002 - pathlib's own signature
-        """Itself: there are no links."""
+        """The path itself: object stores have no links."""
         return self
 
     def stat(self, *, follow_symlinks: bool = True) -> os.stat_result:
-        """Size, time, and a number made of the ETag in the place of an inode.
+        """Size, modification time, and a hash of the version instead of an inode number.
 
         Raises:
             FileNotFoundError: there is no such object or prefix.
-            LogError: ``log_unreadable``, the store does not answer.
+            LogError: ``log_unreadable``, the store cannot be read.
         """
         del follow_symlinks
         info = self.look()
@@ -266,7 +266,7 @@ class RemotePath(PosixPath):
         return os.stat_result(plain, {"st_mtime_ns": moment, "st_mtime": moment / 1e9})
 
     def exists(self, **_: bool) -> bool:
-        """Whether there is an object or a prefix of that name."""
+        """Whether there is an object or a prefix with this name."""
         return bool(self._type())
 
     def is_file(self, **_: bool) -> bool:
@@ -278,22 +278,22 @@ class RemotePath(PosixPath):
         return self._type() == "directory"
 
     def glob(self, pattern: str, **_: bool | None) -> Iterator[Self]:  # type: ignore[override]
-        """Objects right below this prefix whose names fit."""
+        """Objects and prefixes directly below this prefix whose names match."""
         for info in self._list(str(self)):
             child = type(self)(_add_scheme(self, str(info["name"])))
             if child.match(pattern):
                 yield child
 
     def read_bytes(self) -> bytes:
-        """All of an object."""
+        """Content of the object."""
         return fetch_all(open_store(str(self)), str(self))
 
     def read_text(self, encoding: str | None = None, errors: str | None = None, **_: str) -> str:
-        """All of an object as text."""
+        """Content of the object as text."""
         return self.read_bytes().decode(encoding or "utf-8", errors or "strict")
 
     def find_objects(self) -> list[Self]:
-        """Every object under this prefix, sorted."""
+        """All objects below this prefix, sorted."""
         try:
             names = open_store(str(self)).find(str(self), detail=True)
         except OSError as error:
@@ -301,7 +301,7 @@ class RemotePath(PosixPath):
         return sorted(type(self)(_add_scheme(self, name)) for name in names)
 
     def version(self) -> str:
-        """What tells this content from another without reading it: 64 hexadecimal digits of ETag and size.
+        """Identifier of the content without reading it: SHA-256 (hex) of the version (ETag) and size.
 
         Raises:
             FileNotFoundError: there is no such object.
@@ -309,7 +309,7 @@ class RemotePath(PosixPath):
         return _name_version(self.look())
 
     def refresh(self) -> None:
-        """Forget what the store said a moment ago: of objects that were overwritten or added since, too."""
+        """Clear the cached listings, so that objects overwritten or added since are seen."""
         open_store(str(self)).invalidate_cache()
 
     def _type(self) -> str:
@@ -319,11 +319,11 @@ class RemotePath(PosixPath):
             return ""
 
     def look(self) -> Info:
-        """What the store says of it; one listing answers for all its neighbours.
+        """Metadata of the object or prefix; one listing of the parent is cached for all its objects.
 
         Raises:
             FileNotFoundError: there is no such object or prefix.
-            LogError: ``log_unreadable``, the store does not answer.
+            LogError: ``log_unreadable``, the store cannot be read.
         """
         if len(self.parts) <= 2:  # noqa: PLR2004 - scheme and bucket
             return {"type": "directory", "size": 0}
@@ -344,7 +344,7 @@ class RemotePath(PosixPath):
 
 
 def to_location(path: str | os.PathLike[str]) -> Path:
-    """A path, remote where it begins with a scheme; also one that `Path` has taken a slash from."""
+    """Path from text, remote if it starts with a scheme, even if `Path` has removed a slash after it."""
     if isinstance(path, RemotePath):
         return path
     text = os.fspath(path)
@@ -354,17 +354,17 @@ def to_location(path: str | os.PathLike[str]) -> Path:
 
 
 def locate_recorded(address: str, *, follow_remote: bool = False) -> Path:
-    """Where a log stands that results name, if it may be looked at: results may be a stranger's.
+    """Location of a log named in results, if access is allowed: results may come from an untrusted author.
 
-    Whoever wrote them chose the address, and asking it tells him of it, with the user's credentials at hand.
-    A file is looked at, whatever the results say that it is.
+    The author chooses the address, and a request informs its owner and may use the user's credentials. Local
+    paths are always allowed.
 
     Args:
-        address: as the results tell it.
-        follow_remote: whether the user said that addresses are followed.
+        address: address stated in the results.
+        follow_remote: whether the user allowed requests to remote addresses.
 
     Raises:
-        LogError: ``remote_not_followed``; ``no_object_store``, it is at a kind of store that is not reached.
+        LogError: ``remote_not_followed``; ``no_object_store``, its scheme is not supported.
     """
     location = to_location(address)
     if isinstance(location, RemotePath):
@@ -380,9 +380,9 @@ def locate_recorded(address: str, *, follow_remote: bool = False) -> Path:
 
 
 def spell_location(path: Path) -> str:
-    """A path as text that every table can hold; `to_location` leads back to it.
+    """Convert a path to UTF-8 text; `to_location` is the inverse.
 
-    File names are bytes. Those that are no UTF-8 are spelt as an address, ``file:///logs/caf%E9.mcap``.
+    File names are bytes. Those that are not UTF-8 are written as a URL, ``file:///logs/caf%E9.mcap``.
     """
     text = str(path)
     try:
@@ -393,19 +393,19 @@ def spell_location(path: Path) -> str:
 
 
 class RemoteSource(AbstractContextManager["RemoteSource"]):
-    """One version of an object that is read by ranges, from several threads at once.
+    """One version of an object, read by ranges from several threads at once.
 
-    Every range is of the version that was opened: an object that is overwritten meanwhile is refused.
+    All ranges are from the version that was opened: if the object is overwritten, reading raises an error.
 
     Args:
         path: the object.
-        version: the version that must be there still, as `RemoteSource.version` told; None for any.
+        version: required version, from `RemoteSource.version`; None for any.
 
     Attributes:
-        size: count of bytes when it was opened.
-        name: the address.
-        version: as `RemotePath.version`, when it was opened.
-        fetched: bytes that were fetched so far.
+        size: size when it was opened [bytes].
+        name: address of the object.
+        version: result of `RemotePath.version` when it was opened.
+        fetched: number of bytes fetched so far.
 
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
@@ -416,7 +416,7 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
         self._store = open_store(self.name)
         self._lock = threading.Lock()
         self.fetched = 0
-        # What the store said a moment ago of its objects may be out of date: nothing was read yet.
+        # The cached metadata may be out of date: the first read fails if they are, and is then repeated.
         for attempt in range(_OPENINGS):
             if attempt:
                 path.refresh()
@@ -467,7 +467,7 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
         return fetched
 
     def __exit__(self, *_exception: object) -> None:
-        """Nothing is held."""
+        """Do nothing: no resource is open."""
 
 
 def _add_scheme(base: RemotePath, name: str) -> str:

@@ -1,4 +1,4 @@
-"""Walking the records of a file where no index vouches for them, and finding chunks that are missing."""
+"""Sequential scan of the records that no index covers, and detection of missing chunks."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -25,13 +25,13 @@ _MAX_SIDE_RECORD: Final = 1 << 26
 
 
 class Window:
-    """A moving view of a source, so that small neighbouring reads cost one."""
+    """A read buffer over a source that combines small adjacent reads."""
 
     def __init__(self, source: ByteSource) -> None:
         self._source = source
         self._start = 0
         self._bytes = memoryview(b"")
-        # Gaps between chunks are small, and bytes from an object store are dear: reads grow as they go on.
+        # Gaps between chunks are small, and reads from an object store are expensive: the buffer grows.
         self._next = _FIRST_WINDOW
 
     def view(self, offset: int, length: int) -> memoryview:
@@ -45,11 +45,11 @@ class Window:
 
 
 class Scanner:
-    """Walks records into a catalog.
+    """Scans records into a catalog.
 
     Args:
         source: the file.
-        catalog: filled with what is found.
+        catalog: receives the records.
     """
 
     def __init__(self, source: ByteSource, catalog: Catalog) -> None:
@@ -60,7 +60,7 @@ class Scanner:
         self._last_ns: int | None = None
 
     def scan(self, start: int, stop: int) -> None:
-        """Walk the records in [start, stop); damage is noted and stepped over."""
+        """Scan the records in [start, stop); damage is recorded as a loss and skipped."""
         position = start
         previous = start
         while position < stop:
@@ -70,10 +70,10 @@ class Scanner:
             previous, position = position, after
 
     def follow(self, start: int, stop: int) -> int:
-        """Walk the records in [start, stop) of a file that is being written.
+        """Scan the records in [start, stop) of a file that is being written.
 
         Returns:
-            Where the record begins whose end is not there yet; what is damaged before it is noted.
+            Offset of the incomplete record at the end, or ``stop``; damage before it is recorded as a loss.
         """
         position = previous = start
         while position < stop:
@@ -86,7 +86,7 @@ class Scanner:
         return position
 
     def _may_grow(self, position: int, stop: int) -> bool:
-        """Whether the record at ``position`` is of a known kind and ends beyond what is written."""
+        """Whether a record at ``position`` may be incomplete: of a valid kind, and ending after ``stop``."""
         head = self._window.view(position, rec.HEAD_SIZE)
         if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return True
@@ -95,7 +95,7 @@ class Scanner:
         return (opcode in rec.LEAST_BODY or opcode >= FIRST_PRIVATE) and end > stop
 
     def _take(self, position: int, stop: int) -> int | None:
-        """Take the record at ``position`` into the catalog; None when there is none."""
+        """Add the record at ``position`` to the catalog; returns the offset after it, None if invalid."""
         head = self._window.view(position, rec.HEAD_SIZE)
         if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return None
@@ -153,7 +153,7 @@ class Scanner:
             return
         record = rec.parse_record(opcode, body)
         if isinstance(record, Schema | Channel):
-            # Behind the end of the data section stands the summary, here one that is not believed.
+            # Records after the data section belong to the summary, which is rejected when this scan runs.
             catalog.add_description(record, Cover.DATA if catalog.data_end is None else Cover.SUMMARY)
         elif isinstance(record, Header):
             catalog.profile, catalog.library = record.profile, record.library
@@ -195,7 +195,7 @@ class Scanner:
         return True
 
     def _recover(self, previous: int, position: int, stop: int) -> tuple[int, int]:
-        """Note damage at ``position``: (where records go on, where the damage starts)."""
+        """Record damage at ``position``; returns the offset of the next record and that of the damage."""
         if self._take_cut_chunk(position, stop):
             return stop, position
         last = self._catalog.spans[-1] if self._catalog.spans else None
@@ -231,7 +231,7 @@ class Scanner:
         return stop
 
     def _take_cut_chunk(self, position: int, stop: int) -> bool:
-        """Whether a chunk stands at ``position`` whose end is missing."""
+        """Add the chunk at ``position`` if its end is missing; returns whether there is such a chunk."""
         head = self._window.view(position, 128)
         if len(head) < rec.HEAD_SIZE or position + rec.HEAD_SIZE > stop:
             return False
@@ -259,18 +259,18 @@ class Scanner:
 
 
 _STEPS_PER_JUMP: Final = 20
-"""Steps by one that a channel takes for every jump; fewer are no counting."""
+"""Minimum number of increments by one per jump; below it, sequence numbers do not count messages."""
 
 _LISTED: Final = 6
-"""So many topics are named."""
+"""Maximum number of topics listed in a message."""
 
 _WHOLE_FILE: Final = -1
-"""Stands for a channel: of writers that count the messages of all channels together."""
+"""Channel number for the sequence over all channels, for writers that number all messages together."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Jump:
-    """Where the numbers of a channel do not go on: places of the chunks, numbers, log times [ns]."""
+    """A gap in the sequence numbers of a channel: offsets of the chunks, numbers and log times [ns]."""
 
     between: tuple[int, int]
     before: int
@@ -280,7 +280,7 @@ class _Jump:
 
 
 class _Piece(NamedTuple):
-    """The numbers of one channel in one chunk, and the log times [ns] of its first and last message."""
+    """Sequence numbers of one channel in one chunk, and log times [ns] of its first and last message."""
 
     size: int
     steps: int
@@ -293,13 +293,13 @@ class _Piece(NamedTuple):
 
 
 def _cut(channel: NDArray[np.uint16], sequence: Ints, log_time: Ints) -> Iterator[tuple[int, _Piece]]:
-    """Cut messages that are sorted by channel into the pieces of each."""
+    """Split messages that are sorted by channel into one piece per channel."""
     if not channel.size:
         return
     low = np.flatnonzero(np.append(True, channel[1:] != channel[:-1]))
     high = np.append(low[1:], channel.size)
     by_one = np.append(0, np.diff(sequence) == 1)
-    # A step into a channel is none of it.
+    # The first message of a channel has no predecessor in it.
     by_one[low] = 0
     columns = (
         high - low,
@@ -317,15 +317,15 @@ def _cut(channel: NDArray[np.uint16], sequence: Ints, log_time: Ints) -> Iterato
 
 @dataclass(slots=True)
 class _Series:
-    """The numbers of one channel so far.
+    """Sequence numbers of one channel so far.
 
     Attributes:
-        steps: by one.
-        regular: whether all others are jumps ahead from one chunk to the next.
-        jumps: those.
+        steps: number of increments by one.
+        regular: whether all other increments are gaps between one chunk and the next.
+        jumps: these gaps.
         low: smallest number.
         high: largest number.
-        last: number, log time [ns] and chunk of the last message; None where it is not known.
+        last: number, log time [ns] and offset of the chunk of the last message; None if unknown.
     """
 
     steps: int = 0
@@ -337,11 +337,11 @@ class _Series:
 
     @property
     def counts(self) -> bool:
-        """Whether its writer has certainly counted."""
+        """Whether the writer certainly numbers messages consecutively."""
         return self.regular and self.steps >= _STEPS_PER_JUMP * max(1, len(self.jumps))
 
     def add(self, piece: _Piece, position: int) -> None:
-        """Take the messages of the next chunk."""
+        """Add the messages of the next chunk."""
         self.steps += piece.steps
         self.regular &= piece.steps == piece.size - 1
         self.low, self.high = min(self.low, piece.low), max(self.high, piece.high)
@@ -356,14 +356,14 @@ class _Series:
 
 
 class SequenceCheck:
-    """Compares the numbers of messages from chunk to chunk."""
+    """Compares the sequence numbers of messages between successive chunks."""
 
     def __init__(self) -> None:
         self._series: dict[int, _Series] = {}
         self._end: int | None = None
 
     def add(self, span: Span, loaded: Loaded) -> None:
-        """Take the next stretch of the file; what is lost in it or before it explains what is missing."""
+        """Add the next span of the file; losses in it or before it explain missing messages."""
         if span.kind is not SpanKind.CHUNK or loaded.losses or span.offset != self._end:
             for series in self._series.values():
                 series.last = None
@@ -382,14 +382,14 @@ class SequenceCheck:
                 self._series.setdefault(number, _Series()).add(piece, span.offset)
 
     def find_losses(self, channels: Mapping[int, Channel]) -> list[Loss]:
-        """Messages that are missing between two chunks, where it is certain that their writer counted.
+        """Losses of messages missing between two chunks, if the writer certainly numbers consecutively.
 
         Args:
-            channels: by number.
+            channels: channels by number.
         """
         together = self._series.pop(_WHOLE_FILE, _Series())
         counting = {_WHOLE_FILE: together} if together.counts else self._series
-        # Numbers that another channel may have used are no jump: its writer may count them together.
+        # Numbers that another channel may have used are no gap: the writer may number both together.
         other = [series for series in self._series.values() if not series.counts and not together.counts]
         jumps_of: dict[tuple[int, int], dict[int, _Jump]] = {}
         for number, series in counting.items():

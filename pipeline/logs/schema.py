@@ -1,4 +1,4 @@
-"""Message types as trees: parsers of ROS 1, ROS 2 and IDL definitions, and the standard types."""
+"""Trees of message types: parsers of ROS 1, ROS 2 and IDL definitions, and the standard types."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 SEQUENCE: Final = -1
-"""``Member.count`` of a sequence of varying length."""
+"""``Member.count`` of a sequence of variable length."""
 
 NUMBER_TYPES: Final[Mapping[str, np.dtype[np.generic]]] = {
     name: np.dtype(name)
@@ -23,18 +23,18 @@ NUMBER_TYPES: Final[Mapping[str, np.dtype[np.generic]]] = {
         *(f"{u}int{bits}" for u in ("", "u") for bits in (8, 16, 32, 64)),
     )
 }
-"""Array type of every number type, in this machine's byte order."""
+"""Array type of every number type, in native byte order."""
 
 SIZES: Final[Mapping[str, int]] = {name: kind.itemsize for name, kind in NUMBER_TYPES.items()}
-"""Bytes of every number type."""
+"""Size of every number type [bytes]."""
 
 MAX_FIXED: Final = 1 << 24
-"""Longest fixed array taken seriously; a longer one in a definition is damage."""
+"""Maximum length of a fixed array; a longer one indicates a damaged definition."""
 
 MAX_DEPTH: Final = 64
 
 MAX_LEAVES: Final = 1 << 14
-"""Most fields of a type with all types below it; those of a robot have hundreds."""
+"""Maximum number of fields of a type with all nested types; those of a robot have hundreds."""
 
 _MAX_DIGITS: Final = 9
 
@@ -48,7 +48,7 @@ _FIELD: Final = re.compile(
 
 
 class SchemaError(ValueError):
-    """A definition that cannot be understood; the text says why."""
+    """A definition that cannot be parsed; the text states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +68,7 @@ class Member:
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """A message type with everything below it resolved.
+    """A message type with all nested types resolved.
 
     Attributes:
         name: ``package/Name``.
@@ -81,7 +81,7 @@ class Structure:
 
 @dataclass(frozen=True, slots=True)
 class RawField:
-    """A field before its type is looked up: name, type as written, count as in ``Member``."""
+    """A field before its type is resolved: name, type as written, count as in ``Member``."""
 
     name: str
     type: str
@@ -102,11 +102,11 @@ def parse_msg(name: str, text: str, *, dialect: str = "ros2msg") -> Structure:
 
     Args:
         name: type of the message, ``package/msg/Name``.
-        text: its definition, then those of the types below it behind ``===`` and ``MSG: package/Name`` lines.
+        text: its definition, then those of nested types, each after ``===`` and ``MSG: package/Name`` lines.
         dialect: ``ros2msg`` or ``ros1msg``.
 
     Raises:
-        SchemaError: a line or a type that cannot be understood.
+        SchemaError: a line or a type cannot be parsed.
     """
     types: RawTypes = {}
     for position, section in enumerate(_SEPARATOR.split(text)):
@@ -139,10 +139,10 @@ def _parse_fields(body: str, dialect: str) -> Iterator[RawField]:
 
 
 def parse_count(digits: str) -> int:
-    """The number of elements of an array.
+    """Parse the number of elements of an array.
 
     Raises:
-        SchemaError: more elements than any message holds.
+        SchemaError: it has more than `_MAX_DIGITS` digits.
     """
     if len(digits) > _MAX_DIGITS:
         raise SchemaError(f"an array has a number of elements of {len(digits)} digits")
@@ -158,8 +158,8 @@ def resolve(root: str, types: Mapping[str, list[RawField]], *, dialect: str = "r
     """Build the tree of ``root`` from flat definitions keyed by ``package/Name``.
 
     Raises:
-        SchemaError: a type that is not defined, contains itself, or holds an absurd array or absurdly many
-            fields.
+        SchemaError: a type is not defined, contains itself, or exceeds `MAX_FIXED` array elements or
+            `MAX_LEAVES` fields.
     """
     return _Resolver({**_builtin_times(dialect), **types}).build(root, 0)
 
@@ -185,7 +185,7 @@ class _Resolver:
         return self._built[name]
 
     def _measure(self, name: str, members: tuple[Member, ...]) -> None:
-        """Refuse types that a few lines of text blow up: each of two fields of a type of two fields of ..."""
+        """Refuse types that grow exponentially by nesting: two fields of a type with two fields of ..."""
         leaves = elements = 0
         for member in members:
             inside = "" if isinstance(member.element, str) else member.element.name
@@ -223,7 +223,7 @@ def _builtin_times(dialect: str) -> RawTypes:
 
 
 def leaf_paths(structure: Structure, prefix: str = "") -> Iterator[str]:
-    """Every leaf field of a type as a path, ``[]`` marking sequences of structures."""
+    """Paths of all leaf fields of a type; ``[]`` marks sequences of structures."""
     for member in structure.members:
         path = f"{prefix}{member.name}"
         if isinstance(member.element, str):
@@ -233,7 +233,7 @@ def leaf_paths(structure: Structure, prefix: str = "") -> Iterator[str]:
 
 
 def contains_text(structure: Structure, kind: str) -> bool:
-    """Whether ``kind`` (``"wstring"``, ...) occurs anywhere below ``structure``."""
+    """Whether ``structure`` or a nested type has a field of type ``kind``, such as ``"wstring"``."""
     return any(
         member.element == kind if isinstance(member.element, str) else contains_text(member.element, kind)
         for member in structure.members
@@ -244,7 +244,7 @@ _HIDDEN: Final = re.compile(
     r'(?P<string>"(?:[^"\\]|\\.)*+(?:"|\Z))|//[^\n]*|/\*.*?(?:\*/|\Z)|^[ \t\r]*#[^\n]*|^IDL:[^\n]*',
     re.MULTILINE | re.DOTALL,
 )
-"""Strings and comments, whichever begins first. What is not closed reaches to the end: one look will do."""
+"""Strings and comments; an unclosed one extends to the end of the text, so that matching is linear."""
 
 _TOKEN: Final = re.compile(r'""|\'(?:[^\'\\\n]|\\.){1,8}+\'|::|[A-Za-z_][\w]*|[\d.]+[\w.+-]*|\S')
 _NUMBERS: Final = {
@@ -268,10 +268,10 @@ def parse_idl(name: str, text: str) -> Structure:
 
     Args:
         name: type of the message, ``package/msg/Name``.
-        text: ``module``, ``struct``, ``typedef`` and ``const`` declarations; sections behind ``===`` lines.
+        text: ``module``, ``struct``, ``typedef`` and ``const`` declarations; ``===`` lines separate sections.
 
     Raises:
-        SchemaError: a declaration that cannot be understood.
+        SchemaError: a declaration cannot be parsed.
     """
     types: RawTypes = {}
     for section in _SEPARATOR.split(text):
@@ -281,7 +281,7 @@ def parse_idl(name: str, text: str) -> Structure:
 
 
 class _Reader:
-    """Reads declarations into ``types``; typedefs and constants live as long as their section."""
+    """Reads declarations into ``types``; typedefs and constants are local to their section."""
 
     def __init__(self, tokens: list[str], types: RawTypes) -> None:
         self._tokens = tokens
@@ -432,23 +432,23 @@ class _Reader:
             raise SchemaError(f"{word_read!r} stands in place of {word!r}")
 
 
-# Definitions of the standard message types: for writing, and for logs that carry none.
+# Definitions of the standard message types, for writing and for logs without definitions.
 #
-# They stand in ``definitions.msg``, as a log's schema puts one type behind the other.
+# The file ``definitions.msg`` contains them in the format of a concatenated schema.
 
 _RULE: Final = f"\n{'=' * 80}\n"
 
 
 @cache
 def _fields() -> dict[str, str]:
-    """Fields of every bundled type, one a line, by ``package/Name``."""
+    """Fields of every bundled type, one per line, by ``package/Name``."""
     text = resources.files("pipeline.logs").joinpath("definitions.msg").read_text("utf-8")
     sections = (section.partition("\n") for section in text.removesuffix("\n").split(_RULE))
     return {head.removeprefix("MSG: "): fields for head, _, fields in sections}
 
 
 def definition_text(type_name: str) -> str | None:
-    """The concatenated ``ros2msg`` definition of a bundled type, None when it is not bundled.
+    """The concatenated ``ros2msg`` definition of a bundled type, None if it is not bundled.
 
     Args:
         type_name: ``package/msg/Name`` or ``package/Name``.
@@ -465,17 +465,17 @@ def definition_text(type_name: str) -> str | None:
 
 @cache
 def bundled_structure(type_name: str) -> Structure | None:
-    """The tree of a bundled type, None when it is not bundled."""
+    """The tree of a bundled type, None if it is not bundled."""
     text = definition_text(type_name)
     return None if text is None else parse_msg(type_name, text)
 
 
 def bundled_types() -> tuple[str, ...]:
-    """Every bundled type as ``package/msg/Name``."""
+    """All bundled types as ``package/msg/Name``."""
     return tuple(name.replace("/", "/msg/") for name in _fields())
 
 
 def field_names(type_name: str) -> tuple[str, ...]:
-    """Leaf field paths of a bundled type; empty when it is not bundled."""
+    """Leaf field paths of a bundled type; empty if it is not bundled."""
     structure = bundled_structure(type_name)
     return () if structure is None else tuple(leaf_paths(structure))

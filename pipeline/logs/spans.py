@@ -1,4 +1,4 @@
-"""Stretches of a log that hold messages: found, read on several threads, and checked together."""
+"""Reading the spans of a log that contain messages, on several threads, and verifying their checksums."""
 
 import struct
 import zlib
@@ -18,9 +18,9 @@ from pipeline.logs.chunks import Messages, locate_messages
 from pipeline.logs.records import Buffer, Loss
 from pipeline.logs.source import ByteSource, map_in_order
 
-# Stretches of a log that hold messages, and reading one of them.
+# Spans of a log, and reading one of them.
 #
-# A span is a chunk with the message indexes behind it, or a stretch of messages that stand outside chunks.
+# A span is a chunk with the message indexes after it, or a range of message records outside chunks.
 
 Entries: TypeAlias = tuple[int, NDArray[np.uint64]]
 FileCheck: TypeAlias = Callable[[], bool]
@@ -29,22 +29,22 @@ _CRC_IN_HEAD: Final = 24
 _INVERTED: Final = 0xFFFFFFFF
 
 _ZERO_TAIL: Final = 64
-"""So many zeros at the end of a chunk, and no record behind it, are bytes that were never written."""
+"""Minimum number of zero bytes at the end of a chunk, without a record after it, that count as unwritten."""
 
 _MAX_SPAN: Final = chunks.MAX_CHUNK + (64 << 20)
-"""Most bytes that are read at once: the largest chunk and its message indexes."""
+"""Maximum size of one read [bytes]: the largest chunk and its message indexes."""
 
 _MOST_STRETCHES: Final = 100
-"""So many damaged stretches of one span are told one by one; more are told together."""
+"""Maximum number of damaged ranges of a span that are reported individually; more are summarized."""
 
 _NEVER: Final = np.iinfo(np.int64).max
 
 _WORTHWHILE: Final = 0.8
-"""Stopping early pays when this share of a chunk or less is needed."""
+"""Maximum required fraction of a chunk for which partial inflation saves time."""
 
 
 class SpanKind(Enum):
-    """What a span is."""
+    """Kind of a span."""
 
     CHUNK = "chunk"
     LOOSE = "loose"
@@ -53,7 +53,7 @@ class SpanKind(Enum):
 
 @dataclass(frozen=True, slots=True)
 class StoredAs:
-    """How the summary says a chunk is stored."""
+    """Compression and sizes [bytes] of a chunk as stated in the summary."""
 
     compression: str
     compressed_size: int
@@ -62,18 +62,18 @@ class StoredAs:
 
 @dataclass(frozen=True, slots=True)
 class Span:
-    """A stretch of the file that holds messages.
+    """A range of the file that contains messages.
 
     Attributes:
-        kind: what it is.
-        offset: first byte.
-        length: bytes, message indexes not counted.
-        index_length: bytes of the message indexes behind it.
-        start_ns: first log time as stated by the summary or the chunk, None when unknown.
-        end_ns: last log time, None when unknown.
-        channels: numbers of the channels in it, None when unknown.
-        stored_as: how the summary says it is stored, None when it does not.
-        inflated: bytes that come out of a chunk as the summary or its head says.
+        kind: kind of the span.
+        offset: offset of its first byte in the file.
+        length: size without its message indexes [bytes].
+        index_length: size of the message indexes after it [bytes].
+        start_ns: first log time as stated by the summary or the chunk, None if unknown.
+        end_ns: last log time, None if unknown.
+        channels: numbers of the channels in it, None if unknown.
+        stored_as: compression and sizes stated in the summary, None if it is not listed there.
+        inflated: inflated size of a chunk as stated by the summary or its header [bytes].
     """
 
     kind: SpanKind
@@ -92,11 +92,11 @@ class Loaded:
     """A span in memory.
 
     Attributes:
-        chunk: inflated records; empty when nothing could be read.
-        messages: where its messages stand.
-        losses: what was lost in it.
-        unchecked: whether no checksum of the chunk's own covered the records.
-        index_damaged: whether its message index is of no use, which loses nothing.
+        chunk: inflated records; empty if none could be read.
+        messages: positions of its messages.
+        losses: losses in it.
+        unchecked: whether no checksum of the chunk covers the records.
+        index_damaged: whether its message index is invalid; no messages are lost by this.
     """
 
     chunk: Buffer
@@ -107,12 +107,12 @@ class Loaded:
 
 
 def no_file_checksum() -> bool:
-    """Nothing but its own checksum shows whether a chunk is whole."""
+    """Default check for files whose data section has no valid checksum: always False."""
     return False
 
 
 class _SpanError(Exception):
-    """A chunk that cannot be opened: kind of loss and reason."""
+    """A chunk that cannot be read: kind of loss and reason."""
 
     def __init__(self, kind: str, reason: str) -> None:
         super().__init__(reason)
@@ -128,13 +128,13 @@ def load_span(
 ) -> Loaded:
     """Read, inflate and check one span.
 
-    A chunk without checksum is inflated no further than its last wanted message when its message index tells
-    where that ends.
+    A chunk without a checksum is inflated only up to the end of its last wanted message if its message
+    indexes state that position.
 
     Args:
         source: the file.
-        span: which stretch.
-        file_holds: asked when a chunk's checksum differs whether that of the whole file holds.
+        span: the span.
+        file_holds: called if a chunk's checksum differs; returns whether that of the whole file is valid.
         wanted: numbers of the channels whose messages are needed, None for all.
     """
     if span.length + span.index_length > _MAX_SPAN:
@@ -167,7 +167,7 @@ def _load_chunk(
     file_holds: FileCheck,
     wanted: AbstractSet[int] | None,
 ) -> Loaded:
-    """Inflate and check a chunk whose head is known; ``losses`` are those of its head."""
+    """Inflate and check a chunk whose header is parsed; ``losses`` are those of its header."""
     stored = blob[head.body : head.body + head.compressed_size]
     if span.kind is SpanKind.CUT_CHUNK:
         return _load_start(span, head, stored, "the file ends inside it")
@@ -187,15 +187,15 @@ def _load_chunk(
 
 
 def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loaded | None:
-    """Read neighbouring chunks as one: their records end to end are records like those of one chunk.
+    """Read adjacent chunks as one: their concatenated records are equivalent to one chunk.
 
     Args:
         source: the file.
-        spans: chunks that stand one behind the other.
-        size: bytes they inflate to, as the summary says.
+        spans: chunks that are adjacent in the file.
+        size: total inflated size as stated in the summary [bytes].
 
     Returns:
-        All their messages; None when anything at all is not in order, so that each is to be read alone.
+        All their messages; None on any inconsistency: each chunk must then be read individually.
     """
     start = spans[0].offset
     blob = memoryview(
@@ -223,7 +223,7 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
 
 
 def _needed_size(span: Span, entries: list[Entries], wanted: AbstractSet[int]) -> int | None:
-    """Bytes up to the end of the last wanted message, None when that is not certain."""
+    """Size of the chunk up to the end of the last wanted message [bytes], None if it is not certain."""
     if set(span.channels or ()) != {number for number, _ in entries}:
         return None
     last = max((int(e[:, 1].max()) for c, e in entries if c in wanted and e.size), default=-1)
@@ -243,7 +243,7 @@ def _load_prefix(
 
 
 def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]]:
-    """The head of a chunk; as the summary tells it where the chunk's own is damaged."""
+    """Header of a chunk; from the summary if the chunk's own header is damaged."""
     head: rec.ChunkHead | None = None
     reason = "the head of the chunk disagrees with the summary"
     try:
@@ -280,7 +280,7 @@ def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]
 def _inflate_checked(
     span: Span, head: rec.ChunkHead, stored: Buffer, file_holds: FileCheck, losses: list[Loss]
 ) -> Buffer:
-    """Records of a chunk. Notes a checksum that is wrong alone."""
+    """Inflated records of a chunk; appends a loss if only the stored checksum is damaged."""
     try:
         chunk = chunks.inflate(stored, head.compression, head.uncompressed_size)
     except chunks.InflateError as error:
@@ -299,9 +299,9 @@ def _inflate_checked(
 
 
 def _is_unwritten(source: ByteSource, span: Span, stored: Buffer) -> bool:
-    """Whether the end of a chunk was never written: it is zero, and so is what should follow it.
+    """Whether the end of a chunk was never written: it is zero, and so is the next record header.
 
-    Zeros at the end alone are no evidence: many messages end in them, as odometry without covariance does.
+    Zeros at the end alone are no evidence: many messages end in zeros, such as odometry without covariance.
     """
     if len(stored) < _ZERO_TAIL or any(stored[-_ZERO_TAIL:]):
         return False
@@ -309,10 +309,10 @@ def _is_unwritten(source: ByteSource, span: Span, stored: Buffer) -> bool:
 
 
 def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression: str) -> str | None:
-    """Why a chunk whose checksum does not match may be whole all the same, None when nothing says so.
+    """Evidence that a chunk whose checksum does not match is undamaged, None if there is none.
 
-    A damaged byte in the records changes the CRC in all its bytes but with a chance of 2.4e-7; a
-    difference in one byte alone is damage of the stored CRC itself.
+    A damaged byte in the records changes several bytes of the CRC, except with a probability of 2.4e-7; a
+    difference in only one byte is therefore damage to the stored CRC itself.
     """
     difference = stored_crc ^ computed
     if chunks.holds_own_checksum(stored, compression):
@@ -329,7 +329,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
 
 
 def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) -> Loaded:
-    """Keep the messages before the place where a chunk was cut."""
+    """Read the messages before the position where a chunk is cut off."""
     try:
         chunks.check_size(head.compressed_size, head.compression, head.uncompressed_size)
     except chunks.InflateError as error:
@@ -368,7 +368,7 @@ def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
         return []
     what = f"of {size} of the {span.kind.value} at {span.offset} hold no record"
     start, end = np.array(messages.damage, dtype=np.int64).T
-    # Times around each stretch: the latest before it, the earliest behind it.
+    # Log times around each range: the latest before it and the earliest after it.
     latest = np.maximum.accumulate(np.append(0, messages.log_time))
     earliest = np.minimum.accumulate(np.append(messages.log_time, _NEVER)[::-1])[::-1]
     first = latest[np.searchsorted(messages.start, start)]
@@ -383,13 +383,13 @@ def _damage_losses(span: Span, messages: Messages, size: int) -> list[Loss]:
 
 
 def _lose_bytes(span: Span, text: str, lost: int, first: int, last: int) -> Loss:
-    """The loss of bytes between two log times; of the span where no message stands on that side."""
+    """Loss of bytes between two log times; the span's own time on a side without messages."""
     before = int(first) or span.start_ns
     return Loss("damaged_record", text, int(lost), 1, before, span.end_ns if last == _NEVER else int(last))
 
 
 def _compare_times(span: Span, head: rec.ChunkHead, messages: Messages) -> list[Loss]:
-    """What contradicts itself in a chunk that no checksum covers: its head tells its messages' times."""
+    """Loss if a chunk without a checksum has messages outside the time range stated in its header."""
     log_time = messages.log_time
     if not log_time.size or (head.start_ns <= int(log_time.min()) and int(log_time.max()) <= head.end_ns):
         return []
@@ -410,10 +410,10 @@ def _lost(span: Span, kind: str, reason: str) -> Loaded:
 Result = TypeVar("Result")
 
 _TOGETHER: Final = 6 << 20
-"""Inflated bytes of neighbouring chunks that are read together: every step in Python then serves more."""
+"""Maximum total inflated size of adjacent chunks read together [bytes], to reduce the overhead of Python."""
 
 _IN_FLIGHT: Final = 1 << 30
-"""Inflated bytes that all threads together hold, unless a single chunk is larger."""
+"""Maximum inflated size in memory over all threads [bytes], unless a single chunk is larger."""
 
 _CRC_BLOCK: Final = 1 << 20
 
@@ -431,15 +431,15 @@ def load_spans(
 
     Args:
         source: the file.
-        spans: which stretches.
-        use: what to make of each, called on the reading threads so that the chunk itself is soon forgotten;
-            where only some channels are wanted, undamaged neighbours come as one, named by the first.
-        threads: how many are read at once.
+        spans: the spans.
+        use: processes a loaded span, on the reading threads so that the chunk is freed early; if only some
+            channels are wanted, undamaged adjacent chunks are passed as one, with the first span.
+        threads: number of spans that are read at once.
         wanted: numbers of the channels whose messages are needed, None for all.
-        file_holds: asked when a chunk's checksum differs whether that of the whole file holds.
+        file_holds: called if a chunk's checksum differs; returns whether that of the whole file is valid.
 
     Yields:
-        What ``use`` returned.
+        The results of ``use``.
     """
 
     def read(group: list[Span]) -> list[Result]:
@@ -454,12 +454,12 @@ def load_spans(
 
 
 def _weigh(group: list[Span]) -> int:
-    """Bytes that a group takes in memory."""
+    """Memory of a group [bytes]."""
     return sum(max(span.inflated, span.length) for span in group)
 
 
 def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
-    """Chunks that stand one behind the other, a few megabytes together."""
+    """Groups of adjacent chunks, of at most `_TOGETHER` bytes unless a single chunk is larger."""
     groups: list[list[Span]] = []
     size = 0
     for span in spans:
@@ -476,7 +476,7 @@ def _group_neighbours(spans: Sequence[Span]) -> list[list[Span]]:
 
 
 def checksum_holds(source: ByteSource, end: int, crc: int) -> bool:
-    """Whether the checksum of the data section, the first ``end`` bytes of a file, holds."""
+    """Whether the checksum of the data section, the first ``end`` bytes of a file, is valid."""
     computed = 0
     for offset in range(0, end, _CRC_BLOCK):
         computed = zlib.crc32(source.read_at(offset, min(_CRC_BLOCK, end - offset)), computed)

@@ -111,7 +111,7 @@ class TransformBuffer:
         """Frames from ``parent`` to ``child``, both included.
 
         Raises:
-            LogError: ``frame_not_found`` when a frame is unknown or the two are not connected.
+            LogError: ``frame_not_found``, a frame is unknown or the two are not connected.
         """
         up_child = self._ancestors(_clean(child))
         up_parent = self._ancestors(_clean(parent))
@@ -130,9 +130,9 @@ class TransformBuffer:
             at: stamps of the poses [ns]; by default those of the moving link next to the child.
 
         Returns:
-            Poses where every link of the chain is known. A link is interpolated between its stamps. Beyond
-            its first and last stamp it is held for three of its intervals plus the time by which its stamps
-            are ahead of their log times (a future-dated map to odom); rows further out are omitted.
+            Poses at the times where every link of the chain is known. A link is interpolated between its
+            stamps. Beyond its first and last stamp it is held for three of its intervals plus the time by
+            which its stamps are ahead of their log times (a future-dated map to odom); others are omitted.
 
         Raises:
             LogError: ``frame_not_found``.

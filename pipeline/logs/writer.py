@@ -39,7 +39,7 @@ class _Rows(NamedTuple):
 
 
 class LogWriter:
-    """Writes one MCAP file, which gets its name only when it is complete.
+    """Writes one MCAP file under a temporary name, and renames it when it is complete.
 
     Args:
         path: the file; an existing one is replaced.
@@ -57,7 +57,7 @@ class LogWriter:
         if compression not in COMPRESSIONS:
             hint = f"Use one of {', '.join(map(repr, COMPRESSIONS))}"
             raise unsupported(f"chunks cannot be compressed with {compression!r}", str(path), hint)
-        from mcap.writer import CompressionType, Writer  # noqa: PLC0415 - who only reads does not pay for it
+        from mcap.writer import CompressionType, Writer  # noqa: PLC0415 - only writing needs it
 
         self._path = Path(path)
         self._draft = self._path.with_name(f".{self._path.name}.{os.getpid()}.part")

@@ -1,7 +1,7 @@
-"""Recordings that are a folder of text tables: CSV files, or poses in the format of TUM.
+"""Recordings that are a folder of text tables: CSV files, or poses in the TUM format.
 
-A data set is a file in this folder, found by being there, that says of each of its tables which topic,
-message type and fields its columns stand for. Its rows are read as the messages that were logged once.
+Each data set has a TOML file in this folder, which is discovered automatically. It maps the columns of each
+table to a topic, a message type and fields. Rows are read as the messages that were originally logged.
 """
 
 from __future__ import annotations
@@ -32,30 +32,30 @@ if TYPE_CHECKING:
 TEXT_TABLE: Final = "text table"
 
 _MAX_BYTES: Final = 1 << 30
-"""Largest table that is read: an IMU at 400 Hz writes as much in eight hours [bytes]."""
+"""Maximum size of a table [bytes]: that of an IMU at 400 Hz in eight hours."""
 
 _KEPT_NS: Final = 1_000
-"""Times are kept to the microsecond: a double holds the seconds since 1970 no finer [ns]."""
+"""Resolution of times [ns]: a double resolves seconds since 1970 to about one microsecond."""
 
 _LATEST_NS: Final = float(1 << 62)
-"""Later times are no times: the year 2116 [ns]."""
+"""Upper limit of valid times [ns], in the year 2116."""
 
 _CHANNEL: Final = 1
-"""A table is one channel, whose number in its file this is."""
+"""Channel number of a table, which has only one channel."""
 
 
 class TextTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One file of a data set.
 
     Attributes:
-        path: below the folder of a recording.
-        topic: that its rows were logged on.
+        path: path relative to the folder of a recording.
+        topic: topic of its rows.
         type: message type, ``package/msg/Name``.
         time: column with the time of a row.
-        tick_ns: what the time is counted in [ns].
-        fields: column by field of the message, a number in the field's unit.
-        texts: what a field says in every row.
-        columns: names of the columns where the file has no line with them.
+        tick_ns: unit of the time [ns].
+        fields: column by field of the message, numbers in the field's unit.
+        texts: constant texts by field.
+        columns: names of the columns if the file has no header line.
     """
 
     path: str
@@ -69,7 +69,7 @@ class TextTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def wanted(self) -> tuple[str, ...]:
-        """Names of the columns that are read, the time first."""
+        """Names of the columns to read, the time first."""
         return (self.time, *dict.fromkeys(self.fields.values()))
 
 
@@ -77,11 +77,11 @@ class TextFolder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A data set whose recordings are folders of text tables.
 
     Attributes:
-        name: what people call it.
-        source: where its format was read.
+        name: display name.
+        source: source of its format.
         recognized_by: files that every recording of it has.
-        vehicle: that drove, as presets are called.
-        lacks: what its recordings do not tell, a sentence each.
+        vehicle: name of the vehicle's preset.
+        lacks: information missing from its recordings, one sentence each.
         files: its tables.
     """
 
@@ -95,7 +95,7 @@ class TextFolder(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 @functools.cache
 def list_text_folders() -> tuple[TextFolder, ...]:
-    """The data sets that are known, by name."""
+    """The known data sets, sorted by name."""
     folder = resources.files(__package__)
     formats = [
         msgspec.convert(tomllib.loads(entry.read_text(encoding="utf-8")), TextFolder)
@@ -106,7 +106,7 @@ def list_text_folders() -> tuple[TextFolder, ...]:
 
 
 def recognize_text_folder(folder: Path) -> TextFolder | None:
-    """The data set that a folder is a recording of; None where it is of none that is known."""
+    """The known data set of which a folder is a recording; None if there is none."""
     for known in list_text_folders():
         if all((folder / name).is_file() for name in known.recognized_by):
             return known
@@ -114,14 +114,14 @@ def recognize_text_folder(folder: Path) -> TextFolder | None:
 
 
 def list_tables(folder: Path) -> list[Path]:
-    """The tables of a folder that is a recording of text tables; none of any other folder."""
+    """The existing tables of a folder that is a recording of text tables; empty for other folders."""
     known = recognize_text_folder(folder)
     every = [] if known is None else [folder / table.path for table in known.files]
     return [file for file in every if file.is_file()]
 
 
 def find_table(file: Path) -> tuple[TextFolder, TextTable] | None:
-    """The data set and table that a file belongs to; None where it belongs to none."""
+    """The data set and table of a file; None if it belongs to none."""
     for known in list_text_folders():
         for table in known.files:
             if f"/{file.as_posix()}".endswith(f"/{table.path}"):
@@ -132,12 +132,12 @@ def find_table(file: Path) -> tuple[TextFolder, TextTable] | None:
 
 
 def catalog_table(source: ByteSource, known: TextFolder, table: TextTable) -> Catalog:
-    """Find out what a table holds.
+    """Catalog the contents of a table.
 
     Args:
         source: the file.
         known: its data set.
-        table: which of its tables it is.
+        table: description of the table.
 
     Raises:
         LogError: ``too_large``.
@@ -151,14 +151,14 @@ def catalog_table(source: ByteSource, known: TextFolder, table: TextTable) -> Ca
     if rows.times.size:
         catalog.start_ns, catalog.end_ns = int(rows.times.min()), int(rows.times.max())
     if table.path == known.recognized_by[0]:
-        # What holds for the whole recording stands with one file that every recording has.
+        # Metadata of the whole recording are added to one file that every recording has.
         catalog.metadata.append(("deployment", {"vehicle": known.vehicle}))
         catalog.notes += _describe_folder(to_location(source.name), known, table)
     return catalog
 
 
 def _describe_folder(file: Path, known: TextFolder, table: TextTable) -> list[str]:
-    """What is worth knowing of a recording of a data set, by one of its tables."""
+    """Notes on a recording of a data set, given one of its tables."""
     folder = file.parents[table.path.count("/")]
     said = [f"it is a recording of {known.name}: {len(known.files)} text tables are known, a topic each"]
     missing = [each.path for each in known.files if not (folder / each.path).is_file()]
@@ -168,11 +168,11 @@ def _describe_folder(file: Path, known: TextFolder, table: TextTable) -> list[st
 
 
 def read_table(source: ByteSource, table: TextTable) -> Payloads | None:
-    """The rows of a table as the messages that they stand for; None where it has none.
+    """Read the rows of a table as messages; None if it has no rows.
 
     Args:
         source: the file.
-        table: which table it is.
+        table: description of the table.
 
     Raises:
         LogError: ``too_large``.
@@ -195,7 +195,7 @@ def read_table(source: ByteSource, table: TextTable) -> Payloads | None:
 
 @dataclass(slots=True)
 class _Rows:
-    """Rows of a table: times [ns], shape (n,), columns of as many, and what was lost."""
+    """Rows of a table: times [ns], shape (n,), columns of shape (n,), and losses."""
 
     times: Ints = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     columns: Mapping[str, Floats] = field(default_factory=dict)
@@ -212,7 +212,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
     losses: list[Loss] = []
     lines = text.splitlines()
     if lines and not text.endswith("\n"):
-        # A number that is cut looks like another number.
+        # A cut number may be read as a different number.
         lines.pop()
         losses.append(Loss("truncated", f"the last line of {table.path} has no end and is left out"))
     separator = None if table.columns else ","
@@ -237,7 +237,7 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
 
 
 def _parse_lines(lines: Sequence[str], separator: str | None, places: Sequence[int]) -> Floats:
-    """The numbers at some places of every line; lines without them are left out."""
+    """Numbers in the given columns of every line, shape (n, k); lines without them are omitted."""
     if not lines:
         return np.zeros((0, len(places)))
     try:
