@@ -178,6 +178,8 @@ def test_effects_of_which_either_will_do_are_not_both_dropped(tmp_path: Path) ->
 def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
     selection, ideal = _open(scenario, tmp_path / "husky")
+    # Contact friction contains a wider track: it would take the refused one's place.
+    selection.candidates = tuple(one for one in selection.candidates if one.id != "contact_friction")
     allowed = selection.may_stay
     monkeypatch.setattr(
         selection,
