@@ -251,7 +251,7 @@ $(VENV)/.ready: requirements.txt pyproject.toml | $(VENV)/bin/python
 	@# The program starts .2 s sooner where the environment forbids Python to keep what it compiled.
 	@$(BIN)/python -m compileall -q pipeline schemas
 	@# Loops are compiled once, here, and not at the first answer.
-	@$(BIN)/python -c "import pipeline.estimation, pipeline.models as m, pipeline.core.machine_code as c; m.list_effects(); list(c.compile_loops())"
+	@$(BIN)/python -c "from pipeline.cli.verbs_machine import compile_every_loop; compile_every_loop()"
 	@touch $@
 
 $(VENV)/.ready-dev: requirements-dev.txt $(VENV)/.ready

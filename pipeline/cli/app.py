@@ -107,7 +107,10 @@ def _format_usage(error: CycloptsError) -> object:
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
         return CycloptsPanel(error)
     choices = get_args(lacking.hint) if get_origin(lacking.hint) is Literal else ()
-    about = lacking.parameter.help or " or ".join(map(str, choices))
+    # The parser reads docstrings for the help alone.
+    documented = error.app.assemble_argument_collection(parse_docstring=True) if error.app else ()
+    meanings = (one.parameter.help for one in documented if one.name == lacking.name)
+    about = " ".join((next(meanings, "") or " or ".join(map(str, choices))).split()).removesuffix(".")
     verb = f"slip {' '.join(error.command_chain or ())}"
     return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 

@@ -283,13 +283,7 @@ def export(  # noqa: D417 - the options document themselves
     model: Path,
     /,
     *,
-    to: Annotated[
-        str,
-        Parameter(
-            help="ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo, mjcf, "
-            "sdf, traction, json or python"
-        ),
-    ],
+    to: str,
     current: Annotated[
         Path | None, Parameter(help="vesc, px4: the robot's file of parameters, which is corrected")
     ] = None,
@@ -307,6 +301,8 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
+        to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo, mjcf, sdf,
+            traction, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import write_text  # noqa: PLC0415

@@ -388,14 +388,21 @@ def _read_numbers(version: str) -> list[int]:
     return [int(part) for part in re.findall(r"\d+", version.partition("+")[0])]
 
 
-def _look_at_loops() -> Check:
+def compile_every_loop() -> int:
+    """Compile the loops of the estimation and of every effect; the number of loops compiled."""
     import pipeline.estimation  # noqa: F401, PLC0415 - heavy; loops are known where they are imported
-    from pipeline.core.machine_code import compile_loops, list_caches  # noqa: PLC0415
+    from pipeline.core.machine_code import compile_loops  # noqa: PLC0415
     from pipeline.models import list_effects  # noqa: PLC0415
 
     list_effects()
+    return sum(1 for _ in compile_loops())
+
+
+def _look_at_loops() -> Check:
+    from pipeline.core.machine_code import list_caches  # noqa: PLC0415 - heavy
+
     name = "compiled loops"
-    count = sum(1 for _ in compile_loops())
+    count = compile_every_loop()
     caches = list_caches()
     if not caches:
         what = f"{count} loops run as Python, 100 times slower"

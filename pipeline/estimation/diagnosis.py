@@ -36,7 +36,7 @@ CAUSE = ". Cause: "
 class Value:
     """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
 
-    `another_run`: in another run on this ground. `one_sided`: see `Parameter.is_one_sided`.
+    `another_run`: expected interval in another run on this ground. `one_sided`: `Parameter.is_one_sided`.
     """
 
     value: float

@@ -42,7 +42,7 @@ def _run(cache: Path, *command: str | Path) -> set[str]:
 @pytest.mark.long
 def test_what_set_up_compiles_is_what_a_diagnosis_calls(samples: Path, tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    (compile_all,) = re.findall(r'-c "(.*compile_loops.*)"', MAKEFILE.read_text())
+    (compile_all,) = re.findall(r'-c "(.*compile_every_loop.*)"', MAKEFILE.read_text())
     compiled = _run(cache, "-c", compile_all)
     assert len(compiled) > 10
     assert _run(cache, "-c", CALL) == compiled

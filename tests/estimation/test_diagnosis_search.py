@@ -175,11 +175,17 @@ def test_effects_of_which_either_will_do_are_not_both_dropped(tmp_path: Path) ->
     assert len(kept.ids) == 1
 
 
-def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _open_two(folder: Path) -> tuple[Selection, CandidateModel]:
+    """A drive with two effects, of which nothing can take the place of the first one."""
     scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
-    selection, ideal = _open(scenario, tmp_path / "husky")
-    # Contact friction contains a wider track: it would take the refused one's place.
+    selection, ideal = _open(scenario, folder / "husky")
+    # Contact friction contains a wider track.
     selection.candidates = tuple(one for one in selection.candidates if one.id != "contact_friction")
+    return selection, ideal
+
+
+def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    selection, ideal = _open_two(tmp_path)
     allowed = selection.may_stay
     monkeypatch.setattr(
         selection,
@@ -194,10 +200,7 @@ def test_what_may_not_be_named_ends_no_search(tmp_path: Path, monkeypatch: pytes
 def test_what_was_refused_beside_one_model_is_tried_beside_another(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    scenario = replace(_HUSKY, effects={"effective_track": 1.6, "icr_offset": 0.15})
-    selection, ideal = _open(scenario, tmp_path / "husky")
-    # Contact friction contains a wider track: it would take the refused one's place.
-    selection.candidates = tuple(one for one in selection.candidates if one.id != "contact_friction")
+    selection, ideal = _open_two(tmp_path)
     reweight, allowed, asked = selection.reweight, selection.may_stay, list[tuple[str, ...]]()
 
     def note(tested: CandidateModel) -> CandidateModel:

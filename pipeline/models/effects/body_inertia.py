@@ -20,6 +20,9 @@ from pipeline.models.filters import lag_signal
 from pipeline.models.parameter import Conditions, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
+LEAST_LAG_S = 0.02
+"""Smallest lag of the body to report [s]: stamps are off by as much."""
+
 
 class BodyInertia(BodyEffect):
     """Body inertia: with little grip the body follows its wheels late and slides on in turns."""
@@ -31,7 +34,7 @@ class BodyInertia(BodyEffect):
             TIME_CONSTANT,
             about="time constant of the body on the ground",
             starts=(0.15, 0.4, 0.9, 1.6),
-            least=Least(0.02, Least.STAMPS),
+            least=Least(LEAST_LAG_S, Least.STAMPS),
             plausible=Plausible(0.0, 3.0, "wider than the 0.2 to 1 s of ice"),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
             between_runs=Spread(0.034),

@@ -24,6 +24,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
 from pipeline.models.effect import INF, BodyEffect, Effect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effects.body_inertia import LEAST_LAG_S
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.effects.effective_track import EffectiveTrack
 from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
@@ -33,8 +34,6 @@ _GRAVITY = 9.80665
 """Standard gravity [m/s^2]."""
 _LEAST_TAU_S = 1e-3
 """Smallest time constant [s]: with zero the friction force without slip has no direction."""
-_LEAST_LAG_S = 0.02
-"""Smallest lag to report [s]: stamps are off by as much."""
 _STEP_S = 0.02
 """Longest integration step [s]: half of it changes velocities by less than 2 mm/s."""
 
@@ -132,7 +131,7 @@ class ContactFriction(BodyEffect):
         """Whether it is a wider track: even wheels that skid in the fastest turn make the body no later."""
         tau, friction, k = (self.values[name] for name in ("tau", "friction", "k"))
         sliding = conditions.largest.speed * math.sqrt(k - 1.0) / k
-        return math.hypot(tau, sliding / (friction * _GRAVITY)) < _LEAST_LAG_S
+        return math.hypot(tau, sliding / (friction * _GRAVITY)) < LEAST_LAG_S
 
     def collapse(self) -> Effect | None:
         """An effective track of the same ratio."""
