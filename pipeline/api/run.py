@@ -13,9 +13,9 @@ from pipeline.api.fitted_model import Model, tabulate_ladder, tabulate_parameter
 from pipeline.batch.recordings import list_named
 from pipeline.core.json_objects import mapping_in, number_in, objects_in
 from pipeline.core.program import SlipError, format_recorded
+from pipeline.estimation.context import parse_budget
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.ladder import ERRORS_OVER_2S
-from pipeline.estimation.selection import parse_budget
 from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, update_datasets
 from pipeline.job.check import Check as RunsCheck

@@ -76,7 +76,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
-    from pipeline.estimation.selection import parse_budget  # noqa: PLC0415 - heavy
+    from pipeline.estimation.context import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models.model_text import check_target  # noqa: PLC0415 - heavy
 
     if apply is not None:

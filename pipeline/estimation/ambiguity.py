@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
+from pipeline.estimation.context import Context, is_late
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import fit_model
@@ -15,7 +16,7 @@ from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.search import SearchResult, list_rivals, suggest_manoeuvre
-from pipeline.estimation.selection import CandidateModel, Context, Selection, is_late
+from pipeline.estimation.selection import CandidateModel, Selection
 from pipeline.models import Model, find_effect
 from pipeline.models.catalogue import find_late_effect, list_effects
 from pipeline.models.effect import Effect, Late, find_late
@@ -56,17 +57,17 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         if effect.id in selection.given or selection.budget.is_spent():
             continue
         without = selection.drop(final, [effect.id])
-        rivals = [
-            rival
-            for rival in list_rivals(selection, final, (effect.id,))
-            if _is_as_good(selection, final, rival) and _does_the_same(selection, without, final, rival)
-        ]
         alike = _list_alike(selection, without, final, effect)
         # Several rivals may have collapsed to the same simpler effect.
         by_name: dict[str, CandidateModel] = {}
-        for rival in rivals:
-            new = [name for name in rival.ids if name not in final.ids]
-            if len(new) == 1:
+        for candidate in list_rivals(selection, final, (effect.id,)):
+            new = [name for name in candidate.ids if name not in final.ids]
+            if len(new) != 1:
+                continue
+            if not _is_as_good(selection, final, candidate):
+                continue
+            rival = selection.enter(candidate.state) if candidate.is_rough else candidate
+            if _does_the_same(selection, without, final, rival):
                 by_name.setdefault(new[0], rival)
         known = dict.fromkeys([*by_name, *alike])
         # An effect with more parameters is no rival, even where a simpler rival exists.

@@ -25,6 +25,7 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
+from pipeline.estimation.context import Context
 from pipeline.estimation.describe import ladder_as_json
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import ABOVE_FLOOR, Growth, find_main_region, map_errors, pick_regions
@@ -48,7 +49,6 @@ from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, ju
 from pipeline.estimation.learned_step import learn_beyond
 from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
-from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, ModelFile, find_effect

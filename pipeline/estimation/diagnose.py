@@ -12,6 +12,7 @@ from pipeline.core.compute import both_cores
 from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Input, InputChoice, choose_input
+from pipeline.estimation.context import Budget, Context, prepare, usual_budget
 from pipeline.estimation.diagnosis import Diagnosis, RunDiagnosis
 from pipeline.estimation.estimates import NotSignificant, list_not_significant
 from pipeline.estimation.search import (
@@ -22,7 +23,6 @@ from pipeline.estimation.search import (
     search_body,
     search_wheels,
 )
-from pipeline.estimation.selection import Budget, Context, prepare, usual_budget
 from pipeline.estimation.unexplained import (
     LEAST_OF_DRIVE,
     Explainable,

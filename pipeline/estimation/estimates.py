@@ -12,6 +12,7 @@ import numpy as np
 from pipeline.core.program import NORMAL_95
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
+from pipeline.estimation.context import Context
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.intervals import Estimates, estimate_intervals
@@ -19,7 +20,6 @@ from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.learning import estimate_unnamed
 from pipeline.estimation.parts import count_seconds
 from pipeline.estimation.search import SearchResult
-from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
 from pipeline.estimation.verdict import BREVITY, SEARCH_CUT
 from pipeline.models import Effect, Model, find_effect
@@ -28,7 +28,7 @@ from pipeline.models.parameter import Parameter, cut_interval, is_of_one_run, st
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
-    from pipeline.estimation.selection import Budget
+    from pipeline.estimation.context import Budget
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:

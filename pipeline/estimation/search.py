@@ -14,9 +14,10 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_innovations, scale_evidence
 from pipeline.estimation.comparison import Input
+from pipeline.estimation.context import Budget, Context
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.selection import USEFUL, Budget, CandidateModel, Context, Selection, open_selection
+from pipeline.estimation.selection import USEFUL, CandidateModel, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
 from pipeline.models.parameter import Quantity
@@ -161,6 +162,9 @@ _MOST_EFFECTS = 8
 """Maximum number of effects that a search adds on one path: a longer list explains nothing."""
 _BESIDE = (0.7, 1.4)
 """Factors of a parameter for restarting its fit: a factor of two apart, as the starts of effects are."""
+_CLEAR = 2.5
+"""Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
+421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
 _RIVALS = 0.5
 """Minimum predicted gain of an effect's rivals, as a share of its own predicted gain."""
 
@@ -244,14 +248,22 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
     the two does not lead to their common cause.
     """
     free = [effect for effect in current.state.effects if effect.id not in selection.given]
-    simple = [effect.id for effect in free if len(effect.values) == 1]
-    for names in (*((effect.id,) for effect in free), *combinations(simple, 2)):
+    simple = [effect for effect in free if len(effect.values) == 1]
+    # Of effects that are linear in their parameter, an extension finds the common cause.
+    pairs = [pair for pair in combinations(simple, 2) if not all(map(_is_linear, pair))]
+    for names in (*((effect.id,) for effect in free), *((one.id, two.id) for one, two in pairs)):
         if selection.budget.is_spent():
             break
-        best = choose(selection, current, list_rivals(selection, current, names, excluded))
+        rivals = list_rivals(selection, current, names)
+        allowed = [one for one in rivals if not excluded & (set(one.ids) - set(current.ids))]
+        best = choose(selection, current, allowed)
         if best is not current:
             return best
     return current
+
+
+def _is_linear(effect: Effect) -> bool:
+    return all(parameter.search is Search.DIRECT for parameter in effect.parameters)
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
@@ -261,19 +273,20 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
     local minimum, and so may that of a speed loop that was started as a first-order lag.
     """
     while not selection.budget.is_spent():
-        states = [
+        beside = [
             current.state.set(number, share * current.state.get(number))
             for number in current.fit.free
             if number.search is Search.STARTS and number.effect not in selection.given
             for share in _BESIDE
         ]
-        states += [
+        starts = [
             current.state.add(effect.change(**start))
             for effect in current.state.effects
             if effect.id not in selection.given
             for start in effect.starts
         ]
-        fitted = selection.enter_each(states, selection.loss(current))
+        before = selection.loss(current)
+        fitted = selection.approach_each(current, beside, before) + selection.enter_each(starts, before)
         restarted = [one for one in fitted if selection.is_sound(one)]
         best = min(restarted, key=selection.loss, default=current)
         if not selection.is_better(best, current):
@@ -283,35 +296,64 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
 
 
 def list_rivals(
-    selection: Selection, current: CandidateModel, names: tuple[str, ...], excluded: set[str] | None = None
+    selection: Selection, current: CandidateModel, names: tuple[str, ...]
 ) -> list[CandidateModel]:
     """Fitted models in which some effects are replaced by one or two others of similar predicted gain."""
-    excluded = excluded or set()
-    key = (current.ids, names, tuple(sorted(excluded)))
-    if key not in selection.rivals:
-        without = selection.drop(current, names)
-        # With a lag, limits have little evidence: take that of rivals at the model without the effects.
-        evidence = selection.take_evidence(without, excluded, selection.noise)
-        own = [one.chi_square for one in evidence.rank_singles(0.0) if one.starts[0].effect.id in names]
-        for name in names:
-            evidence = evidence.leave_out(name)
-        # A rival must also reduce the loss by the minimum for naming.
-        useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
-        least = _RIVALS * max(own, default=math.inf)
-        selection.rivals[key] = selection.fit_hypotheses(without, evidence, least, useful)
-    return selection.rivals[key]
+    key = (current.ids, names)
+    known = selection.rivals.get(key)
+    if known is None:
+        models = _fit_rivals(selection, current, names)
+    elif known.weights is selection.weights:
+        return known.models
+    else:
+        models = _refit_rivals(selection, current, known.models)
+    selection.rivals[key] = Rivals(selection.weights, models)
+    return models
+
+
+def _fit_rivals(
+    selection: Selection, current: CandidateModel, names: tuple[str, ...]
+) -> list[CandidateModel]:
+    without = selection.drop(current, names)
+    # With a lag, limits have little evidence: take that of rivals at the model without the effects.
+    evidence = selection.take_evidence(without, (), selection.noise)
+    own = [one.chi_square for one in evidence.rank_singles(0.0) if one.starts[0].effect.id in names]
+    for name in names:
+        evidence = evidence.leave_out(name)
+    least = _RIVALS * max(own, default=math.inf)
+    # A rival must also reduce the loss by the minimum for naming.
+    useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
+    return selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
+
+
+def _refit_rivals(
+    selection: Selection, current: CandidateModel, models: Sequence[CandidateModel]
+) -> list[CandidateModel]:
+    """Rivals that come near the model, fitted with the present weights; the others as they are."""
+    is_near = [selection.loss(model) < USEFUL * selection.loss(current) for model in models]
+    near = [model.fit for model, flag in zip(models, is_near, strict=True) if flag]
+    rest = [model for model, flag in zip(models, is_near, strict=True) if not flag]
+    return selection.sort([*selection.enter_each(near), *rest])
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
     """Drop effects whose evidence is no longer significant; the least significant first."""
     while True:
-        free = [[name] for name in current.ids if name not in selection.given]
-        models = selection.drop_each(current, free)
+        doubtful = _list_doubtful(selection, current)
+        models = selection.drop_each(current, [[name] for name in doubtful])
         judged = [(selection.judge(without, current), without) for without in models]
         weak = [(one.share, without) for one, without in judged if not one.is_significant]
         if not weak:
             return current
         current = selection.reweight(min(weak, key=lambda one: one[0])[1])
+
+
+def _list_doubtful(selection: Selection, current: CandidateModel) -> list[str]:
+    """Effects that may not be significant: rough fits of the model without each of the others settle them."""
+    names = [name for name in current.ids if name not in selection.given]
+    rough = selection.approach_each(current, [current.state.drop([name]) for name in names], 0.0)
+    judged = zip(names, (selection.judge(without, current) for without in rough), strict=True)
+    return [name for name, one in judged if one.share < _CLEAR or one.gain < _CLEAR * LEAST_GAIN]
 
 
 def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:

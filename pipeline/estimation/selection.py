@@ -1,211 +1,24 @@
-"""Where models compete: the runs made ready, the candidates, the time there is, and the part of the way."""
+"""Selection among models of one part of the path: their fits, losses and evidence."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import cast
 
 from pipeline.core.arrays import Floats
-from pipeline.core.compute import map_parallel, measure_cpu
-from pipeline.core.program import SlipError
+from pipeline.core.compute import map_parallel
 from pipeline.estimation.acceptance import HALVES, LEAST_T, Improvement, compare, is_nameable
-from pipeline.estimation.comparison import Input
+from pipeline.estimation.context import Budget
 from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
-from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.fit import PartFit, fit_part, try_part
 from pipeline.estimation.folds import Fold, hold_out_part, make_folds
 from pipeline.estimation.parts import Part, make_weights
-from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import Candidate
 from pipeline.estimation.state import State, Weights
-from pipeline.models.catalogue import list_effects
-from pipeline.models.effect import Effect, Place
-from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Largest, is_of_one_run
-from pipeline.run.recording import MotionError, MotionRun
-from pipeline.sources import Vehicle
-
-
-class DiagnosisError(SlipError):
-    """A diagnosis that cannot be made, in one line."""
-
-
-_USUAL_S = 60.0
-"""CPU time of a search [s] for `_FOR_S` of driving, and the least."""
-_FOR_S = 600.0
-"""Driving [s] that `_USUAL_S` is for."""
-_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-"""Seconds in a unit of `--budget`."""
-_DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|)")
-
-
-@dataclass
-class Budget:
-    """CPU time that a search may take; after it the best answer so far stands.
-
-    Attributes:
-        seconds: of CPU time of this process and of what works beside it.
-        notify: told what was found so far.
-        was_cut: whether a search was ended by it.
-    """
-
-    seconds: float = math.inf
-    notify: Callable[[str], None] | None = None
-    was_cut: bool = False
-    _started: float = field(default_factory=measure_cpu)
-
-    @property
-    def spent_s(self) -> float:
-        """CPU time since it began [s]."""
-        return measure_cpu() - self._started
-
-    def is_spent(self) -> bool:
-        """Whether it is used up: whoever asks ends then."""
-        self.was_cut |= self.spent_s > self.seconds
-        return self.was_cut
-
-    def report(self, title: str, effects: Iterable[str]) -> None:
-        """Report the effects found on a part of the way."""
-        if self.notify is not None:
-            self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
-
-
-def usual_budget(driven_s: float) -> float:
-    """CPU time [s] for a run of so much driving [s]: a minute for ten minutes, and never less."""
-    return max(_USUAL_S, _USUAL_S * driven_s / _FOR_S)
-
-
-def parse_budget(text: str) -> float:
-    """CPU time [s] of ``60s``, ``2min`` or a number of seconds.
-
-    Raises:
-        DiagnosisError: ``bad_budget``.
-    """
-    match = _DURATION.fullmatch(text.strip())
-    if match is None or float(match[1]) == 0.0:
-        what, hint = f"{text!r} is not a duration above zero", "Write it like 60s or 5min."
-        raise DiagnosisError("bad_budget", what, where="--budget", hint=hint)
-    return float(match[1]) * _UNITS[match[2]]
-
-
-_FEWEST_WINDOWS = 60
-"""Half seconds of driving with poses that a diagnosis needs: a quarter of a minute, windows overlapping."""
-_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
-_SURE = 4.0
-"""Standard errors from which on a delay of the heading is beyond doubt."""
-
-
-@dataclass(frozen=True)
-class Context:
-    """Runs of one vehicle, ready to be asked.
-
-    Attributes:
-        problem: the runs on the leading input.
-    """
-
-    problem: Problem
-
-    @property
-    def runs(self) -> tuple[MotionRun, ...]:
-        """The recordings."""
-        return self.problem.runs
-
-    @property
-    def vehicle(self) -> Vehicle:
-        """Geometry."""
-        return self.problem.vehicle
-
-    @property
-    def largest(self) -> Largest:
-        """What relative starts are shares of."""
-        return self.problem.largest
-
-    @property
-    def has_encoders(self) -> bool:
-        """Whether every run has measured wheels."""
-        return all(run.wheels is not None for run in self.runs)
-
-    @property
-    def has_gyro(self) -> bool:
-        """Whether every run has a good gyro as heading and clock."""
-        return all(comparison.has_gyro for comparison in self.problem.comparisons)
-
-    def list_shared(self) -> list[object]:
-        """Large objects that stay as they are throughout."""
-        problems = [self.problem, *([self.problem.behind_wheels] if self.has_encoders else [])]
-        return [
-            *problems,
-            *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
-        ]
-
-    @cached_property
-    def conditions(self) -> Conditions:
-        """What the runs can show; every search looks at measured wheels where there are any."""
-        sampling = self.sampling_s if self.has_encoders else 0.0
-        exceeded = self.problem.exceeded
-        slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
-        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded, slope)
-
-    @property
-    def sampling_s(self) -> float:
-        """Delay that sampled encoders may feign: a little more than half their period."""
-        return 0.6 * max(run.wheel_period_s for run in self.runs)
-
-    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
-        """Effects that can be told on an input of this vehicle."""
-        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
-        return tuple(
-            cast("Candidate", effect)
-            for effect in list_effects()
-            if self.vehicle.kind in effect.kinds
-            and effect.place not in hidden
-            and not effect.parts
-            and effect().can_show(self.conditions)
-        )
-
-    def list_drivetrain(self) -> tuple[Candidate, ...]:
-        """Effects between command and wheels."""
-        return tuple(
-            cast("Candidate", effect)
-            for effect in list_effects()
-            if self.vehicle.kind in effect.kinds
-            and effect.place in _DRIVETRAIN
-            and effect().can_show(self.conditions)
-        )
-
-
-def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Context:
-    """Make runs ready.
-
-    Raises:
-        DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be
-            compared.
-    """
-    where = ", ".join(run.name for run in runs)
-    try:
-        problem = Problem(runs, vehicle, source)
-    except MotionError as error:
-        if error.code != f"no_{source.value}":
-            raise
-        other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
-        what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
-        raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
-    windows = problem.whole.run.size
-    if windows < _FEWEST_WINDOWS:
-        what = f"only {windows} stretches of half a second have both a live input and valid poses"
-        hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
-        raise DiagnosisError("too_short", what, where=where, hint=hint)
-    return Context(problem)
-
-
-def is_late(run: MotionRun) -> bool:
-    """Whether the reported heading is late or early against the gyro beyond doubt."""
-    gyro = run.gyro_fit
-    delay = abs(run.alignment.heading_delay_s)
-    return gyro is not None and delay >= LEAST_DELAY_S and delay > _SURE * gyro.delay_error_s
-
+from pipeline.models.effect import Effect
+from pipeline.models.parameter import Conditions, Largest, is_of_one_run
 
 PRICE = 0.5 * LEAST_T**2
 """Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
@@ -216,8 +29,9 @@ _COMPARABLE = 0.5
 _BETTER = 0.005
 """Share of the sum of both losses by which a model with no more numbers must be better to take another's
 place, see `Selection.sum_losses`."""
-USEFUL = 1.3
-"""Loss of a rival over that of the model: what stays above it is neither better nor as good."""
+USEFUL = 1.1
+"""Loss of a rival over that of the model above which it is not fitted to the end: exchanges that are accepted
+on the recordings have 0.9 at most, and with 1.3 a search takes a third more predictions."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
 
@@ -230,11 +44,13 @@ class CandidateModel:
         part: that it is fitted to.
         fit: the model.
         folds: held-out blocks.
+        is_rough: whether only some steps of its fit were taken, see `Selection.approach_each`.
     """
 
     part: Part = field(repr=False)
     fit: PartFit
     folds: tuple[Fold, ...]
+    is_rough: bool = False
 
     @cached_property
     def restarted(self) -> Floats:
@@ -262,6 +78,19 @@ class CandidateModel:
         return len(self.fit.free)
 
 
+@dataclass(frozen=True)
+class Rivals:
+    """Models in the place of some effects of a model.
+
+    Attributes:
+        weights: under which they were fitted.
+        models: those with fewer numbers first, then by loss.
+    """
+
+    weights: Weights
+    models: list[CandidateModel]
+
+
 @dataclass
 class Selection:
     """The competition on one part of the way.
@@ -275,7 +104,7 @@ class Selection:
         given: effects that are never dropped: those of the model to start from.
         budget: how long the search may take.
         noise: of the residuals, as the newest evidence has it.
-        rivals: models in the place of an effect of a model, by the model's effects and its id.
+        rivals: models in the place of effects of a model, by the ids of all its effects and of these.
         shapes: of how many shapes a candidate was the best one before it entered, by id.
         as_if: ids of effects that may have values beyond the observed range.
     """
@@ -288,7 +117,7 @@ class Selection:
     given: frozenset[str] = frozenset()
     budget: Budget = field(default_factory=Budget)
     noise: Noise | None = None
-    rivals: dict[tuple[tuple[str, ...], ...], list[CandidateModel]] = field(default_factory=dict)
+    rivals: dict[tuple[tuple[str, ...], ...], Rivals] = field(default_factory=dict)
     shapes: Mapping[str, int] = field(default_factory=dict)
     as_if: set[str] = field(default_factory=set)
     _dropped: dict[tuple[str, ...], CandidateModel] = field(default_factory=dict)
@@ -306,6 +135,24 @@ class Selection:
         """Fit states, those to the end that may reach a loss that makes them useful."""
         fitted = map_parallel(partial(fit_part, self.part, self.weights, useful=useful), starts)
         return [CandidateModel(self.part, fit, self.folds) for fit in fitted]
+
+    def approach_each(
+        self, base: CandidateModel, states: Sequence[State], useful: float
+    ) -> list[CandidateModel]:
+        """Fit states that differ little from a model, and only the useful ones to the end.
+
+        Args:
+            base: the model, whose derivatives are used for the first steps.
+            states: it with other effects or values.
+            useful: loss that makes a state useful.
+        """
+        tried = map_parallel(partial(try_part, self.part, self.weights, base=base.fit), states)
+        models = [CandidateModel(self.part, fit, self.folds, is_rough=True) for fit in tried]
+        near = [index for index, fit in enumerate(tried) if fit.loss <= useful]
+        fitted = self.enter_each([tried[index].state for index in near], useful)
+        for index, model in zip(near, fitted, strict=True):
+            models[index] = model
+        return models
 
     def drop(self, current: CandidateModel, names: Iterable[str]) -> CandidateModel:
         """A model without some of its effects, fitted anew."""
@@ -349,7 +196,6 @@ class Selection:
         """Take the weights from a model's own residuals, and fit it anew."""
         self.weights = make_weights(model.fit.residual, self.part)
         self._dropped.clear()
-        self.rivals.clear()
         self.budget.report(self.part.title, model.ids)
         return self.enter(model.fit)
 
@@ -368,6 +214,8 @@ class Selection:
         least: float = 0.0,
         useful: float = math.inf,
         beyond: list[CandidateModel] | None = None,
+        *,
+        pairs: bool = True,
     ) -> list[CandidateModel]:
         """The most promising extensions of a model by one effect or by two, fitted.
 
@@ -377,6 +225,7 @@ class Selection:
             least: chi-square that an extension must promise.
             useful: loss above which an extension need not be fitted to the end.
             beyond: takes the extensions by an effect with values beyond the observed range.
+            pairs: also extend by two effects.
 
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
@@ -390,10 +239,15 @@ class Selection:
             for hypothesis, model in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
                 if self._keep(model, base, models):
                     best = max(best, _surplus(hypothesis))
-        pairs = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
-        for model in self._fit_each(base, pairs[:_PAIRS], useful):
+        together = evidence.rank_pairs(PRICE) if pairs else []
+        together = [one for one in together if one.chi_square >= max(least, best + PRICE)]
+        for model in self._fit_each(base, together[:_PAIRS], useful):
             self._keep(model, base, models)
-        return sorted(models.values(), key=lambda one: (one.numbers, self.loss(one)))
+        return self.sort(models.values())
+
+    def sort(self, models: Iterable[CandidateModel]) -> list[CandidateModel]:
+        """Models with fewer numbers first, then by loss."""
+        return sorted(models, key=lambda one: (one.numbers, self.loss(one)))
 
     def admit(
         self, base: CandidateModel, models: list[CandidateModel], beyond: Iterable[CandidateModel]
@@ -402,7 +256,7 @@ class Selection:
         least = min(self.loss(one) for one in (base, *models))
         admitted = [one for one in beyond if self.loss(one) < HALVES * least]
         self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
-        return sorted([*models, *admitted], key=lambda one: (one.numbers, self.loss(one)))
+        return self.sort([*models, *admitted])
 
     def _fit_each(
         self,
@@ -418,7 +272,7 @@ class Selection:
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        fitted = self.enter_each(states, useful)
+        fitted = self.enter_each(states) if useful == math.inf else self.approach_each(base, states, useful)
         if beyond is not None:
             beyond += [model for model in fitted if self._is_beyond(model, base)]
         return [self._simplify(model, base) for model in fitted]

@@ -138,6 +138,11 @@ class Free:
         return f"{self.effect or 'timing'}.{self.name}"
 
     @property
+    def key(self) -> tuple[str, str, int | None]:
+        """Its effect, name and run, the same at other bounds."""
+        return self.effect, self.name, self.run
+
+    @property
     def is_smooth(self) -> bool:
         """Whether derivatives find it; else a grid does."""
         return self.search is not Search.GRID

@@ -9,10 +9,11 @@ import pytest
 
 from pipeline.estimation import Input, Problem, ambiguity, fit_model
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
+from pipeline.estimation.context import Budget, prepare
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
-from pipeline.estimation.selection import Budget, CandidateModel, Selection, open_selection, prepare
+from pipeline.estimation.selection import CandidateModel, Selection, open_selection
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -268,9 +269,9 @@ def test_a_restart_that_promises_no_better_model_ends_early(
     monkeypatch.setattr(part, "find_residuals", count)
     assert restart(selection, found) is found
     early = len(predictions)
-    monkeypatch.setattr(selection, "enter_each", lambda states, *_: enter_each(states))
+    monkeypatch.setattr(selection, "approach_each", lambda _, states, __: enter_each(states))
     assert restart(selection, found) is found
-    assert early < len(predictions) - early
+    assert early < 0.5 * (len(predictions) - early)
 
 
 def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path: Path) -> None:
@@ -313,7 +314,10 @@ def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(
     idle = selection.enter(ideal.state.add(find_effect("lateral_skid")().make_usual(selection.largest)))
     asked = list[float]()
 
-    def note(_base: CandidateModel, _evidence: object, _least: float, useful: float) -> list[CandidateModel]:
+    def note(
+        _base: CandidateModel, _evidence: object, _least: float, useful: float, *, pairs: bool
+    ) -> list[CandidateModel]:
+        assert pairs
         asked.append(useful)
         return []
 

@@ -126,18 +126,21 @@ def test_undecided_are_rivals_of_as_many_numbers_once_each(
 
     def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
         rest = np.full((4, 3), residual)
-        return SimpleNamespace(ids=ids, held=rest, score=1.0, fit=SimpleNamespace(residual=rest))
+        fit = SimpleNamespace(residual=rest)
+        return SimpleNamespace(ids=ids, held=rest, score=1.0, fit=fit, is_rough=False)
 
     final = model(("transport_delay",), 1.0)
     final.state = SimpleNamespace(effects=(effect,))
     largest = SimpleNamespace(is_one_motion=False)
+    weights = SimpleNamespace(scale=1.0)
+    models = [model((name,), 1.0) for name in others]
     selection = SimpleNamespace(
         drop=lambda *_: model((), 0.0),
         loss=lambda _: 1.0,
-        rivals={(final.ids, ("transport_delay",), ()): [model((name,), 1.0) for name in others]},
+        rivals={(final.ids, ("transport_delay",)): SimpleNamespace(weights=weights, models=models)},
         given=frozenset(),
         budget=SimpleNamespace(is_spent=lambda: False),
-        weights=SimpleNamespace(scale=1.0),
+        weights=weights,
         candidates=tuple(map(find_effect, others)),
         largest=largest,
     )
