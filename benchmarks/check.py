@@ -32,14 +32,14 @@ from closed_loop import close_loop
 from draw import draw_riddle
 from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.diagnose import Recording
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import Check, compare, find_usual_spread
-from pipeline.job.check_numbers import ERRORS, RunReading
 from pipeline.job.check_sides import Sides, read_under, unite_effects
 from pipeline.job.run_results import find_diagnosis
+from pipeline.job.stored_fits import ERRORS, RunReading
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

@@ -22,7 +22,7 @@ from json_lines import read_rows
 from pipeline.core.arrays import Floats
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
 from pipeline.job.check import find_usual_spread
-from pipeline.job.check_numbers import ERRORS, USUAL_LOG_RATIO
+from pipeline.job.stored_fits import ERRORS, USUAL_LOG_RATIO
 from pipeline.models.catalogue import find_effect
 
 KINDS = ("closed", "natural", "sets")

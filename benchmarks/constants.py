@@ -20,7 +20,7 @@ from pathlib import Path
 
 from house import list_constants, read_sources
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 

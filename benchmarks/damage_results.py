@@ -23,11 +23,11 @@ from pipeline.batch import Request
 from pipeline.batch.season import run_batch
 from pipeline.job import Options
 from pipeline.simulate import simulate_case
-from pipeline.store import Mirror, Store
+from pipeline.store import Store
 from pipeline.store import verification as room
-from pipeline.store.files import do_nothing
+from pipeline.store.files import MANIFEST, do_nothing
 from pipeline.store.listing import entry_name
-from pipeline.store.manifest import MANIFEST
+from pipeline.store.mirror import Mirror
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping

@@ -26,7 +26,7 @@ from typing import Any
 STAGES = {
     "import modules": ("_frozen_importlib._find_and_load",),
     "read the log, its stages, store": ("pipeline.job.analyze.analyze_log",),
-    "pages of the results folder": ("pipeline.report.page.write_page",),
+    "pages of the results folder": ("pipeline.report.write_page",),
     "read the tables": ("pipeline.job.run_results.read_recording", "pipeline.run.recording.load_run"),
     "make runs ready": ("pipeline.estimation.problem.Problem.__init__",),
     "noise of residuals by any input": ("pipeline.estimation.parts.measure_noise",),
@@ -138,7 +138,7 @@ def print_stages(command: list[str]) -> None:
             if not path.startswith("_"):
                 owner, name, function = _find(path)
                 _replace(owner, name, function, watch.wrap(stage, function))
-    main = import_module("pipeline.cli.app").main
+    main = import_module("pipeline.cli").main
     sys.argv = ["slip", *command]
     try:
         main()

@@ -22,14 +22,14 @@ from typing import TYPE_CHECKING, Literal, cast
 import numpy as np
 import polars as pl
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import hold_out, score
 from pipeline.estimation.learning import fit_with_prior
 from pipeline.estimation.problem import Problem
 from pipeline.job.compared_runs import read_digest
-from pipeline.job.fleet_evidence import forecast_deployment
+from pipeline.job.next_drive import forecast_deployment
 from pipeline.job.prediction import find_estimates, predict_deployment
 from pipeline.models.model import Model
 from pipeline.report.motion_view import load_motion_run, load_vehicle

@@ -30,7 +30,7 @@ VERBS = (
         "map",
     ),
 )
-PROGRAM = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
+PROGRAM = "import sys; from pipeline.cli import main; main(sys.argv[1:])"
 
 
 def main() -> None:

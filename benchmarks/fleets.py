@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
 from motion_runs import make_scenario, tables_of, vehicle_of
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.diagnose import Recording
 from pipeline.fleet.confidence import Interval

@@ -26,7 +26,7 @@ from unittest.mock import patch
 from injections import Drive, Injection, list_injections
 from json_lines import add_row, read_rows
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import Input, Problem, diagnose_runs, fit_model
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.error_regions import format_enough

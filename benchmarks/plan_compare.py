@@ -32,7 +32,7 @@ from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.learning import Curve, find_goal, last_until, narrow_intervals
 from pipeline.estimation.parts import count_seconds
 from pipeline.models import Model, find_effect
-from pipeline.plan.manoeuvres import LEAD_S, RATE_HZ, choose_limits, parse_area
+from pipeline.plan import LEAD_S, RATE_HZ, choose_limits, parse_area
 from pipeline.plan.plan import Request, find_largest, make_plan
 from pipeline.plan.questions import DECIDED_T, Question, Separation, ask_numbers
 from pipeline.plan.rehearsal import assume, learn

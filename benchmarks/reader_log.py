@@ -8,8 +8,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from pipeline.logs import definition_text
-from pipeline.logs.encode import encode_rows
 from pipeline.logs.schema import parse_msg
+from pipeline.logs.writer import encode_rows
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from pipeline.logs.encode import Given
+    from pipeline.logs.writer import Given
 
 IMAGE = """std_msgs/Header header
 uint32 height

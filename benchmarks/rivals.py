@@ -29,8 +29,8 @@ import numpy as np
 from json_lines import add_row, read_rows
 from threadpoolctl import threadpool_limits
 
+from pipeline.core import SlipError, format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError, format_share
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step

@@ -15,7 +15,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.fleet.levels import split_levels
 from pipeline.job import Options

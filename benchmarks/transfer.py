@@ -26,8 +26,8 @@ import numpy as np
 import polars as pl
 from scipy.optimize import minimize
 
+from pipeline.core import NORMAL_95, SlipError
 from pipeline.core.arrays import Floats
-from pipeline.core.program import NORMAL_95, SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import score
@@ -36,7 +36,7 @@ from pipeline.estimation.parts import WheelPart, average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, list_held
 from pipeline.job.compared_runs import read_digest
-from pipeline.job.fleet_evidence import forecast_deployment
+from pipeline.job.next_drive import forecast_deployment
 from pipeline.job.prediction import find_estimates
 from pipeline.models.effect import Effect, Late
 from pipeline.models.filters import lag_signal

@@ -22,11 +22,10 @@ from pipeline.core.arrays import Floats
 from pipeline.export import export_model
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.stored import read_runs
+from pipeline.job.stored_fits import read_runs
 from pipeline.job.twin_replay import SIDES, TwinReplay, find_run_model, replay_twin
 from pipeline.models.model_file import ModelFile
-from pipeline.simulate import Drive, Scenario, simulate_case
-from pipeline.simulate.cases import make_scenario, write_log
+from pipeline.simulate import Drive, Scenario, make_scenario, simulate_case, write_log
 from pipeline.simulate.drivetrain import apply_ideal_model
 from pipeline.simulate.facts import resolve_effects
 from pipeline.simulate.messages import Truth, ask_wheels, record_truth

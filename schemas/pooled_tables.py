@@ -6,8 +6,8 @@ from typing import ClassVar
 import dataframely as dy
 import polars as pl
 
-from schemas import contract
-from schemas.contract import Table
+import schemas
+from schemas import Table
 
 
 class Datasets(Table):
@@ -19,38 +19,38 @@ class Datasets(Table):
 
     VERSION: ClassVar[int] = 3
 
-    by = contract.text("columns that define a dataset, for example `dataset` or `vehicle,terrain`")
-    input = contract.source()
-    runs = contract.count("number of runs", 1)
-    samples = contract.count("time steps of all runs")
-    windows = contract.count("2 s windows of all runs", nullable=True)
-    distance = contract.optional("m", "distance driven in all runs")
-    duration = contract.optional("s", "time covered by all runs")
-    length_scale = contract.optional("m", "L that turns yaw rate into speed in the slip speed")
-    median_modulus = contract.optional("m/s", "median over runs of the runs' median slip speed")
-    low = contract.optional("m/s", "lower end of the 95 % interval of the typical median slip speed")
-    high = contract.optional("m/s", "upper end of it")
-    interval = contract.text("what the interval says: over runs, or within this run only; empty without one")
-    median_window_norm = contract.optional("m/s", "median over runs of the runs' median window norm")
-    norm_low = contract.optional("m/s", "lower end of the 95 % interval of the typical window norm")
-    norm_high = contract.optional("m/s", "upper end of it")
-    published_norm = contract.optional("m/s", "median window norm of the published chain")
-    transitory_median_modulus = contract.optional("m/s", "after a change of command")
-    steady_median_modulus = contract.optional("m/s", "away from changes of command")
-    drivetrain_mean_square = contract.optional("m^2/s^2", "of f(command) - f(measured wheels)")
-    ground_mean_square = contract.optional("m^2/s^2", "of f(measured wheels) - v")
-    cross_mean_square = contract.optional("m^2/s^2", "twice the mean product of the two parts")
-    height_rate = contract.optional("m/s", "height variation per second")
-    largest_kinetic_energy = contract.optional("J", "largest 1/2 m v^2 of any run")
-    relative_slip = contract.optional("1", "median slip speed over ideal speed, while it moves")
-    slip_energy = contract.optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
-    lost_energy = contract.optional(
+    by = schemas.text("columns that define a dataset, for example `dataset` or `vehicle,terrain`")
+    input = schemas.source()
+    runs = schemas.count("number of runs", 1)
+    samples = schemas.count("time steps of all runs")
+    windows = schemas.count("2 s windows of all runs", nullable=True)
+    distance = schemas.optional("m", "distance driven in all runs")
+    duration = schemas.optional("s", "time covered by all runs")
+    length_scale = schemas.optional("m", "L that turns yaw rate into speed in the slip speed")
+    median_modulus = schemas.optional("m/s", "median over runs of the runs' median slip speed")
+    low = schemas.optional("m/s", "lower end of the 95 % interval of the typical median slip speed")
+    high = schemas.optional("m/s", "upper end of it")
+    interval = schemas.text("what the interval says: over runs, or within this run only; empty without one")
+    median_window_norm = schemas.optional("m/s", "median over runs of the runs' median window norm")
+    norm_low = schemas.optional("m/s", "lower end of the 95 % interval of the typical window norm")
+    norm_high = schemas.optional("m/s", "upper end of it")
+    published_norm = schemas.optional("m/s", "median window norm of the published chain")
+    transitory_median_modulus = schemas.optional("m/s", "after a change of command")
+    steady_median_modulus = schemas.optional("m/s", "away from changes of command")
+    drivetrain_mean_square = schemas.optional("m^2/s^2", "of f(command) - f(measured wheels)")
+    ground_mean_square = schemas.optional("m^2/s^2", "of f(measured wheels) - v")
+    cross_mean_square = schemas.optional("m^2/s^2", "twice the mean product of the two parts")
+    height_rate = schemas.optional("m/s", "height variation per second")
+    largest_kinetic_energy = schemas.optional("J", "largest 1/2 m v^2 of any run")
+    relative_slip = schemas.optional("1", "median slip speed over ideal speed, while it moves")
+    slip_energy = schemas.optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
+    lost_energy = schemas.optional(
         "1", "slip path over path driven: energy lost per metre and mass, over mu g"
     )
-    unpredictability = contract.optional("m/s", "rms slip that a fitted slip model leaves, held out")
-    relative_unpredictability = contract.optional("1", "unpredictability over rms ideal speed")
-    transitory_slip = contract.optional("m", "slip path a change of command adds to the steady one")
-    keys = contract.text("run/generation of every run counted, separated by spaces")
+    unpredictability = schemas.optional("m/s", "rms slip that a fitted slip model leaves, held out")
+    relative_unpredictability = schemas.optional("1", "unpredictability over rms ideal speed")
+    transitory_slip = schemas.optional("m", "slip path a change of command adds to the steady one")
+    keys = schemas.text("run/generation of every run counted, separated by spaces")
 
 
 UNITS = ("runs", "blocks")
@@ -61,28 +61,28 @@ class Comparisons(Table):
 
     VERSION: ClassVar[int] = 1
 
-    by = contract.text("columns that define a dataset")
-    input = contract.source()
-    quantity = contract.text("what is compared: median_modulus, or published_norm with --as-published")
-    a = contract.text("one dataset")
-    b = contract.text("the other")
-    runs_a = contract.count("runs of a", 1)
-    runs_b = contract.count("runs of b", 1)
-    shift = contract.number("m/s", "Hodges-Lehmann shift b - a of the units")
-    low = contract.optional("m/s", "lower end of its 95 % interval")
-    high = contract.optional("m/s", "upper end of it")
-    cliffs_delta = contract.bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
-    size = contract.text("Cliff's delta in a word")
-    p = contract.bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
-    p_adjusted = contract.bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
-    smallest_p = contract.bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
-    method = contract.text("test and correction")
-    unit_of_analysis = contract.choice(UNITS, "what is permuted: runs, or blocks of single runs")
-    p_uncorrected = contract.bounded(
+    by = schemas.text("columns that define a dataset")
+    input = schemas.source()
+    quantity = schemas.text("what is compared: median_modulus, or published_norm with --as-published")
+    a = schemas.text("one dataset")
+    b = schemas.text("the other")
+    runs_a = schemas.count("runs of a", 1)
+    runs_b = schemas.count("runs of b", 1)
+    shift = schemas.number("m/s", "Hodges-Lehmann shift b - a of the units")
+    low = schemas.optional("m/s", "lower end of its 95 % interval")
+    high = schemas.optional("m/s", "upper end of it")
+    cliffs_delta = schemas.bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
+    size = schemas.text("Cliff's delta in a word")
+    p = schemas.bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
+    p_adjusted = schemas.bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
+    smallest_p = schemas.bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
+    method = schemas.text("test and correction")
+    unit_of_analysis = schemas.choice(UNITS, "what is permuted: runs, or blocks of single runs")
+    p_uncorrected = schemas.bounded(
         "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
     )
-    note = contract.text("remarks on the row; may be empty")
-    keys = contract.text("run/generation of every run counted, separated by spaces")
+    note = schemas.text("remarks on the row; may be empty")
+    keys = schemas.text("run/generation of every run counted, separated by spaces")
 
 
 LEVELS = ("vehicle", "terrain", "run", "open")
@@ -96,24 +96,24 @@ class Fleet(Table):
 
     VERSION: ClassVar[int] = 1
 
-    effect = contract.name("id of the effect")
-    parameter = contract.name("name of the parameter")
-    unit = contract.text("unit of value, low, high and the spreads")
-    level = contract.choice(
+    effect = schemas.name("id of the effect")
+    parameter = schemas.name("name of the parameter")
+    unit = schemas.text("unit of value, low, high and the spreads")
+    level = schemas.choice(
         LEVELS, "level of the number: vehicle, terrain or run; open where the runs do not determine it"
     )
-    name = contract.text("what the effect is called at that level; all candidates where it is open")
-    because = contract.text("why that level, or which runs would determine it")
-    value = contract.number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
-    low = contract.optional("1", "lower end of its 95 % interval")
-    high = contract.optional("1", "upper end of it")
-    spread_terrain = contract.optional("1", "standard deviation between terrains")
-    spread_run = contract.optional("1", "standard deviation between runs of a terrain")
-    chi_square = contract.optional("1", "scatter of runs over what their errors say")
-    p_terrain = contract.optional("1", "p value of equal terrains")
-    runs = contract.count("runs behind the value", 1)
-    named = contract.count("runs whose diagnosis names the effect", nullable=True)
-    keys = contract.text("run/generation of every run counted, separated by spaces")
+    name = schemas.text("what the effect is called at that level; all candidates where it is open")
+    because = schemas.text("why that level, or which runs would determine it")
+    value = schemas.number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
+    low = schemas.optional("1", "lower end of its 95 % interval")
+    high = schemas.optional("1", "upper end of it")
+    spread_terrain = schemas.optional("1", "standard deviation between terrains")
+    spread_run = schemas.optional("1", "standard deviation between runs of a terrain")
+    chi_square = schemas.optional("1", "scatter of runs over what their errors say")
+    p_terrain = schemas.optional("1", "p value of equal terrains")
+    runs = schemas.count("runs behind the value", 1)
+    named = schemas.count("runs whose diagnosis names the effect", nullable=True)
+    keys = schemas.text("run/generation of every run counted, separated by spaces")
 
 
 _NAME = r"^[^\x00-\x1f\x7f/\\]{1,120}$"
@@ -212,7 +212,7 @@ def _status(of: str) -> dy.Enum:
     return dy.Enum(STATUSES, nullable=True, metadata={"description": f"how well {of} is known"})
 
 
-_number = partial(contract.bounded, nullable=True)
+_number = partial(schemas.bounded, nullable=True)
 
 
 class Deployments(dy.Schema):
@@ -228,7 +228,7 @@ class Deployments(dy.Schema):
     citation_status = _status("the citation")
     vehicle = _deployment_text("vehicle")
     vehicle_status = _status("the vehicle")
-    drive = contract.choice(DRIVES, "how it steers")
+    drive = schemas.choice(DRIVES, "how it steers")
     model_type = dy.Enum(MODELS, nullable=True, metadata={"description": "kind of motion model; the marker"})
     model = _deployment_text("the model in a few words")
     model_status = _status("the model")
@@ -299,20 +299,20 @@ class Cells(Table):
 
     VERSION: ClassVar[int] = 1
 
-    frame = contract.name("in which x and y are: a place on Earth, a map that runs share, or one run's own")
-    input = contract.source()
-    cell = contract.bounded("m", "side of the cell", 0.0)
-    x = contract.number("m", "middle of the cell, east on Earth", frame="map")
-    y = contract.number("m", "middle of the cell, north on Earth", frame="map")
-    latitude = contract.optional("deg", "of the middle; null in a frame that is not on Earth")
-    longitude = contract.optional("deg", "of the middle; null in a frame that is not on Earth")
-    passes = contract.count("crossings of the cell by all runs", 1)
-    runs = contract.count("runs that crossed it", 1)
-    slip = contract.bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
-    slip_low = contract.optional("1", "lower quartile of it over crossings; null of a single one")
-    slip_high = contract.optional("1", "upper quartile")
-    modulus = contract.bounded("m/s", "slip speed, median over crossings", 0.0)
-    energy = contract.optional("J", "kinetic energy of the slip velocity, median; null without a mass")
-    lean = contract.optional("rad", "inclination of the vehicle, median; null where it was not measured")
-    power = contract.optional("W", "drawn from the battery, median; null where the log does not say")
-    keys = contract.text("run/generation of every run counted, separated by spaces")
+    frame = schemas.name("in which x and y are: a place on Earth, a map that runs share, or one run's own")
+    input = schemas.source()
+    cell = schemas.bounded("m", "side of the cell", 0.0)
+    x = schemas.number("m", "middle of the cell, east on Earth", frame="map")
+    y = schemas.number("m", "middle of the cell, north on Earth", frame="map")
+    latitude = schemas.optional("deg", "of the middle; null in a frame that is not on Earth")
+    longitude = schemas.optional("deg", "of the middle; null in a frame that is not on Earth")
+    passes = schemas.count("crossings of the cell by all runs", 1)
+    runs = schemas.count("runs that crossed it", 1)
+    slip = schemas.bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
+    slip_low = schemas.optional("1", "lower quartile of it over crossings; null of a single one")
+    slip_high = schemas.optional("1", "upper quartile")
+    modulus = schemas.bounded("m/s", "slip speed, median over crossings", 0.0)
+    energy = schemas.optional("J", "kinetic energy of the slip velocity, median; null without a mass")
+    lean = schemas.optional("rad", "inclination of the vehicle, median; null where it was not measured")
+    power = schemas.optional("W", "drawn from the battery, median; null where the log does not say")
+    keys = schemas.text("run/generation of every run counted, separated by spaces")

@@ -7,8 +7,8 @@ from typing import ClassVar
 import dataframely as dy
 import polars as pl
 
-from schemas import contract
-from schemas.contract import Table
+import schemas
+from schemas import Table
 
 
 class Commands(Table):
@@ -16,32 +16,32 @@ class Commands(Table):
 
     VERSION: ClassVar[int] = 3
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    log_time = contract.log_time()
-    left = contract.optional("rad/s", "commanded speed of the left wheels")
-    right = contract.optional("rad/s", "commanded speed of the right wheels")
-    speed = contract.body("m/s", "commanded speed (Ackermann)", nullable=True)
-    steering = contract.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
-    sideways = contract.optional(
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    log_time = schemas.log_time()
+    left = schemas.optional("rad/s", "commanded speed of the left wheels")
+    right = schemas.optional("rad/s", "commanded speed of the right wheels")
+    speed = schemas.body("m/s", "commanded speed (Ackermann)", nullable=True)
+    steering = schemas.body("rad", "commanded steering angle (Ackermann), left positive", nullable=True)
+    sideways = schemas.optional(
         "rad/s", "commanded speed of the wheels that moves to the left (mecanum, omni)"
     )
-    body_x = contract.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
-    body_y = contract.body(
+    body_x = schemas.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
+    body_y = schemas.body(
         "m/s", "commanded speed to the left where the command is a Twist (mecanum, omni)", nullable=True
     )
-    body_w = contract.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
-    left_aligned = contract.optional("rad/s", "speed of the left wheels after corrections")
-    right_aligned = contract.optional("rad/s", "speed of the right wheels after corrections")
-    sideways_aligned = contract.optional(
+    body_w = schemas.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
+    left_aligned = schemas.optional("rad/s", "speed of the left wheels after corrections")
+    right_aligned = schemas.optional("rad/s", "speed of the right wheels after corrections")
+    sideways_aligned = schemas.optional(
         "rad/s", "speed of the wheels that moves to the left after corrections"
     )
-    speed_aligned = contract.body("m/s", "speed after corrections (Ackermann)", nullable=True)
-    active = contract.flag("inside an interval in which commands are live")
+    speed_aligned = schemas.body("m/s", "speed after corrections (Ackermann)", nullable=True)
+    active = schemas.flag("inside an interval in which commands are live")
 
     @dy.rule()
     def drive_is_complete(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
-        return contract.drive_is_complete()
+        return schemas.drive_is_complete()
 
 
 class Wheels(Table):
@@ -49,22 +49,22 @@ class Wheels(Table):
 
     VERSION: ClassVar[int] = 3
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    log_time = contract.log_time()
-    left = contract.optional("rad/s", "measured speed of the left wheels, mean of the side")
-    right = contract.optional("rad/s", "measured speed of the right wheels, mean of the side")
-    speed = contract.body("m/s", "measured speed (Ackermann)", nullable=True)
-    steering = contract.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
-    sideways = contract.optional(
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    log_time = schemas.log_time()
+    left = schemas.optional("rad/s", "measured speed of the left wheels, mean of the side")
+    right = schemas.optional("rad/s", "measured speed of the right wheels, mean of the side")
+    speed = schemas.body("m/s", "measured speed (Ackermann)", nullable=True)
+    steering = schemas.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
+    sideways = schemas.optional(
         "rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)"
     )
-    latency = contract.number("s", "delay of the encoders: they describe t - latency", frame="log clock")
-    active = contract.flag("inside an interval in which commands are live")
+    latency = schemas.number("s", "delay of the encoders: they describe t - latency", frame="log clock")
+    active = schemas.flag("inside an interval in which commands are live")
 
     @dy.rule()
     def drive_is_complete(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
-        return contract.drive_is_complete()
+        return schemas.drive_is_complete()
 
 
 UNIT_TOLERANCE = 1e-6
@@ -75,18 +75,18 @@ class Poses(Table):
 
     VERSION: ClassVar[int] = 2
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    log_time = contract.log_time()
-    segment = contract.segment()
-    x, y, z = contract.vector("m", "position of base_link", "map")
-    q_x, q_y, q_z, q_w = contract.vector("1", "quaternion of base_link", "map", 4)
-    latency = contract.number(
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    log_time = schemas.log_time()
+    segment = schemas.segment()
+    x, y, z = schemas.vector("m", "position of base_link", "map")
+    q_x, q_y, q_z, q_w = schemas.vector("1", "quaternion of base_link", "map", 4)
+    latency = schemas.number(
         "s", "delay of this pose against the gyro: it belongs to t - latency", frame="log clock"
     )
-    outlier = contract.flag("in an incident, or the localization is at fault: left out of medians and fits")
-    held = contract.flag("repeats the pose before it: an old estimate sampled again")
-    active = contract.flag("inside an interval in which commands are live")
+    outlier = schemas.flag("in an incident, or the localization is at fault: left out of medians and fits")
+    held = schemas.flag("repeats the pose before it: an old estimate sampled again")
+    active = schemas.flag("inside an interval in which commands are live")
 
     @dy.rule()
     def quaternion_has_unit_length(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
@@ -99,12 +99,12 @@ class Imu(Table):
 
     VERSION: ClassVar[int] = 1
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    log_time = contract.log_time()
-    rate_x, rate_y, rate_z = contract.vector("rad/s", "angular velocity", "imu")
-    acceleration_x, acceleration_y, acceleration_z = contract.vector("m/s^2", "specific force", "imu")
-    active = contract.flag("inside an interval in which commands are live")
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    log_time = schemas.log_time()
+    rate_x, rate_y, rate_z = schemas.vector("rad/s", "angular velocity", "imu")
+    acceleration_x, acceleration_y, acceleration_z = schemas.vector("m/s^2", "specific force", "imu")
+    active = schemas.flag("inside an interval in which commands are live")
 
 
 class Power(Table):
@@ -112,13 +112,13 @@ class Power(Table):
 
     VERSION: ClassVar[int] = 1
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    log_time = contract.log_time()
-    current = contract.number("A", "current that the drive draws, all its motors; below zero it feeds back")
-    voltage = contract.optional("V", "voltage of the battery")
-    power = contract.optional("W", "current times voltage")
-    energy_per_m = contract.optional(
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    log_time = schemas.log_time()
+    current = schemas.number("A", "current that the drive draws, all its motors; below zero it feeds back")
+    voltage = schemas.optional("V", "voltage of the battery")
+    power = schemas.optional("W", "current times voltage")
+    energy_per_m = schemas.optional(
         "J/m", "power over the speed over ground within 0.5 s before and after; null below 0.1 m/s"
     )
 
@@ -128,30 +128,30 @@ class Alignments(Table):
 
     VERSION: ClassVar[int] = 3
 
-    hold_time = contract.optional("s", "the controller stops this long after its last command")
-    command_scale = contract.number("1", "factor by which the recorded command was multiplied")
-    track_multiplier = contract.number(
+    hold_time = schemas.optional("s", "the controller stops this long after its last command")
+    command_scale = schemas.number("1", "factor by which the recorded command was multiplied")
+    track_multiplier = schemas.number(
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
     )
-    gyro_scale = contract.optional(
+    gyro_scale = schemas.optional(
         "1", "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro"
     )
-    gyro_bias = contract.optional("rad/s", "yaw rate of the vehicle where the scaled gyro says zero")
-    heading_delay = contract.optional(
+    gyro_bias = schemas.optional("rad/s", "yaw rate of the vehicle where the scaled gyro says zero")
+    heading_delay = schemas.optional(
         "s", "delay of the reported heading against the gyro: part of every latency of the poses"
     )
-    heading_delay_error = contract.optional("s", "standard error of that delay")
-    wheel_delay = contract.number("s", "delay of the encoders against the gyro: the latency of the wheels")
-    gyro_residual = contract.optional("1", "yaw rate that differs from the gyro's, as a share of it")
-    gyro_delay = contract.optional(
+    heading_delay_error = schemas.optional("s", "standard error of that delay")
+    wheel_delay = schemas.number("s", "delay of the encoders against the gyro: the latency of the wheels")
+    gyro_residual = schemas.optional("1", "yaw rate that differs from the gyro's, as a share of it")
+    gyro_delay = schemas.optional(
         "s", "delay of the gyro against the poses, where it is within half of its sampling period"
     )
-    latency_spread = contract.number("s", "standard deviation of the latencies that were taken off the poses")
-    outlier_time = contract.number("s", "time in which the localization contradicts the wheels")
-    recorded_modulus_command = contract.optional(
+    latency_spread = schemas.number("s", "standard deviation of the latencies that were taken off the poses")
+    outlier_time = schemas.number("s", "time in which the localization contradicts the wheels")
+    recorded_modulus_command = schemas.optional(
         "m/s", "median slip speed (L = 1 m) from commands as recorded, before any correction"
     )
-    recorded_modulus_measured = contract.optional("m/s", "the same from wheel encoders")
+    recorded_modulus_measured = schemas.optional("m/s", "the same from wheel encoders")
 
 
 EVENT_KINDS = (
@@ -165,17 +165,17 @@ class Events(Table):
 
     VERSION: ClassVar[int] = 1
 
-    kind = contract.choice(EVENT_KINDS, "what happened")
-    t_start = contract.seconds("when it began")
-    t_end = contract.seconds("when it ended")
-    t_known = contract.seconds("when the signals up to then first showed it")
-    size = contract.optional(
+    kind = schemas.choice(EVENT_KINDS, "what happened")
+    t_start = schemas.seconds("when it began")
+    t_end = schemas.seconds("when it ended")
+    t_known = schemas.seconds("when the signals up to then first showed it")
+    size = schemas.optional(
         "1",
         "largest share of the wheels' usual motion that the body did not make; when sliding, of the body's "
         "motion that the wheels did not make; null of incidents",
     )
-    x = contract.number("m", "position of base_link where it began", frame="map")
-    y = contract.number("m", "position of base_link where it began", frame="map")
+    x = schemas.number("m", "position of base_link where it began", frame="map")
+    y = schemas.number("m", "position of base_link where it began", frame="map")
 
 
 SEVERITIES = ("info", "warning", "error")
@@ -186,15 +186,15 @@ class Findings(Table):
 
     VERSION: ClassVar[int] = 1
 
-    stage = contract.text("stage that noticed it")
+    stage = schemas.text("stage that noticed it")
     id = dy.String(min_length=1, regex=r"^[a-z][a-z0-9_]*$", metadata={"description": "stable id"})
-    severity = contract.choice(SEVERITIES, "info, warning, or error: do not trust results")
-    text = contract.name("the finding in one sentence")
-    where = contract.text("topic, column or stretch of time; empty for the whole run")
-    t_start = contract.optional("s", "start of the stretch it concerns")
-    t_end = contract.optional("s", "end of the stretch it concerns")
-    value = contract.optional("1", "the number behind it, in the unit the text gives")
-    count = contract.count("how often", nullable=True)
+    severity = schemas.choice(SEVERITIES, "info, warning, or error: do not trust results")
+    text = schemas.name("the finding in one sentence")
+    where = schemas.text("topic, column or stretch of time; empty for the whole run")
+    t_start = schemas.optional("s", "start of the stretch it concerns")
+    t_end = schemas.optional("s", "end of the stretch it concerns")
+    value = schemas.optional("1", "the number behind it, in the unit the text gives")
+    count = schemas.count("how often", nullable=True)
 
 
 class Velocities(Table):
@@ -202,18 +202,18 @@ class Velocities(Table):
 
     VERSION: ClassVar[int] = 2
 
-    t = contract.seconds()
-    stamp = contract.stamp()
-    segment = contract.segment()
-    x, y, z = contract.vector("m", "position of base_link", "map")
-    roll = contract.number("rad", "roll of base_link", frame="map")
-    pitch = contract.number("rad", "pitch of base_link, nose down positive", frame="map")
-    yaw = contract.number("rad", "yaw of base_link, unwrapped inside a segment", frame="map")
-    v_x = contract.body("m/s", "body velocity forward")
-    v_y = contract.body("m/s", "body velocity to the left")
-    v_w = contract.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
-    v_w_imu = contract.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
-    outlier = contract.flag("in an incident, or the localization is at fault")
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    segment = schemas.segment()
+    x, y, z = schemas.vector("m", "position of base_link", "map")
+    roll = schemas.number("rad", "roll of base_link", frame="map")
+    pitch = schemas.number("rad", "pitch of base_link, nose down positive", frame="map")
+    yaw = schemas.number("rad", "yaw of base_link, unwrapped inside a segment", frame="map")
+    v_x = schemas.body("m/s", "body velocity forward")
+    v_y = schemas.body("m/s", "body velocity to the left")
+    v_w = schemas.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
+    v_w_imu = schemas.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
+    outlier = schemas.flag("in an incident, or the localization is at fault")
 
 
 class Slip(Table):
@@ -221,34 +221,34 @@ class Slip(Table):
 
     VERSION: ClassVar[int] = 2
 
-    input = contract.source()
-    t = contract.seconds()
-    stamp = contract.stamp()
-    segment = contract.segment()
-    step = contract.step()
-    transitory = contract.flag("within the transitory span after a change of command")
-    f_x = contract.body("m/s", "ideal velocity forward")
-    f_y = contract.body("m/s", "ideal velocity to the left")
-    f_w = contract.body("rad/s", "ideal yaw rate")
-    v_x = contract.body("m/s", "measured velocity forward")
-    v_y = contract.body("m/s", "measured velocity to the left")
-    v_w = contract.body("rad/s", "measured yaw rate")
-    g_x = contract.body("m/s", "slip forward")
-    g_y = contract.body("m/s", "slip to the left")
-    g_w = contract.body("rad/s", "slip in yaw rate")
+    input = schemas.source()
+    t = schemas.seconds()
+    stamp = schemas.stamp()
+    segment = schemas.segment()
+    step = schemas.step()
+    transitory = schemas.flag("within the transitory span after a change of command")
+    f_x = schemas.body("m/s", "ideal velocity forward")
+    f_y = schemas.body("m/s", "ideal velocity to the left")
+    f_w = schemas.body("rad/s", "ideal yaw rate")
+    v_x = schemas.body("m/s", "measured velocity forward")
+    v_y = schemas.body("m/s", "measured velocity to the left")
+    v_w = schemas.body("rad/s", "measured yaw rate")
+    g_x = schemas.body("m/s", "slip forward")
+    g_y = schemas.body("m/s", "slip to the left")
+    g_w = schemas.body("rad/s", "slip in yaw rate")
     modulus = dy.Float64(
         min=0.0,
         check=lambda value: value.is_finite(),
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
-    model_x = contract.body("m/s", "velocity forward of the model given with --model", nullable=True)
-    model_y = contract.body("m/s", "velocity to the left of that model", nullable=True)
-    model_w = contract.body("rad/s", "yaw rate of that model", nullable=True)
-    residual_modulus = contract.body(
+    model_x = schemas.body("m/s", "velocity forward of the model given with --model", nullable=True)
+    model_y = schemas.body("m/s", "velocity to the left of that model", nullable=True)
+    model_w = schemas.body("rad/s", "yaw rate of that model", nullable=True)
+    residual_modulus = schemas.body(
         "m/s", "norm of (model_x - v_x, model_y - v_y, L (model_w - v_w))", nullable=True
     )
-    suspect = contract.flag(
+    suspect = schemas.flag(
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
 
@@ -263,18 +263,18 @@ class Windows(Table):
 
     VERSION: ClassVar[int] = 1
 
-    input = contract.source()
-    t_start = contract.seconds("start of the window")
-    t_end = contract.seconds("end of the window")
-    segment = contract.segment()
-    step = contract.step()
-    transitory = contract.flag("most of the window lies in the transitory span of a change of command")
-    suspect = contract.flag(
+    input = schemas.source()
+    t_start = schemas.seconds("start of the window")
+    t_end = schemas.seconds("end of the window")
+    segment = schemas.segment()
+    step = schemas.step()
+    transitory = schemas.flag("most of the window lies in the transitory span of a change of command")
+    suspect = schemas.flag(
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
-    rms_modulus = contract.bounded("m/s", "root mean square of the slip speed", 0.0)
-    window_norm = contract.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
+    rms_modulus = schemas.bounded("m/s", "root mean square of the slip speed", 0.0)
+    window_norm = schemas.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
 
 
 SUBSETS = ("all", "transitory", "steady")
@@ -285,27 +285,27 @@ class Aggregates(Table):
 
     VERSION: ClassVar[int] = 2
 
-    input = contract.source()
-    subset = contract.choice(SUBSETS, "all samples, or only transitory or steady ones")
-    samples = contract.count("time steps counted")
-    windows = contract.count("2 s windows counted")
-    median_modulus = contract.optional("m/s", "median slip speed")
-    median_residual_modulus = contract.optional(
+    input = schemas.source()
+    subset = schemas.choice(SUBSETS, "all samples, or only transitory or steady ones")
+    samples = schemas.count("time steps counted")
+    windows = schemas.count("2 s windows counted")
+    median_modulus = schemas.optional("m/s", "median slip speed")
+    median_residual_modulus = schemas.optional(
         "m/s", "median slip speed of the residual of the model given with --model"
     )
-    median_window_norm = contract.optional("m/s", "median 2 s window norm")
-    rms_x = contract.optional("m/s", "root mean square of g_x")
-    rms_y = contract.optional("m/s", "root mean square of g_y")
-    rms_w = contract.optional("rad/s", "root mean square of g_w")
-    mean_square = contract.optional("m^2/s^2", "mean square of the modulus")
-    drivetrain_mean_square = contract.optional("m^2/s^2", "of f(command) - f(measured wheels)")
-    ground_mean_square = contract.optional("m^2/s^2", "of f(measured wheels) - v")
-    cross_mean_square = contract.optional("m^2/s^2", "twice the mean product of the two parts")
-    distance = contract.optional("m", "distance driven")
-    duration = contract.optional("s", "time covered by the samples")
-    height_rate = contract.optional("m/s", "height variation per second")
-    largest_kinetic_energy = contract.optional("J", "largest 1/2 m v^2; null without a mass")
-    length_scale = contract.number("m", "L that turns yaw rate into speed in the slip speed")
+    median_window_norm = schemas.optional("m/s", "median 2 s window norm")
+    rms_x = schemas.optional("m/s", "root mean square of g_x")
+    rms_y = schemas.optional("m/s", "root mean square of g_y")
+    rms_w = schemas.optional("rad/s", "root mean square of g_w")
+    mean_square = schemas.optional("m^2/s^2", "mean square of the modulus")
+    drivetrain_mean_square = schemas.optional("m^2/s^2", "of f(command) - f(measured wheels)")
+    ground_mean_square = schemas.optional("m^2/s^2", "of f(measured wheels) - v")
+    cross_mean_square = schemas.optional("m^2/s^2", "twice the mean product of the two parts")
+    distance = schemas.optional("m", "distance driven")
+    duration = schemas.optional("s", "time covered by the samples")
+    height_rate = schemas.optional("m/s", "height variation per second")
+    largest_kinetic_energy = schemas.optional("J", "largest 1/2 m v^2; null without a mass")
+    length_scale = schemas.number("m", "L that turns yaw rate into speed in the slip speed")
 
 
 KINDS = ("rung", "floor")
@@ -316,17 +316,17 @@ class Ladder(Table):
 
     VERSION: ClassVar[int] = 1
 
-    input = contract.source("input of the model")
-    kind = contract.choice(KINDS, "a model, or how well motion repeats itself")
+    input = schemas.source("input of the model")
+    kind = schemas.choice(KINDS, "a model, or how well motion repeats itself")
     rung = dy.Int32(min=0, metadata={"description": "step of the ladder; 0 is the ideal model"})
-    added = contract.text("effects that this step adds")
-    effects = contract.text("all effects of this step, in the order from command to pose")
-    rms_x = contract.body("m/s", "rms of displacement over 0.5 s, over 0.5 s: forward", nullable=True)
-    rms_y = contract.body("m/s", "the same to the left", nullable=True)
-    rms_w = contract.body("rad/s", "the same of the heading", nullable=True)
-    t_mrmse = contract.optional("m", "rms position error over windows and steps of 2 s")
-    r_mrmse = contract.optional("rad", "rms wrapped yaw error over windows and steps of 2 s")
-    explained_share = contract.optional("1", "share of the removable error that is gone")
+    added = schemas.text("effects that this step adds")
+    effects = schemas.text("all effects of this step, in the order from command to pose")
+    rms_x = schemas.body("m/s", "rms of displacement over 0.5 s, over 0.5 s: forward", nullable=True)
+    rms_y = schemas.body("m/s", "the same to the left", nullable=True)
+    rms_w = schemas.body("rad/s", "the same of the heading", nullable=True)
+    t_mrmse = schemas.optional("m", "rms position error over windows and steps of 2 s")
+    r_mrmse = schemas.optional("rad", "rms wrapped yaw error over windows and steps of 2 s")
+    explained_share = schemas.optional("1", "share of the removable error that is gone")
 
 
 QUANTITIES = ("slip", "position", "heading")
@@ -338,17 +338,17 @@ class Budget(Table):
 
     VERSION: ClassVar[int] = 1
 
-    input = contract.source()
-    quantity = contract.choice(QUANTITIES, "mean square that is divided: slip over 0.5 s, or error over 2 s")
-    kind = contract.choice(BUDGET_KINDS, "an effect, the disturbance, or the noise floor")
-    name = contract.name("id of the effect, or the kind")
-    mean_square = contract.number("1", "its part of the mean square, in the unit of the column `unit`")
-    unit = contract.text("unit of mean_square")
-    share = contract.number("1", "its part over the whole: its Shapley value over the order of effects")
-    low = contract.optional("1", "lower end of its 95 % interval, a jackknife over 10 s stretches")
-    high = contract.optional("1", "upper end of it")
-    alone = contract.optional("1", "share that the effect takes from the ideal model by itself")
-    last = contract.optional("1", "share that it takes when all others are there")
+    input = schemas.source()
+    quantity = schemas.choice(QUANTITIES, "mean square that is divided: slip over 0.5 s, or error over 2 s")
+    kind = schemas.choice(BUDGET_KINDS, "an effect, the disturbance, or the noise floor")
+    name = schemas.name("id of the effect, or the kind")
+    mean_square = schemas.number("1", "its part of the mean square, in the unit of the column `unit`")
+    unit = schemas.text("unit of mean_square")
+    share = schemas.number("1", "its part over the whole: its Shapley value over the order of effects")
+    low = schemas.optional("1", "lower end of its 95 % interval, a jackknife over 10 s stretches")
+    high = schemas.optional("1", "upper end of it")
+    alone = schemas.optional("1", "share that the effect takes from the ideal model by itself")
+    last = schemas.optional("1", "share that it takes when all others are there")
     stretches = dy.Int32(min=0, metadata={"description": "stretches of 10 s behind the interval"})
 
 
@@ -357,14 +357,14 @@ class Parameters(Table):
 
     VERSION: ClassVar[int] = 2
 
-    input = contract.source()
-    effect = contract.name("id of the effect")
-    parameter = contract.name("name of the parameter")
-    value = contract.number("1", "its value, in the unit of the column `unit`")
-    low = contract.optional("1", "lower end of its 95 % interval")
-    high = contract.optional("1", "upper end of it")
-    unit = contract.text("unit of value, low and high")
-    at_bound = contract.flag("the fit stopped at a bound of the search: the interval is not meaningful")
+    input = schemas.source()
+    effect = schemas.name("id of the effect")
+    parameter = schemas.name("name of the parameter")
+    value = schemas.number("1", "its value, in the unit of the column `unit`")
+    low = schemas.optional("1", "lower end of its 95 % interval")
+    high = schemas.optional("1", "upper end of it")
+    unit = schemas.text("unit of value, low and high")
+    at_bound = schemas.flag("the fit stopped at a bound of the search: the interval is not meaningful")
 
 
 class Estimates(Table):
@@ -372,14 +372,14 @@ class Estimates(Table):
 
     VERSION: ClassVar[int] = 3
 
-    input = contract.source()
-    effect = contract.name("id of the effect")
-    parameter = contract.name("name of the parameter")
-    unit = contract.text("unit of value and standard_error")
-    value = contract.number("1", "its estimate, in the unit of the column `unit`")
-    standard_error = contract.bounded("1", "half of its 95 % interval over 1.96", 0.0)
-    named = contract.flag(
+    input = schemas.source()
+    effect = schemas.name("id of the effect")
+    parameter = schemas.name("name of the parameter")
+    unit = schemas.text("unit of value and standard_error")
+    value = schemas.number("1", "its estimate, in the unit of the column `unit`")
+    standard_error = schemas.bounded("1", "half of its 95 % interval over 1.96", 0.0)
+    named = schemas.flag(
         "the diagnosis names the effect; else the estimate is what one step of a joint fit gives"
     )
-    at_bound = contract.flag("the fit stopped at a bound of the search: the error is not meaningful")
-    in_model = contract.flag("the run's written model holds the effect: one of each undecided group, too")
+    at_bound = schemas.flag("the fit stopped at a bound of the search: the error is not meaningful")
+    in_model = schemas.flag("the run's written model holds the effect: one of each undecided group, too")

@@ -30,7 +30,7 @@ from draw import CATEGORIES, Answer, draw_riddle, open_seal, write_riddle
 from play import parse_seeds
 from score import score_runs
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

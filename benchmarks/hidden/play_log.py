@@ -18,7 +18,7 @@ from records import Job, Record, describe_scene
 from score import score_runs
 from truth import Json, check_models
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -17,10 +17,9 @@ from draw import Answer  # noqa: TC002 - it runs as a script, too
 from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out
 from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.folds import measure_errors
-from pipeline.models import Effect, Model, ModelFile, find_effect
+from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.effect import Late, find_late
 from pipeline.models.model_file import parse_model
-from pipeline.models.model_text import format_model
 from pipeline.run import HeadingSource, MotionError
 from pipeline.sources import Vehicle
 

@@ -20,7 +20,7 @@ from answer_simple import drive_ideally, write_answers
 from read_task import Read, predict_windows, walk_velocities
 
 import pipeline as slip
-from pipeline.api.run import Diagnosis
+from pipeline.api import Diagnosis
 
 Json = dict[str, Any]
 

@@ -30,7 +30,7 @@ from seal_truth import SealError, derive, hash_text, read_key, seal
 from task_draws import Lengths, Ring, draw_task
 from task_files import TRUTH_FORMAT, VERSION, write_task
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 
 SEED = 20261
 RINGS = ("open", "sealed", "rigid", "real")

@@ -41,10 +41,10 @@ from task_files import (
     write_sheet,
 )
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 from pipeline.report.motion_view import load_vehicle
 
 Floats = NDArray[np.float64]

@@ -14,7 +14,7 @@ import msgspec
 from effects_pages import escape, table, write_effect_pages
 
 import schemas
-from pipeline.cli.app import build_app
+from pipeline.cli import build_app
 from pipeline.export import list_targets
 from pipeline.sources import Configuration, list_presets
 

@@ -12,25 +12,25 @@ from typing import TYPE_CHECKING, Literal, Self
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.core.json_objects import number_in, objects_in
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core import INPUT_WORDS
+from pipeline.core.untrusted import number_in, objects_in
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.describe import format_ladder, format_parameters, list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
-from pipeline.job.stored import ModelFit, fit_to_runs, read_runs
+from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-from pipeline.report.figure_files import ShownFigure, show_figures
+from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 
 if TYPE_CHECKING:
-    from pipeline.api.run import Run
+    from pipeline.api import Run
     from pipeline.job.keys import Owner
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")

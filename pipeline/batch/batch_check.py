@@ -4,17 +4,18 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
+from pipeline.batch.batch_plan import POOLED, forget_pools, measure_results
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.batch.upkeep import POOLED, forget_pools, measure_results
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job.run_results import UPLOADS
 from pipeline.logs import LogError, hash_log, locate_recorded
-from pipeline.store import Examination, Mirror, Problem, Store, StoreError
+from pipeline.store import Store, StoreError
+from pipeline.store.files import MANIFEST
 from pipeline.store.listing import KEY_MARK, REGISTER, entry_name, is_run_manifest
-from pipeline.store.manifest import MANIFEST
+from pipeline.store.mirror import Mirror
 from pipeline.store.names import Sample, Tally, encode_run
 from pipeline.store.seals import parse_manifest
-from pipeline.store.verification import DiskFiles
+from pipeline.store.verification import DiskFiles, Examination, Problem
 
 _UNSEALED = "without the right key its integrity cannot be checked"
 _LEFT = {

@@ -1,27 +1,30 @@
-"""One log in a supervised worker: its outcome as a report, and as a ledger entry for the next batch."""
+"""One log as a task: its executor in this process, its outcome as a report and as a ledger entry.
+
+An executor takes tasks and returns `concurrent.futures.Future`; the runner uses nothing else of it.
+"""
 
 from __future__ import annotations
 
 import os
 import pickle
 import resource
-import signal
-import subprocess
 import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import msgspec
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError, end_with, silence_warnings
 from pipeline.logs import FETCHED
-from pipeline.store import JSON, LOG_NOTES, LogSighting, Mirror, Store, StoreError
+from pipeline.store import JSON, LOG_NOTES, LogSighting, Store, StoreError
+from pipeline.store.mirror import Mirror
 
 if TYPE_CHECKING:
     from pipeline.job import Options
@@ -124,106 +127,6 @@ def _as_entry(content: Mapping[str, JSON]) -> Entry | None:
     except msgspec.ValidationError:
         # Entry of another version: the log is processed again.
         return None
-
-
-_PERIOD_S = 0.05
-_PROC = Path("/proc/self/task")
-_SLOW_PERIOD_S = 1.0
-"""Polling period where another program must be called for the list of processes [s]."""
-
-
-class MemoryWatchdog:
-    """Kills child processes that exceed a memory limit.
-
-    Args:
-        limit_bytes: memory limit of each process.
-    """
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit = limit_bytes
-        self._killed: dict[int, int] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
-
-    def start(self) -> None:
-        """Start watching in a separate thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop watching."""
-        self._stop.set()
-        self._thread.join()
-
-    def held_by(self, pid: int | None) -> int | None:
-        """Memory of a process when it was killed for it [bytes]; None if it was not."""
-        return None if pid is None else self._killed.get(pid)
-
-    def _watch(self) -> None:
-        while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            for pid in list_children():
-                held = read_memory(pid)
-                if held > self._limit and pid not in self._killed:
-                    self._killed[pid] = held
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-
-
-@contextmanager
-def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[None]:
-    """Limit the memory of this process itself.
-
-    Args:
-        limit_bytes: memory limit.
-        give_up: called in a separate thread with the memory in use if it exceeds the limit; ends the process.
-    """
-    done = threading.Event()
-
-    def watch() -> None:
-        while not done.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            held = read_memory(os.getpid())
-            if held > limit_bytes:
-                give_up(held)
-
-    watcher = threading.Thread(target=watch, name="own memory", daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        done.set()
-        watcher.join()
-
-
-def list_children() -> list[int]:
-    """Running child processes of this process."""
-    if not _PROC.exists():
-        asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
-        return [int(word) for word in asked.split()]
-    children: list[int] = []
-    for path in _PROC.glob("*/children"):
-        # A thread may end between listing the folder and reading the file.
-        with suppress(OSError):
-            children += [int(word) for word in path.read_bytes().split()]
-    return children
-
-
-def read_memory(pid: int) -> int:
-    """Memory of a process [bytes], 0 if it has ended."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
-    except FileNotFoundError:
-        return 0 if Path("/proc/self").exists() else _kilobytes(pid) * 1024
-    except (OSError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def _ask(command: list[str]) -> str:
-    asked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    return asked.stdout
-
-
-def _kilobytes(pid: int) -> int:
-    return int(_ask(["/bin/ps", "-o", "rss=", "-p", str(pid)]).strip() or 0)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -336,7 +239,7 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 
 def _format_losses(outcome: Outcome) -> str:
-    from pipeline.core.json_objects import objects_in  # noqa: PLC0415 - heavy
+    from pipeline.core.untrusted import objects_in  # noqa: PLC0415 - heavy
     from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
 
     losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
@@ -367,3 +270,146 @@ def read_rss() -> int:
             return int(file.read().split()[1]) * resource.getpagesize()
     except OSError:
         return _peak_bytes()
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Settings of an executor.
+
+    Attributes:
+        jobs: number of parallel tasks.
+        timeout_s: time limit of a task [s].
+        memory_bytes: memory limit of a task.
+        work: function to call with a task; importable by its name in a fresh process.
+    """
+
+    jobs: int
+    timeout_s: float
+    memory_bytes: int
+    work: Callable[[Task], Report]
+
+
+@dataclass(frozen=True)
+class Blame:
+    """Reason why a task has no report.
+
+    Attributes:
+        code: ``worker_died``, ``timed_out``, ``out_of_memory``, ``no_result``, ...
+        reason: one sentence without a full stop.
+        kills: number of workers lost to the task.
+    """
+
+    code: str
+    reason: str
+    kills: int
+
+
+class Executor(Protocol):
+    """Interface of the executors."""
+
+    depth: int
+    """Preferred number of submitted tasks, including waiting ones."""
+    spreads_blame: bool
+    """Whether a dying worker may implicate innocent tasks; suspects are then tried alone."""
+
+    def expect(self, tasks: int) -> None:
+        """Prepare for this number of tasks, which will certainly be submitted."""
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Submit a task."""
+
+    def blame(self, task: Task, error: BaseException) -> Blame:
+        """Interpret the exception of a future."""
+
+    def close(self) -> None:
+        """End the workers, without waiting for unfinished tasks."""
+
+
+class InlineExecutor:
+    """This process, one log after the other: for debugging, and where processes cannot be started.
+
+    There is no isolation: a log that crashes, hangs or exhausts the memory ends the batch.
+    """
+
+    depth = 1
+    # No other task can be blamed.
+    spreads_blame = False
+
+    def __init__(self, settings: Settings) -> None:
+        self._work = settings.work
+
+    def expect(self, tasks: int) -> None:
+        """Do nothing: no preparation is needed."""
+
+    def submit(self, task: Task) -> Future[Report]:
+        """Work on a task immediately."""
+        future: Future[Report] = Future()
+        future.set_result(work_safely(self._work, task))
+        return future
+
+    def blame(self, task: Task, error: BaseException) -> Blame:
+        """Interpret the exception of a future; a log raises none."""
+        del task
+        return Blame("no_result", f"it gave no result: {type(error).__name__}: {error}", 0)
+
+    def close(self) -> None:
+        """Do nothing: there are no workers."""
+
+
+def format_exit(code: int | None) -> str:
+    """Describe an exit code in words."""
+    if code is None:
+        return "reason unknown"
+    return f"signal {-code}" if code < 0 else f"exit code {code}"
+
+
+def prepare_worker(parent: int) -> None:
+    """End this process when the batch that it works for is killed, and suppress its output."""
+    silence_warnings()
+    end_with(parent)
+
+
+def load_libraries() -> None:
+    """Load the libraries that every log needs, so that the first log does not include this time."""
+    import pipeline.job.analyze  # noqa: PLC0415 - only in workers
+    import pipeline.store.parquet_tables  # noqa: F401, PLC0415 - likewise
+
+
+DEATHS = "batch/deaths"
+_GUARD_PERIOD_S = 0.1
+
+
+def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float, memory_bytes: int) -> Report:
+    """Work on a task; end this process if it exceeds the time or memory limit.
+
+    Args:
+        work: function to call.
+        task: its task.
+        timeout_s: time limit [s].
+        memory_bytes: memory limit.
+    """
+    done = threading.Event()
+
+    def guard() -> None:
+        remaining_s = timeout_s
+        while not done.wait(_GUARD_PERIOD_S):
+            remaining_s -= _GUARD_PERIOD_S
+            held = read_rss()
+            if held > memory_bytes:
+                limit = memory_bytes / 1e9
+                _die_of(task, "out_of_memory", f"it used {held / 1e9:.2g} GB, more than {limit:.2g} GB")
+            if remaining_s <= 0.0:
+                _die_of(task, "timed_out", f"it did not end within {timeout_s:g} s")
+
+    watcher = threading.Thread(target=guard, name="guard", daemon=True)
+    watcher.start()
+    try:
+        return work_safely(work, task)
+    finally:
+        done.set()
+        watcher.join()
+
+
+def _die_of(task: Task, code: str, reason: str) -> None:
+    Store(task.options.out).notes(DEATHS).write(task.log.path, {"code": code, "reason": reason})
+    os._exit(1)

@@ -14,7 +14,7 @@ from pathlib import Path
 from queue import Empty, SimpleQueue
 from typing import TypeVar
 
-from pipeline.batch.request import BatchError
+from pipeline.batch import BatchError
 from pipeline.core.untrusted import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING

@@ -11,16 +11,35 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Protocol
 
-from pipeline.batch.batch_plan import Item, Plan, make_plan
-from pipeline.batch.batch_work import FATAL_KILLS, STATES, WITH_RESULTS, Entry, Ledger, Report, Task, work_on
-from pipeline.batch.cluster import SCHEMES, open_cluster
-from pipeline.batch.executors import Blame, Executor, InlineExecutor, LocalExecutor, Settings
+from pipeline.batch import BatchError, Request, Shard
+from pipeline.batch.batch_plan import (
+    Item,
+    Plan,
+    make_plan,
+    prune_results,
+    refresh_pools,
+    refresh_remote_pools,
+)
+from pipeline.batch.batch_work import (
+    FATAL_KILLS,
+    STATES,
+    WITH_RESULTS,
+    Blame,
+    Entry,
+    Executor,
+    InlineExecutor,
+    Ledger,
+    Report,
+    Settings,
+    Task,
+    work_on,
+)
+from pipeline.batch.executors import SCHEMES, LocalExecutor, open_cluster
 from pipeline.batch.recordings import find_recordings
-from pipeline.batch.request import BatchError, Request, Shard
-from pipeline.batch.upkeep import prune_results, refresh_pools, refresh_remote_pools
-from pipeline.core.program import SlipError
-from pipeline.store import Mirror, Store
+from pipeline.core import SlipError
+from pipeline.store import Store
 from pipeline.store.listing import KEY_MARK
+from pipeline.store.mirror import Mirror
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""

@@ -1,6 +1,160 @@
 """The command line: verbs that parse, call and print. No numerics.
 
-Verbs of one task share a file; heavy rooms are imported inside the verbs, so that help is instant.
+Verbs of one task share a file; heavy rooms are imported inside the verbs, so that help is instant. Here are
+the program, its verbs by task, and what errors become.
 """
 
-from pipeline.cli.app import main
+import gc
+import importlib
+import os
+import re
+import sys
+from collections.abc import Sequence
+from functools import partial
+from typing import Literal, get_args, get_origin
+
+from cyclopts import App, CycloptsError, CycloptsPanel, Group, MissingArgumentError, Parameter
+
+from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, print_note
+from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
+
+HELP = """How far was the motion from the ideal model, and why?
+
+Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
+A name that begins with a dash goes behind --, after all options.
+"""
+_GROUPS = {
+    "Analyze a run": {
+        "analyze": "verbs_log",
+        "diagnose": "verbs_effects",
+        "watch": "verb_watch",
+        "inspect": "verbs_log",
+        "export": "verbs_effects",
+    },
+    "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_machine"},
+    "Plan and simulate drives": {"plan": "verbs_drives", "simulate": "verbs_log"},
+    "Compare several runs": {"check": "verbs_fleet", "compare": "verbs_datasets", "fleet": "verbs_fleet"},
+    "Batches and results": {"batch": "verbs_machine", "results": "verbs_results"},
+    "The installation": {"doctor": "verbs_machine"},
+}
+"""Files of the commands, by task."""
+
+_YOUNG = 20_000
+"""Threshold of the garbage collector [new objects]: nearly all are freed without it, and it takes time."""
+_MOVED = {
+    **dict.fromkeys(("predict", "trend", "map", "share"), "fleet"),
+    **dict.fromkeys(("status", "verify", "explain", "query", "stage"), "results"),
+    "schedule": "batch",
+}
+"""Former top-level commands, and the command that each belongs to now."""
+
+_FORMER_OUT = {"simulate": "--file", "model export": "--file", "plan": "--folder"}
+"""Present name of the former option `--out`, by command; for all others it is `--results`."""
+
+
+def build_app(verb: str = "") -> App:
+    """The program with every command: the function of its name, or what `build_` and its name makes.
+
+    Args:
+        verb: the one that is asked for; the others are not imported then. Any other word stands for all.
+    """
+    app = App(
+        name="slip",
+        help=HELP,
+        # Plain text: a Markdown renderer takes longer to load than everything else.
+        help_format="plaintext",
+        version=read_version,
+        version_flags=["--version"],
+        # No --no-json and no --empty-logs: options with a negative form declare it themselves.
+        default_parameter=Parameter(negative=()),
+        result_action="return_value",
+        # `main` handles Ctrl-C, and reports the state of the results.
+        suppress_keyboard_interrupt=False,
+        error_formatter=_format_usage,
+    )
+    known = {name for files in _GROUPS.values() for name in files}
+    for index, (title, files) in enumerate(_GROUPS.items()):
+        group = Group(title, sort_key=index)
+        for name in files if verb not in known else [verb] if verb in files else ():
+            content = vars(importlib.import_module(f"pipeline.cli.{files[name]}"))
+            build = content.get(f"build_{name}")
+            app.command(build() if build else content[name])
+            app[name].group = group
+    options = Group("Options", sort_key=len(_GROUPS))
+    app.command(partial(_install_completion, app), name="--install-completion", group=options)
+    for flag in ("--help", "--version"):
+        app[flag].group = options
+    return app
+
+
+def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | None = None) -> int:
+    """Install completion of commands and options.
+
+    Args:
+        app: the program.
+        shell: the shell (default: the one that this is called from).
+    """
+    from cyclopts.completion.detect import ShellDetectionError  # noqa: PLC0415 - only here
+
+    try:
+        path = app.install_completion(shell=shell)
+    except (ShellDetectionError, OSError) as error:
+        hint = "Name your shell with --shell bash, zsh or fish; your home folder must be writable"
+        raise SlipError("no_completion", f"completion is not installed: {error}", hint=hint) from error
+    print_lines([f"{path}: a new shell completes the commands of slip"])
+    return CLEAN
+
+
+def _format_usage(error: CycloptsError) -> object:
+    """Format the panel of a usage error; for a missing argument it states name and meaning."""
+    lacking = error.argument
+    if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
+        return CycloptsPanel(error)
+    choices = get_args(lacking.hint) if get_origin(lacking.hint) is Literal else ()
+    # The parser reads docstrings for the help alone.
+    documented = error.app.assemble_argument_collection(parse_docstring=True) if error.app else ()
+    meanings = (one.parameter.help for one in documented if one.name == lacking.name)
+    about = " ".join((next(meanings, "") or " or ".join(map(str, choices))).split()).removesuffix(".")
+    verb = f"slip {' '.join(error.command_chain or ())}"
+    return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
+
+
+def _rename_out(words: Sequence[str]) -> list[str]:
+    """Replace the former option `--out` by its present name, except after `--`."""
+    options = list(words)[: words.index("--")] if "--" in words else list(words)
+    said = " ".join(options)
+    name = next((now for verb, now in _FORMER_OUT.items() if said.startswith(verb)), "--results")
+    renamed = [re.sub(r"^--out(?==|$)", name, word) for word in options]
+    return [*renamed, *words[len(options) :]]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run one verb and exit: 0 clean, 1 failed, 2 usage, 3 done with losses."""
+    # Results must not depend on the number of threads of a library, and short jobs are slower with more.
+    for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+    keep_current_folder_out()
+    silence_warnings()
+    gc.set_threshold(_YOUNG)
+    try:
+        words = _rename_out(sys.argv[1:] if arguments is None else arguments)
+        verb = next(iter(words), "")
+        if verb == "help":
+            words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
+        if verb in _MOVED:
+            print_note(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
+            sys.exit(USAGE)
+        code = build_app(verb)(words, exit_on_error=False)
+    except CycloptsError:
+        sys.exit(USAGE)
+    except SlipError as error:
+        print_error(error)
+        sys.exit(FAILED)
+    except BrokenPipeError:
+        # The reader of the pipe has exited (`slip ... | head`): no output is possible.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(FAILED)
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted; nothing was left half-written\n")
+        sys.exit(130)
+    sys.exit(code if isinstance(code, int) else 0)

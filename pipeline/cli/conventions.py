@@ -17,11 +17,13 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError, measure_memory
 from pipeline.job import INPUTS, STAGE_WORDS, Options
 
 if TYPE_CHECKING:
-    from pipeline.store import Mirror, Store
+    from pipeline.job.analyze import OpenedRun
+    from pipeline.store import Store
+    from pipeline.store.mirror import Mirror
 
 CLEAN = 0
 FAILED = 1
@@ -29,7 +31,6 @@ USAGE = 2
 LOSSY = 3
 
 _DOING = {**STAGE_WORDS, "diagnosis": "estimating effects"}
-
 
 # Control characters, line separators, bidirectional formatting characters, and undecodable bytes.
 _UNPRINTABLE = re.compile(
@@ -40,6 +41,7 @@ _UNPRINTABLE = re.compile(
 _FIELD = re.compile(r"(?:^|(?<=  ))\S")
 _NARROWEST = 40
 _DEEPEST = 38
+
 # Commands and paths, which users copy from the screen, are not folded.
 _COPIED = ("next ", "play ", "page ", "report ")
 
@@ -192,7 +194,7 @@ def limited_memory(
     Raises:
         BatchError: ``bad_size``.
     """
-    from pipeline.batch.batch_work import limit_memory  # noqa: PLC0415 - heavy
+    from pipeline.core import limit_memory  # noqa: PLC0415 - heavy
 
     limit = choose_limit(size)
 
@@ -214,9 +216,13 @@ def choose_limit(size: str | None) -> int:
     Raises:
         BatchError: ``bad_size``.
     """
-    from pipeline.batch import measure_memory, parse_size  # noqa: PLC0415 - heavy
+    return int(_SHARE * measure_memory()) if size is None else _parse_size(size)
 
-    return int(_SHARE * measure_memory()) if size is None else parse_size(size)
+
+def _parse_size(text: str) -> int:
+    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
+
+    return parse_size(text)
 
 
 def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
@@ -230,7 +236,6 @@ Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
 KeyFile: TypeAlias = Annotated[
     Path | None, Parameter(name="--key", help="file with the key that signs the results (or SLIP_KEY_FILE)")
 ]
-
 
 All: TypeAlias = Annotated[bool, Parameter(name="--all", negative=())]
 """Whether to show the whole summary, or only the verdict, the main effects and the remaining error."""
@@ -294,11 +299,9 @@ def build_options(choices: Choices) -> Options:
         BatchError: ``bad_size``.
         StoreError: ``bad_key_file``.
     """
-    from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
-
     use_key(choices.key)
     return Options(
-        max_inflated=None if choices.max_inflated is None else parse_size(choices.max_inflated),
+        max_inflated=None if choices.max_inflated is None else _parse_size(choices.max_inflated),
         out=choices.results,
         config=choices.config,
         overrides=_list_overrides(choices),
@@ -378,7 +381,7 @@ def open_results(results: Path) -> ResultsLocation:
         StoreError: ``no_object_store``.
     """
     from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
-    from pipeline.store import Mirror  # noqa: PLC0415 - likewise
+    from pipeline.store.mirror import Mirror  # noqa: PLC0415 - likewise
 
     location = to_location(results)
     if not isinstance(location, RemotePath):
@@ -391,3 +394,25 @@ def format_vehicle_source(source: str) -> str:
     """Where the geometry of a vehicle comes from."""
     words = source.replace("_", " ")
     return "geometry: estimated" if source == "fitted" else f"geometry: from {words}"
+
+
+TrustCode = Annotated[
+    bool,
+    Parameter(name="--trust-code", help="trust the Python that the model file names, now and later"),
+]
+
+
+@contextmanager
+def open_shown(
+    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
+) -> Iterator[OpenedRun]:
+    """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
+    from pipeline.job.analyze import open_run  # noqa: PLC0415 - heavy
+
+    with (
+        show_progress(Path(name).name, quiet=quiet) as progress,
+        open_run(name, options, progress) as opened,
+    ):
+        yield opened
+    if opened.note and not quiet:
+        notify(f"slip: {opened.note}")

@@ -4,35 +4,27 @@ from __future__ import annotations
 
 import re
 import shlex
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.cli.conventions import CLEAN, print_json, print_lines, print_note, print_result, show_progress
-from pipeline.core.program import INPUT_WORDS, NORMAL_95, SlipError
+from pipeline.cli.conventions import CLEAN, open_shown, print_json, print_lines, print_note, print_result
+from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError
 
 if TYPE_CHECKING:
     from pipeline.cli.verb_model import On
     from pipeline.estimation.problem import Problem
     from pipeline.fleet.forecast import Forecast
-    from pipeline.job import Options
     from pipeline.job.keys import Owner
-    from pipeline.job.stored import OpenedRun
     from pipeline.models.literature import LiteratureModel
     from pipeline.models.model import Model
     from pipeline.models.model_file import ModelFile
     from pipeline.run.recording import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
-
-TrustCode = Annotated[
-    bool,
-    Parameter(name="--trust-code", help="trust the Python that the model file names, now and later"),
-]
 
 
 def trust_named(path: Path | None, *, wanted: bool) -> None:
@@ -76,9 +68,9 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
             one of the names.
     """
+    from pipeline.models import format_model  # noqa: PLC0415
     from pipeline.models.catalogue import list_effects  # noqa: PLC0415 - heavy
     from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import format_model  # noqa: PLC0415
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     trust_named(path, wanted=trust_code)
@@ -104,8 +96,8 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
         force: replace a file that is there.
         quiet: print nothing.
     """
+    from pipeline.models import write_text  # noqa: PLC0415
     from pipeline.models.catalogue import draft_effect  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import write_text  # noqa: PLC0415
     from pipeline.run.recording import MotionError  # noqa: PLC0415
 
     text = draft_effect(file)
@@ -185,22 +177,6 @@ def _print(codes: dict[str, str], otherwise: str, *, json: bool) -> int:
     )
 
 
-@contextmanager
-def open_shown(
-    name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
-) -> Iterator[OpenedRun]:
-    """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
-    from pipeline.job.stored import open_run  # noqa: PLC0415 - heavy
-
-    with (
-        show_progress(Path(name).name, quiet=quiet) as progress,
-        open_run(name, options, progress) as opened,
-    ):
-        yield opened
-    if opened.note and not quiet:
-        notify(f"slip: {opened.note}")
-
-
 def gather_runs(
     names: Sequence[str], vehicle: Vehicle | None, owner: Owner | None, out: Path, *, quiet: bool
 ) -> tuple[Vehicle, list[MotionRun]]:
@@ -220,7 +196,7 @@ def gather_runs(
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
     from pipeline.job import Options  # noqa: PLC0415
-    from pipeline.job.stored import read_runs  # noqa: PLC0415 - heavy
+    from pipeline.job.stored_fits import read_runs  # noqa: PLC0415 - heavy
 
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
@@ -323,7 +299,7 @@ def forecast_runs(
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
     """
-    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.run.recording import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -450,7 +426,7 @@ def compare_rivals(
         spoken: the runs, and how the answer is printed.
         against: what they are compared with.
     """
-    from pipeline.job.stored import contest_models  # noqa: PLC0415 - heavy
+    from pipeline.job.stored_fits import contest_models  # noqa: PLC0415 - heavy
     from pipeline.models.literature import list_models  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json

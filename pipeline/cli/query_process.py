@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from pipeline.cli.conventions import CLEAN, FAILED, ResultsLocation, tidy_line
-from pipeline.core.program import SlipError, end_with, silence_warnings
+from pipeline.core import SlipError, end_with, silence_warnings
 
 if TYPE_CHECKING:
     import polars as pl
@@ -98,7 +98,7 @@ def _print(answer: pl.DataFrame, form: Literal["table", "csv", "json"]) -> None:
 def _print_csv(answer: pl.DataFrame) -> None:
     import polars as pl  # noqa: PLC0415 - heavy
 
-    from pipeline.core.tables import format_csv  # noqa: PLC0415 - heavy
+    from pipeline.core.untrusted import format_csv  # noqa: PLC0415 - heavy
 
     try:
         _write(format_csv(answer.clear()))

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
-from pipeline.core.json_objects import mapping_in, number_in, objects_in
-from pipeline.core.program import INPUT_WORDS, format_duration, format_recorded
+from pipeline.core import INPUT_WORDS, format_duration, format_recorded
+from pipeline.core.untrusted import mapping_in, number_in, objects_in
+from pipeline.report import format_distance, format_split
 from pipeline.report.scene import RunReport
-from pipeline.report.templating import format_distance, format_split
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID

@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import CLEAN, Results, print_json, print_lines, print_note
+from pipeline.cli.conventions import CLEAN, Results, TrustCode, print_json, print_lines, print_note
 from pipeline.cli.model_runs import (
     Against,
-    TrustCode,
     compare_rivals,
     cut_first,
     expect_model,
@@ -32,12 +31,12 @@ from pipeline.cli.model_runs import (
     trusted,
     untrust,
 )
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
     from pipeline.estimation.learned_bands import Coverage
     from pipeline.estimation.problem import Transfer
-    from pipeline.job.stored import ModelFit
+    from pipeline.job.stored_fits import ModelFit
     from pipeline.models.model_file import ModelFile
     from pipeline.run.recording import MotionRun
 
@@ -95,10 +94,10 @@ def new(
         force: replace a file that is there.
         quiet: print nothing.
     """
+    from pipeline.models import write_model  # noqa: PLC0415
     from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
     from pipeline.models.literature import find_model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
-    from pipeline.models.model_text import write_model  # noqa: PLC0415
     from pipeline.run.recording import MotionError  # noqa: PLC0415
     from pipeline.sources import resolve_vehicle  # noqa: PLC0415
     from pipeline.sources.configuration import VehicleSection  # noqa: PLC0415
@@ -305,7 +304,7 @@ def export(  # noqa: D417 - the options document themselves
             traction, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import write_text  # noqa: PLC0415
+    from pipeline.models import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
     opened = open_model(model, trust_code=trust_code)
@@ -334,8 +333,8 @@ def _change(
         MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
-    from pipeline.job.stored import fit_to_runs  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import format_model, write_model  # noqa: PLC0415
+    from pipeline.job.stored_fits import fit_to_runs  # noqa: PLC0415 - heavy
+    from pipeline.models import format_model, write_model  # noqa: PLC0415
 
     # Excluded effects would be lost from the file: raise this error before a long fit.
     format_model(after)

@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Choices, build_options, print_lines, print_note, spell_choices
-from pipeline.core.program import SlipError, format_duration, format_share, naming_os_errors
+from pipeline.core import SlipError, format_duration, format_share, naming_os_errors
 
 if TYPE_CHECKING:
     from pipeline.job.watch import Watch
@@ -110,7 +110,7 @@ def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> N
 
 
 def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
-    from pipeline.report.templating import render_template  # noqa: PLC0415 - heavy
+    from pipeline.report import render_template  # noqa: PLC0415 - heavy
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
     text = render_template("report/templates/watch.html", lines=lines, is_live=is_live)

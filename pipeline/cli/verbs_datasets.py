@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
-from pipeline.core.program import INPUT_WORDS, SlipError, format_share
+from pipeline.core import INPUT_WORDS, SlipError, format_share
 from pipeline.job import FigureFormat
 
 if TYPE_CHECKING:
@@ -103,7 +103,8 @@ def _compare_causes(
 
 
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
-    from pipeline.fleet.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
+    from pipeline.fleet import MEASURES  # noqa: PLC0415 - heavy
+    from pipeline.fleet.pairs import compare_orders  # noqa: PLC0415 - heavy
 
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
         "dataset", "runs", "median_window_norm"
@@ -313,7 +314,7 @@ def merge(  # noqa: D417 - arguments document themselves
 
 
 def _are_features(*paths: Path) -> bool:
-    from pipeline.fleet.features import MAGIC  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import MAGIC  # noqa: PLC0415 - heavy
 
     for path in paths:
         if path.is_file():
@@ -326,14 +327,14 @@ def _are_features(*paths: Path) -> bool:
 def _read_features(path: Path) -> pl.DataFrame:
     """As `read_features`; end the program if an untrusted file exceeds the memory limit."""
     from pipeline.cli.conventions import limited_memory  # noqa: PLC0415 - heavy
-    from pipeline.fleet.features import read_features  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import read_features  # noqa: PLC0415 - heavy
 
     with limited_memory(_FEATURES_MEMORY, lambda: str(path), lambda _: None, "Do not trust this file"):
         return read_features(path)
 
 
 def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
-    from pipeline.fleet.features import merge_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import merge_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features(
         [_read_features(path) for path in (first, second)], f"{first} and {second}"
@@ -366,7 +367,7 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.features import write_features  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import write_features  # noqa: PLC0415 - heavy
     from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 

@@ -18,6 +18,7 @@ from pipeline.cli.conventions import (
     KeyFile,
     Results,
     build_options,
+    open_shown,
     print_error,
     print_json,
     print_lines,
@@ -26,8 +27,8 @@ from pipeline.cli.conventions import (
     show_progress,
     summarize_error,
 )
-from pipeline.cli.model_runs import gather_runs, open_model, open_shown
-from pipeline.core.program import SlipError, finite_or_none, naming_os_errors
+from pipeline.cli.model_runs import gather_runs, open_model
+from pipeline.core import SlipError, finite_or_none, naming_os_errors
 
 if TYPE_CHECKING:
     from pipeline.estimation import Recording, RunDiagnosis
@@ -102,7 +103,7 @@ def plan(  # noqa: D417 - the runs document themselves
             return _check(check, names, options, json=json, quiet=quiet)
         from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
         from pipeline.job.next_drive import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
-        from pipeline.plan.manoeuvres import parse_area, parse_time  # noqa: PLC0415 - heavy
+        from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
         from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
 
         seconds = parse_time(time)
@@ -332,8 +333,7 @@ def replay(
     Raises:
         SlipError: a file cannot be read, or the twin cannot be made.
     """
-    from pipeline.job.twin_replay import replay_twin  # noqa: PLC0415 - heavy
-    from pipeline.job.twin_world import load_mujoco  # noqa: PLC0415
+    from pipeline.job.twin_replay import load_mujoco, replay_twin  # noqa: PLC0415 - heavy
 
     # Report a missing package before an analysis, which may take a minute.
     load_mujoco()

@@ -15,9 +15,11 @@ from pipeline.cli.conventions import (
     All,
     Choices,
     Results,
+    TrustCode,
     build_options,
     exit_code,
     limited_memory,
+    open_shown,
     print_error,
     print_json,
     print_lines,
@@ -28,8 +30,7 @@ from pipeline.cli.conventions import (
     spell_flags,
     summarize_error,
 )
-from pipeline.cli.model_runs import TrustCode, open_model, open_shown
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.core.untrusted import resolve_inside
 from pipeline.job import INPUTS, Options
 
@@ -77,11 +78,11 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     """
     options = build_options(choices)
     from pipeline.estimation.context import parse_budget  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import check_target  # noqa: PLC0415 - heavy
+    from pipeline.models import check_target  # noqa: PLC0415 - heavy
 
     if apply is not None:
         check_target(apply)
-    known = None if model is None else open_model(model, trust_code=trust_code)
+    known = _open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
     answers: list[_Answer] = []
     at_work = [logs[0]]
@@ -124,6 +125,15 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
             )
             print_lines(answer.describe(following, everything=everything).splitlines())
     return _end(answers, errors, lossy=lossy, quiet=quiet)
+
+
+def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:
+    """The named model, if one is named."""
+    if path is None:
+        return None
+    from pipeline.cli.model_runs import open_model  # noqa: PLC0415 - only with a model
+
+    return open_model(path, trust_code=trust_code)
 
 
 def _gather(
@@ -367,14 +377,13 @@ def export(  # noqa: D417 - the results folder documents itself
         quiet: print nothing.
     """
     from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
-    from pipeline.report import viewer_layouts  # noqa: PLC0415
-    from pipeline.report.derived_log import write_derived_log  # noqa: PLC0415
+    from pipeline.report import viewer_files  # noqa: PLC0415
     from pipeline.report.export_source import ExportSource  # noqa: PLC0415
-    from pipeline.report.viewer_layouts import write_csv  # noqa: PLC0415 - heavy
+    from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
-    known = None if model is None else open_model(model, trust_code=trust_code)
+    known = _open_model(model, trust_code=trust_code)
     chosen, named_on = _find_named(manifest) if known is None else (known.model, None)
     source = ExportSource(manifest, chosen, input or named_on, frame)
     path = file or resolve_inside(Path(), manifest.run.replace("/", "_") + _SUFFIXES[to])
@@ -383,8 +392,8 @@ def export(  # noqa: D417 - the results folder documents itself
     else:
         write = {
             "mcap": write_derived_log,
-            "foxglove-layout": viewer_layouts.write_foxglove_layout,
-            "plotjuggler-layout": viewer_layouts.write_plotjuggler_layout,
+            "foxglove-layout": viewer_files.write_foxglove_layout,
+            "plotjuggler-layout": viewer_files.write_plotjuggler_layout,
         }[to]
         written = [write(source, path)]
     files = [str(each) for each in written]

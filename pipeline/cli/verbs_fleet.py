@@ -18,8 +18,10 @@ from pipeline.cli.conventions import (
     Choices,
     KeyFile,
     Results,
+    TrustCode,
     build_options,
     format_value,
+    open_shown,
     print_error,
     print_json,
     print_lines,
@@ -27,8 +29,8 @@ from pipeline.cli.conventions import (
     summarize_error,
     use_key,
 )
-from pipeline.cli.model_runs import TrustCode, open_model, open_shown
-from pipeline.core.program import SlipError
+from pipeline.cli.model_runs import open_model
+from pipeline.core import SlipError
 
 if TYPE_CHECKING:
     from pipeline.fleet.trend import Trend
@@ -84,7 +86,7 @@ def check(  # noqa: D417 - the arguments document themselves
             read_limits,
         )
         from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
-        from pipeline.models.model_text import write_text  # noqa: PLC0415 - heavy
+        from pipeline.models import write_text  # noqa: PLC0415 - heavy
         from pipeline.store import Store  # noqa: PLC0415 - heavy
 
         bounds = None if limits is None else read_limits(limits)
@@ -323,8 +325,8 @@ def predict(
         quiet: print nothing.
     """
     from pipeline.job import prediction as predictions  # noqa: PLC0415 - heavy
-    from pipeline.job.fleet_evidence import forecast_deployment  # noqa: PLC0415 - heavy
-    from pipeline.models.model_text import write_model  # noqa: PLC0415
+    from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.models import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(results)

@@ -16,6 +16,7 @@ from pipeline.cli.conventions import (
     All,
     Choices,
     Results,
+    TrustCode,
     build_options,
     exit_code,
     format_vehicle_source,
@@ -28,13 +29,13 @@ from pipeline.cli.conventions import (
     spell_choices,
     summarize_error,
 )
-from pipeline.cli.model_runs import TrustCode, trust_named
-from pipeline.core.program import SlipError, format_duration, format_share
+from pipeline.cli.model_runs import trust_named
+from pipeline.core import SlipError, format_duration, format_share
 from pipeline.job import FigureFormat, Options
 
 if TYPE_CHECKING:
     from pipeline.job.analyze import Outcome
-    from pipeline.job.log_setup import Inspection, TopicHealth
+    from pipeline.job.keys import Inspection, TopicHealth
     from pipeline.stages.pose_choice import PoseRating
 
 
@@ -128,7 +129,7 @@ def _analyze_all(
 
 def _warm_report() -> None:
     """Load the report's plotting code in the background while the log is read."""
-    from pipeline.report.page import warm_bundle  # noqa: PLC0415 - only for reports
+    from pipeline.report.theme import warm_bundle  # noqa: PLC0415 - only for reports
 
     warm_bundle()
 
@@ -164,7 +165,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.job.log_setup import inspect_log  # noqa: PLC0415 - heavy
+    from pipeline.job.keys import inspect_log  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
     seen = inspect_log(

@@ -19,15 +19,17 @@ from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import (
+    Nightly,
     Pruning,
     Request,
+    System,
     count_cores,
-    measure_memory,
+    parse_clock,
     parse_memory_limit,
     parse_shard,
     parse_size,
+    print_units,
 )
-from pipeline.batch.request import Nightly, System, parse_clock, print_units
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
@@ -46,7 +48,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     use_key,
 )
-from pipeline.core.program import PACKAGE, SlipError, read_version, slip_command
+from pipeline.core import PACKAGE, SlipError, measure_memory, read_version, slip_command
 
 if TYPE_CHECKING:
     from pipeline.batch.season import Line, Outcome
@@ -260,7 +262,7 @@ def serve(  # noqa: D417 - the results folder documents itself
         quiet: print nothing.
     """
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
-    from pipeline.web import serve as serve_workbench  # noqa: PLC0415 - heavy
+    from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
     def notify(address: str, token: str) -> None:
         whole = f"{address}?token={token}"

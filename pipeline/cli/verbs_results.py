@@ -33,7 +33,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     use_key,
 )
-from pipeline.core.program import INPUT_WORDS, THREAD_VARIABLES, SlipError, python_command, shorten
+from pipeline.core import INPUT_WORDS, THREAD_VARIABLES, SlipError, python_command, shorten
 
 if TYPE_CHECKING:
     from pipeline.batch.batch_check import Status, Verification
@@ -117,8 +117,8 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
     Raises:
         SlipError: the error that the process reports; ``timed_out``, ``out_of_memory`` or ``query_died``.
     """
-    from pipeline.batch.batch_work import MemoryWatchdog  # noqa: PLC0415 - only for this verb
     from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
+    from pipeline.core import MemoryWatchdog  # noqa: PLC0415 - only for this verb
 
     pinned = {**dict.fromkeys(THREAD_VARIABLES, "1"), "RUST_MIN_STACK": str(STACK_BYTES)}
     watchdog, is_late = MemoryWatchdog(memory_bytes), threading.Event()

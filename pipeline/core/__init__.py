@@ -1,4 +1,359 @@
-"""Foundations of all packages: errors, rigid motions, time grids, segments.
+"""Foundations of all packages: rigid motions, time grids, segments, and, here, what every file may need.
 
-Pure functions over numpy arrays and one base class for errors, independent of logs, tables and files.
+Here are errors, version, formatting of numbers and durations, starting Python processes, and the memory of
+processes and of the machine. An error has a stable code for scripts, states what is wrong and where, and ends
+with what to do about it. Each package derives a class of its own.
 """
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+_READABLE = 300
+"""Maximum number of characters of quoted text in a sentence: four lines of a screen."""
+_LONGEST = 1000
+"""Maximum number of characters of an error, which may quote a text of any size from a file."""
+
+
+class SlipError(Exception):
+    """An error that the user can correct.
+
+    Args:
+        code: stable identifier in snake_case, for example ``log_not_found``.
+        what: what is wrong, one sentence without a full stop.
+        where: the file, topic, key or line it concerns; empty when there is none.
+        hint: what to do about it.
+    """
+
+    def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
+        super().__init__(what)
+        self.code = code
+        # Errors quote files, whose texts may have any length.
+        self.what = shorten(what, _LONGEST)
+        self.where = where
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """One line: where, what, what to do."""
+        origin = f"{self.where}: " if self.where else ""
+        return f"{origin}{self.what}. {self.hint.rstrip('.')}."
+
+    def _render_traceback_(self) -> list[str]:
+        """The same line in place of a traceback in a notebook."""
+        return [f"slip: {' '.join(str(self).split())}"]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep every part when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
+
+
+def shorten(text: str, most: int = _READABLE) -> str:
+    """A text, truncated if it is long."""
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
+def guess_names(name: str, known: Iterable[str]) -> str:
+    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty."""
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    near = difflib.get_close_matches(name, list(known), n=3)
+    return f"Did you mean {' or '.join(near)}? " if near else ""
+
+
+def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
+    return kind(code, what, where=where, hint=hint)
+
+
+@contextmanager
+def naming_os_errors(
+    make: type[SlipError], code: str, what: str, *, where: object, hint: str
+) -> Iterator[None]:
+    """Context manager that raises errors of the operating system as `SlipError` with their reason.
+
+    Raises:
+        SlipError: of the class `make`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
+
+
+_MINUTE, _HOUR = 60.0, 3600.0  # seconds
+_NEARLY_ALL = 0.95
+"""Share of the recording below which the compared duration is shown as well."""
+
+INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
+"""Text for each input of the ideal model."""
+
+
+def format_share(share: float, digits: int = 2) -> str:
+    """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
+
+    Args:
+        share: 1 is the whole.
+        digits: significant digits, at least those before the decimal point; 0 for whole percent.
+    """
+    percent = 100.0 * share
+    leading = math.floor(math.log10(abs(percent))) if percent and math.isfinite(percent) else 0
+    places = max(digits - 1 - leading, 0) if digits else 0
+    text = f"{percent:z.{places}f}"
+    return f"{text.rstrip('0').rstrip('.') if places else text} %"
+
+
+def format_duration(seconds: float) -> str:
+    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
+    if seconds < _MINUTE:
+        return f"{round(seconds, 1):g} s"
+    whole = round(seconds)
+    if whole < _HOUR:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def format_recorded(recorded_s: float, compared_s: object = None) -> str:
+    """Duration of a log, and of its part with slip if that is clearly less."""
+    text = format_duration(recorded_s)
+    if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
+        text += f", {format_duration(compared_s)} of it compared"
+    return text
+
+
+NORMAL_95 = 1.959964
+"""Half of a normal distribution's 95 % interval, in standard deviations."""
+
+JSON_DIGITS = 6
+"""Significant digits of estimates in JSON, more than any estimate has."""
+
+
+def finite_or_none(value: float, digits: int | None = None) -> float | None:
+    """A number, rounded to ``digits`` significant digits if given; None if it is not finite."""
+    if not math.isfinite(value):
+        return None
+    return value if digits is None else float(f"{value:.{digits}g}")
+
+
+def pick(item: object, *names: str) -> dict[str, Any]:
+    """Selected fields of an object by name."""
+    return {name: getattr(item, name) for name in names}
+
+
+def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
+    """Selected numbers of an object by name, as `finite_or_none`."""
+    return {name: finite_or_none(getattr(item, name), digits) for name in names}
+
+
+def silence_warnings() -> None:
+    """Hide warnings in this process unless requested (``python -W``, ``PYTHONWARNINGS``).
+
+    Users are informed by findings, losses and errors. Filters are unchanged: warnings that are errors, as in
+    the tests, remain errors.
+    """
+    if not sys.warnoptions:
+        warnings.showwarning = _ignore
+
+
+def _ignore(*_: object, **__: object) -> None:
+    return None
+
+
+PACKAGE = "slip-pipeline"
+
+
+def read_version() -> str:
+    """Version of the installed package; in a checkout that is not installed, the declared one."""
+    # Every call of the program imports this module, and few need the version.
+    import importlib.metadata  # noqa: PLC0415
+    import tomllib  # noqa: PLC0415
+
+    try:
+        return importlib.metadata.version(PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        declared = Path(__file__).parents[2] / "pyproject.toml"
+        content = tomllib.loads(declared.read_text(encoding="utf-8"))
+        return str(content["project"]["version"])
+
+
+# Starting Python in a separate process, without imports from the current folder.
+#
+# ``python -c`` and ``python -m`` search the current folder before the standard library: a `tempfile.py` in a
+# folder with untrusted logs would run. ``-P`` excludes that folder. ``-I`` would also exclude PYTHONPATH and
+# the site packages of the user, which are trusted and may contain slip itself.
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+"""Environment variables with the number of threads of numerical libraries."""
+
+_ORPHAN_PERIOD_S = 0.5
+"""Period of checking for the parent process [s]: an orphan ends within it; a check takes microseconds."""
+
+
+def python_command(*words: str) -> list[str]:
+    """Command line of this interpreter, by its absolute path, without the current folder in its import path.
+
+    Args:
+        words: arguments, such as ``-m pipeline batch``.
+    """
+    return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
+
+
+def slip_command(*words: str) -> list[str]:
+    """Command line of a verb in a process of its own.
+
+    Args:
+        words: the verb and its arguments.
+    """
+    return python_command("-m", "pipeline", *words)
+
+
+def keep_current_folder_out() -> None:
+    """Exclude the current folder from the import path of Python processes started by libraries."""
+    os.environ["PYTHONSAFEPATH"] = "1"
+
+
+def end_with(parent: int) -> None:
+    """End this process when the one that started it is killed.
+
+    Args:
+        parent: id of that process.
+    """
+    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_ORPHAN_PERIOD_S)
+    os._exit(1)
+
+
+_PERIOD_S = 0.05
+"""Polling period of memory [s]: a process takes tens of megabytes in it, and reading takes microseconds."""
+_PROC = Path("/proc/self/task")
+_SLOW_PERIOD_S = 1.0
+"""Polling period where another program must be called for the list of processes [s]."""
+
+
+class MemoryWatchdog:
+    """Kills child processes that exceed a memory limit.
+
+    Args:
+        limit_bytes: memory limit of each process.
+    """
+
+    def __init__(self, limit_bytes: int) -> None:
+        self._limit = limit_bytes
+        self._killed: dict[int, int] = {}
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
+
+    def start(self) -> None:
+        """Start watching in a separate thread."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop watching."""
+        self._stop.set()
+        self._thread.join()
+
+    def held_by(self, pid: int | None) -> int | None:
+        """Memory of a process when it was killed for it [bytes]; None if it was not."""
+        return None if pid is None else self._killed.get(pid)
+
+    def _watch(self) -> None:
+        while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
+            for pid in list_children():
+                held = read_memory(pid)
+                if held > self._limit and pid not in self._killed:
+                    self._killed[pid] = held
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+
+
+@contextmanager
+def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[None]:
+    """Limit the memory of this process itself.
+
+    Args:
+        limit_bytes: memory limit.
+        give_up: called in a separate thread with the memory in use if it exceeds the limit; ends the process.
+    """
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
+            held = read_memory(os.getpid())
+            if held > limit_bytes:
+                give_up(held)
+
+    watcher = threading.Thread(target=watch, name="own memory", daemon=True)
+    watcher.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watcher.join()
+
+
+def list_children() -> list[int]:
+    """Running child processes of this process."""
+    if not _PROC.exists():
+        asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
+        return [int(word) for word in asked.split()]
+    children: list[int] = []
+    for path in _PROC.glob("*/children"):
+        # A thread may end between listing the folder and reading the file.
+        with suppress(OSError):
+            children += [int(word) for word in path.read_bytes().split()]
+    return children
+
+
+def read_memory(pid: int) -> int:
+    """Memory of a process [bytes], 0 if it has ended."""
+    try:
+        pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
+    except FileNotFoundError:
+        return 0 if Path("/proc/self").exists() else _kilobytes(pid) * 1024
+    except (OSError, IndexError):
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def _ask(command: list[str]) -> str:
+    asked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
+    return asked.stdout
+
+
+def _kilobytes(pid: int) -> int:
+    return int(_ask(["/bin/ps", "-o", "rss=", "-p", str(pid)]).strip() or 0)
+
+
+def measure_memory(own: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sys/fs/cgroup")) -> int:
+    """Memory available to this process [bytes]: of the machine, or of its control group if that is less.
+
+    Args:
+        own: file with the control group of this process.
+        groups: folder of the control groups (version 2).
+    """
+    installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    return min(installed, *_list_limits(own, groups)) if own.exists() else installed
+
+
+def _list_limits(own: Path, groups: Path) -> Iterator[int]:
+    for line in own.read_text(encoding="utf-8").splitlines():
+        if line.startswith("0::"):
+            inside = PurePosixPath(line[3:].lstrip("/"))
+            for group in (inside, *inside.parents):
+                # "max" means no limit; the root has no such file.
+                with suppress(OSError, ValueError):
+                    yield int((groups / group / "memory.max").read_text(encoding="utf-8"))
+    yield sys.maxsize

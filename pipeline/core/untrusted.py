@@ -1,26 +1,30 @@
-"""Bounded reading of untrusted names, TOML files and folders."""
+"""Bounded reading of untrusted names, JSON objects, TOML files and folders; texts as safe CSV."""
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import re
 import stat
+import sys
 import tomllib
 import unicodedata
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from pipeline.core.program import SlipError, shorten
+from pipeline.core import SlipError, shorten
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    AnyPath = TypeVar("AnyPath", bound=Path)
 
 # Untrusted names as paths: of objects, of members of a recording, in manifests, from a browser.
 #
 # Without a check, the author of such a name decides where a file is read or written. `resolve_inside` checks
 # every such name and confines it to its folder.
-
-if TYPE_CHECKING:
-    AnyPath = TypeVar("AnyPath", bound=Path)
 
 _LONGEST_PART = 255
 """Maximum length of a file name on Linux [bytes] (NAME_MAX)."""
@@ -288,3 +292,80 @@ def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirE
 
     for files in walk_tree(str(top), look, lambda folder, why: skip(Path(folder), why)):
         yield from files
+
+
+def read_object(path: Path) -> dict[str, object]:
+    """The object in a file; empty if there is none or it cannot be read."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def number_in(source: Mapping[str, object], key: str) -> float | None:
+    """A finite number under a key, or None."""
+    return _take_number(source.get(key))
+
+
+def numbers_in(source: Mapping[str, object], key: str) -> list[float | None]:
+    """A list of numbers under a key; other entries become None."""
+    return [_take_number(entry) for entry in _take_list(source.get(key))]
+
+
+def mapping_in(source: Mapping[str, object], key: str) -> Mapping[str, object]:
+    """An object under a key; empty if missing."""
+    value = source.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def objects_in(source: Mapping[str, object], key: str) -> list[Mapping[str, object]]:
+    """A list of objects under a key; empty if missing, without entries of other types."""
+    return [entry for entry in _take_list(source.get(key)) if isinstance(entry, Mapping)]
+
+
+def _take_number(value: object) -> float | None:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return None
+    # Integers as well: one of 400 digits exceeds the range of a double.
+    return float(value) if abs(value) <= sys.float_info.max else None
+
+
+def _take_list(value: object) -> Sequence[object]:
+    return value if isinstance(value, Sequence) and not isinstance(value, str) else ()
+
+
+_FORMULA = "=+\\-@\t\r\n\uff1d\uff0b\uff0d\uff20"
+"""First characters of a spreadsheet formula, after OWASP, "CSV Injection"; the last four are wide forms."""
+
+
+def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None = None) -> str:
+    """A table as CSV, safe for spreadsheets: a text that looks like a formula gets a leading quote.
+
+    Args:
+        frame: a table without nested columns; numbers, also negative ones, are unchanged.
+        header: whether the first line contains the column names.
+        digits: number of decimal places; None for all.
+
+    Raises:
+        PolarsError: a column cannot be represented in CSV.
+    """
+    import polars as pl  # noqa: PLC0415 - heavy
+    import polars.selectors as cs  # noqa: PLC0415
+
+    names = pl.Series(frame.columns, dtype=pl.String)
+    safe = dict(zip(frame.columns, names.to_frame("").select(_quote(pl.col(""))).to_series(), strict=True))
+    texts = frame.with_columns(_quote((cs.string() | cs.enum() | cs.categorical()).cast(pl.String)))
+    return texts.rename(safe).write_csv(include_header=header, float_precision=digits)
+
+
+def unquote_formulas(frame: pl.DataFrame) -> pl.DataFrame:
+    """The original texts of a table that `format_csv` wrote."""
+    import polars.selectors as cs  # noqa: PLC0415 - heavy
+
+    return frame.with_columns(cs.string().str.replace(f"^'('*[{_FORMULA}])", "$1"))
+
+
+def _quote(text: pl.Expr) -> pl.Expr:
+    # Existing leading quotes get one more, so that the original text can be restored.
+    return text.str.replace(f"^('*[{_FORMULA}])", "'$1")

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats, robust_spreads
-from pipeline.core.program import format_share
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import CLIP, count_seconds
 from pipeline.models.effect import Effect, Parameter

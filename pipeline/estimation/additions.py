@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
 from pipeline.estimation.context import Context
 from pipeline.estimation.describe import format_rises

@@ -16,9 +16,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, nearest_indices
+from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
 from pipeline.core.compute import map_parallel
-from pipeline.core.numerics import jackknife_deviation, student_quantile
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem

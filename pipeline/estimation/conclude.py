@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.program import format_share
 from pipeline.estimation import unexplained as residual_structure
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, grow_evidence, measure_moves
 from pipeline.estimation.ambiguity import (

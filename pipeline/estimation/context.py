@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import cast
 
+from pipeline.core import SlipError
 from pipeline.core.compute import measure_cpu
-from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import Candidate

@@ -5,7 +5,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.core.program import JSON_DIGITS, finite_or_none, format_share, pick_finite
+from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.estimation.folds import Errors, errors_as_json
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimates

@@ -7,12 +7,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core.program import JSON_DIGITS, finite_or_none, pick_finite
+from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
+from pipeline.models import format_model
 from pipeline.models.catalogue import find_effect
-from pipeline.models.model_text import format_model
 from pipeline.models.parameter import UNDETERMINED, Level, Reading
 from pipeline.run.windows import HORIZON_S
 
@@ -400,7 +400,7 @@ class Diagnosis:
 
         Steps and noise floor, values of named effects, causes of slip and errors, estimates of all effects.
         """
-        from pipeline.core.tables import tabulate  # noqa: PLC0415 - heavy
+        from schemas import tabulate  # noqa: PLC0415 - heavy
 
         return tabulate(table, [row for item in self.runs if item.run == run for row in _ROWS[table](item)])
 

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
-from pipeline.core.json_objects import number_in
-from pipeline.core.program import INPUT_WORDS, format_share
+from pipeline.core import INPUT_WORDS, format_share
+from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.core import NORMAL_95
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.core.program import NORMAL_95
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.estimation.problem import Problem

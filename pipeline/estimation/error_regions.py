@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import finite_or_none, format_share
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.program import finite_or_none, format_share
 from pipeline.estimation.learning import (
     INTERVAL_SHARE,
     Curve,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.program import NORMAL_95
+from pipeline.core import NORMAL_95
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.context import Context

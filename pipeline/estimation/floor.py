@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads
-from pipeline.core.numerics import solve_nonnegative
+from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads, solve_nonnegative
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import CLIP, average_lags, find_live

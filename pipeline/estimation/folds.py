@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
-from pipeline.core.program import JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
 from pipeline.estimation.parts import Part
 from pipeline.estimation.state import (

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints, count_freedom, group_rows, robust_spreads
-from pipeline.core.numerics import student_quantile
-from pipeline.core.program import NORMAL_95
+from pipeline.core import NORMAL_95
+from pipeline.core.arrays import Floats, Ints, count_freedom, group_rows, robust_spreads, student_quantile
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
 from pipeline.estimation.problem import Problem

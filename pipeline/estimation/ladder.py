@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from pipeline.core import pick
 from pipeline.core.arrays import Floats
-from pipeline.core.program import pick
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out
 from pipeline.estimation.intervals import Estimates, estimate_intervals

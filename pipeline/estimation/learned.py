@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.core import SlipError
 from pipeline.core.arrays import Flags, Floats, robust_spreads
-from pipeline.core.program import SlipError
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.folds import hold_out, score
 from pipeline.estimation.parts import CLIP, locate_windows

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.program import format_share
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import HeldOut, number_predictions
 from pipeline.estimation.problem import Problem

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
-from pipeline.core.program import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import ABOVE_FLOOR
@@ -40,11 +40,8 @@ from pipeline.estimation.ladder import (
     list_rises,
     read_error,
 )
-from pipeline.estimation.learned import average_features
-from pipeline.estimation.learned_bands import Coverage, Ratios, list_ratios, make_bands, measure_coverage
 from pipeline.estimation.parts import CLIP
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
-from pipeline.estimation.rivals import Rival, compare_errors, judge_fit, time_fit
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Late
 from pipeline.models.learned_term import (
@@ -62,6 +59,8 @@ from pipeline.run.recording import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.estimation.diagnosis import Json
+    from pipeline.estimation.learned_bands import Coverage, Ratios
+    from pipeline.estimation.rivals import Rival
 
 _INDEPENDENT = 0.25
 """Share of independent windows of half a second: their residuals are correlated for two seconds, as in
@@ -91,6 +90,8 @@ class ResidualData:
     @cached_property
     def windows(self) -> tuple[Floats, Floats, Flags]:
         """Inputs (n, p) and residuals (n, 3) of all windows, and whether each lies within one prediction."""
+        from pipeline.estimation.learned import average_features  # noqa: PLC0415 - only where a term is learned
+
         known, residuals, whole = list[Floats](), list[Floats](), list[Flags]()
         for run, comparison in enumerate(self.problem.comparisons):
             probe = InputProbe()
@@ -227,6 +228,8 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
     falls = list_rises(new, old, CHANCE)
     if not falls:
         return f"no error over 2 s falls by more than {format_share(CHANCE)}"
+    from pipeline.estimation.rivals import compare_errors  # noqa: PLC0415 - only where a term is learned
+
     for name in falls:
         one, other = (
             np.concatenate(held.position if name == "t_mrmse_m" else held.yaw) for held in (after, before)
@@ -285,6 +288,8 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
     term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
     if not term.inputs:
         return LearnedStep(term, below, below, "no input explains the residual")
+    from pipeline.estimation.learned_bands import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
+
     above = hold_out(problem, fitted, learn_fold(problem))
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
     state = fitted.state.add(term)
@@ -312,6 +317,8 @@ def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()
 
 def judge_with_term(problem: Problem, name: str, model: Model, per_run: Sequence[str] = ()) -> Rival:
     """As `judge_rival`, for a model that may have a learned term, which is retrained."""
+    from pipeline.estimation.rivals import Rival, judge_fit, time_fit  # noqa: PLC0415 - only where a term is learned
+
     fitted, fit_s = time_fit(problem, drop_learned(model), per_run)
     physics = judge_fit(problem, name, fitted, fit_s)
     if find_learned(model) is None:
@@ -393,7 +400,10 @@ def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = (
     grounds = sorted({run.terrain for run in problem.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
         return None
-    ratios, refusals = list[Ratios](), list[str]()
+    from pipeline.estimation.learned_bands import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
+
+    ratios: list[Ratios] = []
+    refusals: list[str] = []
     for ground in grounds:
         rest = _take(problem, [run for run in problem.runs if run.terrain != ground])
         fitted = fit_model(rest, model, per_run=per_run)
@@ -425,9 +435,12 @@ def check_bands(
         source: its input.
         per_run: labels of parameters with one value per run.
     """
-    term, coverages = find_learned(model), list[dict[str, Coverage]]()
+    coverages: list[dict[str, Coverage]] = []
+    term = find_learned(model)
     if term is None or term.bands is None:
         return coverages
+    from pipeline.estimation.learned_bands import list_ratios, measure_coverage  # noqa: PLC0415 - only where a term is learned
+
     for run in runs:
         there = Problem([run], model.vehicle, source)
         state = fit_own(there, model, per_run).state

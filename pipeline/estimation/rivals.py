@@ -14,9 +14,8 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.numerics import jackknife_deviation, student_quantile
-from pipeline.core.program import JSON_DIGITS, finite_or_none
+from pipeline.core import JSON_DIGITS, finite_or_none
+from pipeline.core.arrays import Floats, Ints, jackknife_deviation, student_quantile
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions
 from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error

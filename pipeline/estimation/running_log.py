@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import cast
 
-from pipeline.core.json_objects import objects_in
+from pipeline.core.untrusted import objects_in
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal

@@ -10,9 +10,8 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.core.arrays import Bytes, Flags, Floats
+from pipeline.core.arrays import Bytes, Flags, Floats, student_quantile
 from pipeline.core.compute import map_parallel
-from pipeline.core.numerics import student_quantile
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained

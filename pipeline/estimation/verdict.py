@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from pipeline.core.json_objects import mapping_in, number_in, objects_in
+from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects

@@ -1,15 +1,35 @@
-"""Export of models to targets; the targets are discovered in the folder `targets`."""
+"""Export of models to targets, found by being in this folder, and what targets share.
+
+Shared are the conversion of a fitted model to controller parameters, and ROS 2 parameter files.
+"""
+
+from __future__ import annotations
 
 import functools
 import importlib
+import io
+import math
+import operator
 import pkgutil
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from pipeline.core.program import guess_names
+from ruamel.yaml import YAML
+from ruamel.yaml.comments import CommentedMap, CommentedSeq
+
+from pipeline.core import INPUT_WORDS, guess_names
+from pipeline.models.catalogue import is_own
+from pipeline.models.effect import Effect, Parameter
+from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import ModelFile
+from pipeline.models.parameter import Quantity
 from pipeline.run.recording import MotionError
+
+if TYPE_CHECKING:
+    from ruamel.yaml.nodes import ScalarNode
+    from ruamel.yaml.representer import RoundTripRepresenter
 
 Current = Mapping[str, float]
 
@@ -40,7 +60,7 @@ class Target:
 @functools.cache
 def list_targets() -> tuple[Target, ...]:
     """All targets of the folder, by name."""
-    folder = importlib.import_module("pipeline.export.targets")
+    folder = importlib.import_module("pipeline.export")
     modules = (
         importlib.import_module(f"{folder.__name__}.{m.name}") for m in pkgutil.iter_modules(folder.__path__)
     )
@@ -114,3 +134,329 @@ def export_model(file: ModelFile, name: str, current: Current | None = None) -> 
             others, see the target.
     """
     return find_target(name).write(file, current or {})
+
+
+@dataclass(frozen=True)
+class Amount:
+    """Value with its sources.
+
+    Attributes:
+        value: in SI units.
+        sources: a line for each parameter it was computed from; empty if nothing is known.
+        effects: ids of the effects among them.
+    """
+
+    value: float
+    sources: tuple[str, ...] = ()
+    effects: frozenset[str] = frozenset()
+
+    def __neg__(self) -> Amount:
+        return self.change(operator.neg)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the value was measured and is finite."""
+        return bool(self.sources) and math.isfinite(self.value)
+
+    def change(self, function: Callable[..., float], *given: Amount) -> Amount:
+        """Convert the value to another quantity, such as a body limit to a wheel limit by the wheel's radius.
+
+        The effects of the given values are listed as sources, but not as effects covered by the result.
+        """
+        return Amount(_compute(function, self, *given), _unite(self, *given), self.effects)
+
+
+def combine(function: Callable[..., float], *amounts: Amount) -> Amount:
+    """Apply a function to several values; the sources and effects are united."""
+    effects = frozenset[str]().union(*(amount.effects for amount in amounts))
+    return Amount(_compute(function, *amounts), _unite(*amounts), effects)
+
+
+def _compute(function: Callable[..., float], *amounts: Amount) -> float:
+    """Value of the function; NaN for a division by zero."""
+    try:
+        return function(*(amount.value for amount in amounts))
+    except ZeroDivisionError:
+        return math.nan
+
+
+def _unite(*amounts: Amount) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(line for amount in amounts for line in amount.sources))
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One parameter of a target.
+
+    Attributes:
+        path: names of the parent nodes and groups and of the parameter, separated by dots.
+        value: value as written: a number, or several in a row.
+        sources: sources of the value.
+        effects: ids of the effects that it covers.
+    """
+
+    path: str
+    value: float | bool | tuple[float, ...] | tuple[bool, ...]
+    sources: tuple[str, ...] = ()
+    effects: frozenset[str] = frozenset()
+
+
+@dataclass
+class Sheet:
+    """Parameters of a target, in order.
+
+    Attributes:
+        head: comment lines above them.
+        settings: the parameters.
+    """
+
+    head: list[str] = field(default_factory=list)
+    settings: list[Setting] = field(default_factory=list)
+
+    def add(self, path: str, amount: Amount, note: str = "") -> None:
+        """Add a value unless it is unknown."""
+        if amount.is_known:
+            self._append(path, _round(amount.value), amount, note)
+
+    def add_row(self, path: str, amounts: tuple[Amount | float, ...], note: str = "") -> None:
+        """Add a parameter of several values, unless one that is not a constant is unknown."""
+        measured = [amount for amount in amounts if isinstance(amount, Amount)]
+        if all(amount.is_known for amount in measured):
+            numbers = tuple(_round(a.value if isinstance(a, Amount) else a) for a in amounts)
+            self._append(path, numbers, combine(lambda *_: math.nan, *measured), note)
+
+    def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
+        notes = (note,) if note else ()
+        self.settings.append(Setting(path, value, (*amount.sources, *notes), amount.effects))
+
+
+class Facts:
+    """Vehicle properties from a model file: quantities, and delays and limits of the body derived from them.
+
+    Attributes:
+        file: the model file.
+        vehicle: its vehicle.
+    """
+
+    def __init__(self, file: ModelFile) -> None:
+        self.file = file
+        self.vehicle = file.model.vehicle
+
+    def take(self, quantity: Quantity) -> Amount:
+        """Return a quantity; neutral and without sources if no effect of the model has it.
+
+        Formulas and Python effects of the user do not count, whatever their ids are; nor do parameters that
+        the fit did not determine, and effects with equally good alternatives.
+        """
+        values, sources, effects = [], [], []
+        for effect, parameter in self._list_numbers():
+            is_open = self.file.find_doubt(effect, parameter) or self.file.list_rivals(effect.id)
+            if quantity in parameter.quantities and not is_open:
+                values.append(effect.values[parameter.name])
+                sources.append(self._format_source(effect, parameter))
+                effects.append(effect.id)
+        return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
+
+    def measure(self, name: str) -> Amount:
+        """Return a vehicle dimension by its field name; NaN and unknown if it is not given."""
+        value = getattr(self.vehicle, name)
+        return Amount(math.nan if value is None else value, (f"vehicle {self.vehicle.id}: {name}",))
+
+    def find_radius(self) -> Amount:
+        """Effective wheel radius [m]."""
+        return combine(operator.mul, self.measure("wheel_radius_m"), self.take(Quantity.RADIUS))
+
+    def find_track(self) -> Amount:
+        """Effective track width [m]."""
+        return combine(operator.mul, self.measure("track_width_m"), self.take(Quantity.TRACK))
+
+    def find_largest_steering(self) -> Amount:
+        """Steering angle at the largest command [rad]."""
+        return combine(operator.mul, self.measure("max_steering_rad"), self.take(Quantity.STEERING_GAIN))
+
+    def find_turning_radius(self) -> Amount:
+        """Smallest turning radius that a car reaches to both sides [m]."""
+        gain, offset = self.take(Quantity.STEERING_GAIN), self.take(Quantity.STEERING_OFFSET)
+        angle = self.measure("max_steering_rad").change(lambda a, g, o: g * a - abs(o), gain, offset)
+        return self.measure("wheelbase_m").change(_find_circle, angle)
+
+    def find_speed_delay(self) -> Amount:
+        """Delay of the speed behind a smooth command [s]: sum of dead time and time constants."""
+        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(Quantity.SPEED_LAG))
+
+    def find_turn_delay(self) -> Amount:
+        """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering."""
+        lag = Quantity.TURN_LAG if self.vehicle.kind == "differential" else Quantity.STEERING_LAG
+        return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
+
+    def find_speed_limit(self) -> Amount:
+        """Largest speed [m/s], from the body command or from the wheels when driving straight."""
+        wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
+        return self._hold(_take_least(self.take(Quantity.SPEED_LIMIT), wheels), "driven_speed_mps", "m/s")
+
+    def find_turn_limit(self) -> Amount:
+        """Largest yaw rate [rad/s], from the body command or from the wheels when turning on the spot."""
+        limit = _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
+        return self._hold(limit, "driven_yaw_rate_radps", "rad/s")
+
+    def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
+        """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
+        rows = self.file.list_fitted("runs")
+        driven = [value for row in rows if isinstance(value := row.get(key), float)]
+        if not (limit.is_known and driven) or limit.value <= max(driven):
+            return limit
+        most = max(driven)
+        source = f"no more than was driven: {most:.3g} {unit} (99th percentile)"
+        return Amount(most, (*limit.sources, source), limit.effects)
+
+    def find_speed_acceleration(self) -> Amount:
+        """Largest acceleration [m/s^2] driving straight."""
+        return self.take(Quantity.WHEEL_ACCELERATION_LIMIT).change(operator.mul, self.find_radius())
+
+    def find_turn_acceleration(self) -> Amount:
+        """Largest yaw acceleration [rad/s^2] turning on the spot; unknown for a car."""
+        return self._spin(Quantity.WHEEL_ACCELERATION_LIMIT)
+
+    def find_deadband(self) -> tuple[Amount, Amount]:
+        """Deadband as speed [m/s] when driving straight and as yaw rate [rad/s] when turning on the spot."""
+        rim = self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
+        return rim, self._turn(rim)
+
+    def list_unmapped(self, sheet: Sheet) -> list[str]:
+        """Effects that no parameter of a sheet covers, one line each with their parameters."""
+        used = frozenset[str]().union(*(setting.effects for setting in sheet.settings))
+        return [
+            "; ".join(self._format_source(effect, p) for p in effect.parameters if effect.is_used(p))
+            or effect.id
+            for effect in self.file.model
+            if effect.id not in used
+        ]
+
+    def format_fit(self) -> str:
+        """Data that the model was fitted to; empty before a fit."""
+        names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
+        source = str(self.file.fit.get("input"))
+        return f"Fitted {INPUT_WORDS.get(source, source)} of {', '.join(names)}." if names else ""
+
+    def _spin(self, quantity: Quantity) -> Amount:
+        return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
+
+    def _turn(self, rim: Amount) -> Amount:
+        """Yaw rate of a vehicle whose sides run at opposite speeds; unknown for a car."""
+        if self.vehicle.kind != "differential":
+            return Amount(math.nan)
+        return rim.change(lambda speed, track: 2.0 * speed / track, self.find_track())
+
+    def _list_numbers(self) -> Iterator[tuple[Effect, Parameter]]:
+        for effect in self.file.model:
+            if not isinstance(effect, FormulaEffect) and not is_own(type(effect)):
+                yield from ((effect, parameter) for parameter in effect.parameters)
+
+    def _format_source(self, effect: Effect, parameter: Parameter) -> str:
+        label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
+        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        text = f"{label} = {value:.5g}{unit}"
+        if label in self.file.intervals:
+            low, high = self.file.intervals[label]
+            text += f" (95 %: {low:.5g} to {high:.5g})"
+        if rivals := self.file.list_rivals(effect.id):
+            text += f", undecided: {' or '.join(rivals)} would explain the data as well"
+        for number, other, at in self.file.unless:
+            text += f", {at:.5g}{unit} with {other} in the model" if number == label else ""
+        doubt = self.file.find_doubt(effect, parameter)
+        return f"{text}, {doubt}" if doubt else text
+
+
+def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:
+    """Facts of a model, and a sheet with a head that gives vehicle, target and fit.
+
+    Raises:
+        MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
+    """
+    facts = Facts(file)
+    if facts.vehicle.kind not in kinds:
+        raise MotionError(
+            "wrong_vehicle",
+            f"{target.name} has parameters for {' and '.join(kinds)} vehicles; {facts.vehicle.id} is "
+            f"{facts.vehicle.kind}",
+            where=facts.vehicle.id,
+            hint="Export to another target: json and python take every vehicle.",
+        )
+    head = [
+        f"{facts.vehicle.name}: {target.about}.",
+        f"Names: {target.source}.",
+        facts.format_fit(),
+    ]
+    return facts, Sheet([line for line in head if line])
+
+
+def _join(quantity: Quantity, values: list[float]) -> float:
+    if values or quantity.join not in {min, max}:
+        return float(quantity.join(values))
+    return math.inf if quantity.join is min else 0.0
+
+
+def _round(value: float) -> float:
+    return float(f"{value:.5g}")
+
+
+def _find_circle(wheelbase_m: float, angle_rad: float) -> float:
+    """Turning radius of the rear axle; infinite if the car steers to one side only."""
+    return wheelbase_m / math.tan(angle_rad) if angle_rad > 0.0 else math.inf
+
+
+def _take_least(*amounts: Amount) -> Amount:
+    known = [amount for amount in amounts if amount.is_known]
+    return combine(min, *known) if len(known) > 1 else (known or [Amount(math.inf)])[0]
+
+
+_INDENT = 2
+
+
+def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
+    """Comment lines above the parameters: the head, and the effects that none of them covers."""
+    unmapped = facts.list_unmapped(sheet)
+    lines = [*sheet.head, *(["No parameter there stands for:"] if unmapped else [])]
+    return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
+
+
+def make_plain(text: str) -> str:
+    """Replace unprintable characters, so that the text fits on one line."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def write_yaml(facts: Facts, sheet: Sheet) -> str:
+    """Format a sheet as a ROS 2 parameter file."""
+    tree = CommentedMap()
+    for setting in sheet.settings:
+        group = tree
+        *above, name = setting.path.split(".")
+        for node in above:
+            group = group.setdefault(node, CommentedMap())
+        group[name] = _make_value(setting.value)
+        comment = "\n".join(make_plain(line) for line in setting.sources)
+        group.yaml_set_comment_before_after_key(name, before=comment, indent=_INDENT * len(above))
+    comments = "".join(f"# {line}\n" for line in list_comments(facts, sheet))
+    if not tree:
+        return comments
+    yaml, text = YAML(), io.StringIO()
+    yaml.width = 4096
+    yaml.representer.add_representer(float, _represent_float)
+    yaml.dump(tree, text)
+    return comments + text.getvalue()
+
+
+def _make_value(value: object) -> object:
+    if not isinstance(value, tuple):
+        return value
+    row = CommentedSeq(value)
+    row.fa.set_flow_style()
+    return row
+
+
+def _represent_float(representer: RoundTripRepresenter, value: float) -> ScalarNode:
+    """Write a number with a point, so that every YAML reader takes it for a double."""
+    text = repr(value)
+    if "." not in text:
+        text = text.replace("e", ".0e")
+    return representer.represent_scalar("tag:yaml.org,2002:float", text)

@@ -15,8 +15,8 @@ from itertools import combinations
 import numpy as np
 import polars as pl
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.program import format_share
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS

@@ -19,8 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
-from pipeline.core.numerics import normal_tail
+from pipeline.core.arrays import Flags, Floats, normal_tail
 from pipeline.fleet.levels import FEWEST_OF_SPREAD, weigh_run_spreads
 
 CHANCE = 0.025

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.numerics import student_quantile
+from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
 from pipeline.fleet.rank_tests import (
     CONFIDENCE,
     DRAWS,

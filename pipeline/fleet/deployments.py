@@ -7,10 +7,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core.program import naming_os_errors
-from pipeline.core.tables import format_csv, unquote_formulas
-from pipeline.fleet.datasets import Measure
-from pipeline.fleet.runs import ComparisonError
+from pipeline.core import naming_os_errors
+from pipeline.core.untrusted import format_csv, unquote_formulas
+from pipeline.fleet import ComparisonError, Measure
 from schemas.pooled_tables import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.

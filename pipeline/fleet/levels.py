@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.numerics import student_quantile
+from pipeline.core.arrays import Floats, Ints, student_quantile
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.rank_tests import CONFIDENCE, StatisticsError, check_values
 

@@ -1,4 +1,6 @@
-"""Pairwise comparison of groups of runs, and tables of comparisons."""
+"""Pairwise comparison of groups of runs, tables of comparisons, and agreement on the order of terrains."""
+
+from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -8,9 +10,10 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
+from pipeline.core import pick
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.program import pick
-from pipeline.core.tables import format_csv
+from pipeline.core.untrusted import format_csv
+from pipeline.fleet import MEASURES
 from pipeline.fleet.confidence import (
     Blocks,
     Comparison,
@@ -27,6 +30,8 @@ from pipeline.fleet.rank_tests import (
     MOST_GROUPS,
     adjust_holm,
     adjust_max_t,
+    kendall_p,
+    kendall_tau,
     mann_whitney,
     name_delta,
     runs_needed,
@@ -383,3 +388,67 @@ class Answer:
     intervals: pl.DataFrame
     windows: pl.DataFrame
     notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of two vehicles on the order of the terrains that both were driven on.
+
+    Attributes:
+        measure: key of `MEASURES`.
+        a, b: vehicles.
+        terrains: common terrains, from easy to hard for `a`.
+        tau: Kendall's tau-b; None with fewer than two terrains.
+        p: two-sided probability of an order as strong if there were none.
+        smallest_p: smallest p possible with this number of terrains.
+        text: the result in words.
+    """
+
+    measure: str
+    a: str
+    b: str
+    terrains: tuple[str, ...]
+    tau: float | None
+    p: float | None
+    smallest_p: float | None
+    text: str
+
+
+def compare_orders(datasets: pl.DataFrame) -> list[Agreement]:
+    """Compare every two vehicles by every measure that both have; a terrain has the median over its datasets.
+
+    Args:
+        datasets: table `datasets` of one input; rows over several vehicles or terrains are ignored.
+    """
+    known = datasets.filter(pl.col("vehicle") != "*", pl.col("terrain") != "*")
+    comparisons = []
+    for a, b in itertools.combinations(sorted(set(known["vehicle"])), 2):
+        for key, measure in MEASURES.items():
+            sides = [
+                known.filter(pl.col("vehicle") == vehicle)
+                .drop_nulls(measure.column)
+                .group_by("terrain")
+                .agg(pl.col(measure.column).median().alias(vehicle))
+                for vehicle in (a, b)
+            ]
+            comparisons.append(_order(key, a, b, sides[0].join(sides[1], on="terrain").sort(a, "terrain")))
+    return comparisons
+
+
+def _order(key: str, a: str, b: str, both: pl.DataFrame) -> Agreement:
+    terrains = tuple(both["terrain"].to_list())
+    count = len(terrains)
+    if count < 2:  # noqa: PLR2004 - an order takes two
+        shared = f"share {terrains[0]} only" if terrains else "have no terrain in common"
+        return Agreement(
+            key, a, b, terrains, None, None, None, f"{a} and {b} {shared}: no order of terrains to compare"
+        )
+    tau = kendall_tau(both[a], both[b])
+    p, smallest = kendall_p(tau, count)
+    sure = (
+        f"p = {p:.2g}"
+        if smallest <= LEVEL
+        else f"too few terrains for significance, p = {p:.2g}; at least 5 are needed"
+    )
+    text = f"{a} and {b} on {count} terrains by {MEASURES[key].name}: Kendall's tau {tau:.2f}, {sure}"
+    return Agreement(key, a, b, terrains, tau, p, smallest, text)

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipeline.core import SlipError
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.program import SlipError
 
 # Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
 #

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core.program import NORMAL_95, finite_or_none, pick
+from pipeline.core import NORMAL_95, finite_or_none, pick
+from pipeline.fleet import UNKNOWN
 from pipeline.fleet.forecast import leave_out_odd, list_numbers
+from pipeline.fleet.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.fleet.rank_tests import LEVEL
-from pipeline.fleet.runs import UNKNOWN
-from pipeline.fleet.shifts import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.models.catalogue import find_effect
 from pipeline.models.parameter import Level
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 
 
 class JobError(SlipError):

@@ -1,21 +1,29 @@
-"""Analysis of one log through all stages: summary, report, and the drives planned for its run."""
+"""One log through all stages: its results, preview and plan; and stored runs, opened by log or name."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from contextlib import suppress
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core.program import read_version
+from pipeline.core import SlipError, read_version
 from pipeline.core.untrusted import PathError, resolve_inside
-from pipeline.job import FIGURES, STAGES, FigureFormat, Options
-from pipeline.job.keys import hash_json, key_stages
-from pipeline.job.log_setup import LogSetup, name_run, set_up_log
+from pipeline.job import FIGURES, INPUTS, STAGES, FigureFormat, Options
+from pipeline.job.keys import (
+    LogSetup,
+    find_recorded_log,
+    find_run,
+    hash_json,
+    key_stages,
+    name_run,
+    set_up_log,
+)
 from pipeline.job.run_results import (
     DIAGNOSIS,
     diagnose_work,
@@ -27,15 +35,15 @@ from pipeline.job.run_results import (
     summarize_run,
 )
 from pipeline.job.work import Progress, Work, hash_model, read_wanted, stored_contexts, stored_keys
-from pipeline.logs import LogData, LogError, locate_recorded, spell_location
-from pipeline.report.page import PLANS, lead_to, lead_up
-from pipeline.report.scene import RunReport
+from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
+from pipeline.report import PLANS, lead_to, lead_up
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import QUARANTINE, encode_run
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan  # numerical imports that the workbench pages do not need
+    from pipeline.plan.plan import Plan
+    from pipeline.report.scene import RunReport
 
 PREVIEW = "plan.json"
 
@@ -309,6 +317,7 @@ def _write_outputs(
         # Importing the plotting code is most of the start-up time: only if needed.
         from pipeline.report.motion_view import view_diagnosis  # noqa: PLC0415
         from pipeline.report.page import render_report  # noqa: PLC0415
+        from pipeline.report.scene import RunReport  # noqa: PLC0415
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
@@ -326,7 +335,7 @@ def _write_outputs(
 def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
     import tempfile  # noqa: PLC0415 - only where figures are asked for
 
-    from pipeline.report.figure_files import write_figures  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_figures  # noqa: PLC0415 - heavy
 
     with tempfile.TemporaryDirectory() as folder:
         for path in write_figures(report, Path(folder), kind):
@@ -369,10 +378,9 @@ def update_datasets(store: Store) -> None:
 
     Columns that only `slip compare` computes are null until it has run.
     """
-    from pipeline.fleet.datasets import pool_runs  # noqa: PLC0415 - heavy
-    from pipeline.fleet.runs import gather_runs  # noqa: PLC0415 - heavy
+    from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
     from pipeline.job.compared_runs import find_material  # noqa: PLC0415 - heavy
-    from pipeline.report.page import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
+    from pipeline.report import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
 
     write_page(store, CATALOGUE, render_catalogue(store))
     compared = find_material(store, ("dataset",), trusted_only=False, tables=("aggregates",))
@@ -380,3 +388,113 @@ def update_datasets(store: Store) -> None:
         return
     pooled = pool_runs(gather_runs(compared.scan("aggregates").collect(), compared.labels), ("dataset",))
     store.write_results_table("datasets", pooled)
+
+
+@dataclass(frozen=True)
+class OpenedRun:
+    """An opened run.
+
+    Attributes:
+        manifest: its results.
+        lossy: whether the run was opened by its log and the log had losses.
+        note: warning that the log's current configuration would give other results; else empty.
+    """
+
+    manifest: Manifest
+    lossy: bool = False
+    note: str = ""
+
+
+@contextmanager
+def open_run(text: str, options: Options, progress: Progress) -> Iterator[OpenedRun]:
+    """Open the results of a log or of a stored run; stored results are never changed.
+
+    If complete results exist for the content of a log, they are used as they are. With other options
+    (`--vehicle`, `--config`, ...), the log is analyzed again in a temporary folder. A log without results is
+    analyzed and stored.
+
+    Args:
+        text: name of a run, or path of a log.
+        options: options of the user; results always have both inputs.
+        progress: callback, called with the name of each stage that is computed.
+
+    Raises:
+        SlipError: the log cannot be read, or there is no such run.
+    """
+    store = Store(options.out)
+    path = Path(text)
+    chosen = bool(options.overrides) or options.config is not None
+    if path.exists():
+        stored = _find_stored(path, store)
+    else:
+        stored = _find_named(text, path, store)
+        if stored is not None and not chosen:
+            yield OpenedRun(stored)
+            return
+        hint = f"Other choices than the run's need it: give its path, or ask about {text} without them."
+        path = path if stored is None else find_recorded_log(stored, hint=hint)
+    if stored is None and options.inputs != INPUTS:
+        # Raises the error of a missing input before anything is computed.
+        set_up_log(path, options)
+    options = replace(options, inputs=INPUTS)
+    if stored is None:
+        outcome = analyze_log(path, options, progress)
+        if outcome.computed:
+            update_datasets(store)
+        yield OpenedRun(outcome.manifest, outcome.lossy)
+        return
+    changed = _is_changed(path, stored, options, asked=chosen)
+    if changed and chosen:
+        with tempfile.TemporaryDirectory(prefix="slip-") as folder:
+            aside = replace(options, out=Path(folder), run=stored.run, report=False, diagnosis=False)
+            outcome = analyze_log(path, aside, progress)
+            yield OpenedRun(outcome.manifest, outcome.lossy)
+        return
+    note = (
+        f"{stored.run} is read as it was analyzed, with other options or another configuration than now; "
+        f"slip analyze {text} recomputes it"
+    )
+    lossy = bool(stored_contexts(stored).get("extract", {}).get("losses"))
+    yield OpenedRun(stored, lossy, note if changed else "")
+
+
+def _find_stored(path: Path, store: Store) -> Manifest | None:
+    """The complete results of a log's content; None if there are none."""
+    sha256 = LogIdentities(store).lookup(path)
+    if sha256 is None:
+        size = sum(part.stat().st_size for part in (list_files(path) if path.is_dir() else [path]))
+        # Hashing reads the whole log: only if a stored log has the same size.
+        if all(manifest.part("log").get("bytes") != size for manifest in store.survey().manifests):
+            return None
+        sha256 = hash_log(path)
+    manifest = store.manifest(name_run(path, sha256, store))
+    if manifest is None or manifest.part("log").get("sha256") != sha256 or SUMMARY not in manifest.files:
+        return None
+    return manifest
+
+
+def _find_named(text: str, path: Path, store: Store) -> Manifest | None:
+    """The results of that name; None if it is the path of a log that does not exist."""
+    known = {manifest.run: manifest for manifest in store.survey().manifests}
+    if text in known:
+        return known[text]
+    return None if path.suffix else find_run(text, store)
+
+
+def _is_changed(path: Path, stored: Manifest, options: Options, *, asked: bool) -> bool:
+    """Whether an analysis would now use another vehicle or configuration."""
+    try:
+        setup = set_up_log(path, options)
+    except SlipError:
+        if asked:
+            raise
+        # Without the options of its analysis, the log alone may be insufficient.
+        return False
+    now = {
+        "configuration": msgspec.to_builtins(setup.configuration),
+        "vehicle": msgspec.to_builtins(setup.vehicle),
+        "terrain": setup.terrain,
+        "dataset": setup.dataset,
+        "inputs": options.inputs,
+    }
+    return any(stored.details.get(key) != value for key, value in json.loads(json.dumps(now)).items())

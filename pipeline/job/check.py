@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core.program import NORMAL_95, finite_or_none, format_share, guess_names, shorten
+from pipeline.core import NORMAL_95, finite_or_none, format_share, guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
-from pipeline.job.check_numbers import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO, RunReading
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
-from pipeline.models.model_text import write_text
+from pipeline.job.stored_fits import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO, RunReading
+from pipeline.models import write_text
 
 if TYPE_CHECKING:
     from pipeline.job.keys import Owner

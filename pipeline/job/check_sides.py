@@ -12,19 +12,18 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
+from pipeline.core import NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.core.arrays import Floats
-from pipeline.core.program import NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
-from pipeline.job.check_numbers import ERRORS, Label, RunReading, list_labels, measure_slip, read_run
 from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
-from pipeline.job.stored import read_runs
+from pipeline.job.stored_fits import ERRORS, Label, RunReading, list_labels, measure_slip, read_run, read_runs
+from pipeline.models import format_model
 from pipeline.models.catalogue import list_effects
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
-from pipeline.models.model_text import format_model
 from pipeline.models.parameter import is_of_one_run
 from pipeline.report.motion_view import read_model_text
 

@@ -7,11 +7,11 @@ import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.verdict import enumerate_texts, name_effect
 from pipeline.job.check import Check, find_pace
-from pipeline.job.check_numbers import ERRORS, POSITION_ERROR, Label
+from pipeline.job.stored_fits import ERRORS, POSITION_ERROR, Label
 from pipeline.models.effect import Place
 from pipeline.models.parameter import Level
 

@@ -7,11 +7,19 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
+from pipeline.core import read_version
 from pipeline.core.arrays import Ints
-from pipeline.core.program import read_version
+from pipeline.fleet import (
+    OVER_RUNS,
+    THIS_RUN,
+    add_measures,
+    gather_runs,
+    measure_difficulty,
+    pool_runs,
+    spread_windows,
+)
 from pipeline.fleet.confidence import Interval, bound_typical
-from pipeline.fleet.datasets import OVER_RUNS, THIS_RUN, compare_orders, pool_runs, spread_windows
-from pipeline.fleet.features import check_features
+from pipeline.fleet.exchange import check_features, follow_published, read_limits
 from pipeline.fleet.pairs import (
     Answer,
     Group,
@@ -19,15 +27,14 @@ from pipeline.fleet.pairs import (
     Samples,
     bound_run,
     compare_groups,
+    compare_orders,
     tabulate_pairs,
     write_csv,
     write_latex,
 )
-from pipeline.fleet.published_chain import follow_published, read_limits
-from pipeline.fleet.runs import add_measures, gather_runs, measure_difficulty
 from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
-from pipeline.report.templating import Picture
+from pipeline.report import Picture
 from pipeline.stages.slip_stage import WINDOW_S
 from pipeline.store import Store
 from schemas.pooled_tables import Features
@@ -141,8 +148,8 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     Returns:
         The files by name.
     """
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import list_pictures, render_comparison  # noqa: PLC0415 - heavy
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     store.write_results_table("datasets", answer.datasets)
     store.write_results_table("comparisons", answer.comparisons)
@@ -165,7 +172,7 @@ def write_figures(
     """Write figures to `figures/` if a format is given; return the files by name."""
     if figures is None:
         return {}
-    from pipeline.report.figure_files import write_pictures  # noqa: PLC0415 - heavy
+    from pipeline.report.page import write_pictures  # noqa: PLC0415 - heavy
 
     return {path.name: path for path in write_pictures(draw(), store.root / "figures", figures)}
 

@@ -7,8 +7,7 @@ from datetime import UTC, datetime
 import polars as pl
 
 from pipeline.estimation.verdict import find_refusal
-from pipeline.fleet.datasets import read_day
-from pipeline.fleet.runs import label_runs
+from pipeline.fleet import label_runs, read_day
 from pipeline.job.run_results import DIAGNOSED
 from pipeline.store import Manifest, Store
 from pipeline.store.parquet_tables import scan_table

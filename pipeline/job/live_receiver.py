@@ -21,10 +21,15 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import JobError
-from pipeline.logs.live_protocol import FOXGLOVE_NAMES, FrameError, LiveProtocol, choose_protocol
-from pipeline.logs.live_recording import LiveRecording
+from pipeline.logs.live_recording import (
+    FOXGLOVE_NAMES,
+    FrameError,
+    LiveProtocol,
+    LiveRecording,
+    choose_protocol,
+)
 from pipeline.sources.message_types import MessageType, find_type, plain_type
 from pipeline.sources.topics import STRING_TYPE, TRANSFORM_TYPES
 

@@ -21,11 +21,10 @@ from urllib.parse import urlsplit
 
 import msgspec
 
-from pipeline.core.program import python_command
+from pipeline.core import python_command
 from pipeline.job import JobError
 from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
-from pipeline.logs.growing import GrowingLog
-from pipeline.logs.index import LISTING, list_files
+from pipeline.logs.index import LISTING, GrowingLog, list_files
 from pipeline.logs.live_recording import lock_folder
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)

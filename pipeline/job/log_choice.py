@@ -7,8 +7,11 @@
 4. The geometry of an unidentified vehicle is estimated from the wheels and the pose.
 """
 
+from __future__ import annotations
+
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -57,9 +60,11 @@ from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
 from pipeline.stages.extract import Extracted, extract_tables
-from pipeline.stages.pose_choice import PoseRating, fit_controller, fit_geometry, rate_poses, replace_pose
 from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
+
+if TYPE_CHECKING:
+    from pipeline.stages.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")
@@ -377,6 +382,8 @@ def _check_contradiction(
 def _compare(
     chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
+    from pipeline.stages.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - where several compete
+
     data = read_topics(index, list_wanted(chosen.sources, index.types, rivals))
     ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
     findings = chosen.findings
@@ -439,6 +446,8 @@ def _fit_vehicle(
         asked = sources.command if drive is not sources.command else None
         measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
         made = extract_tables(data, measured, configuration, vehicle, where=where)
+        from pipeline.stages.pose_choice import fit_controller, fit_geometry  # noqa: PLC0415 - seldom needed
+
         fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
         if fitted is None:
             raise problem

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core.program import finite_or_none, pick, pick_finite
+from pipeline.core import finite_or_none, pick, pick_finite
+from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
-from pipeline.fleet.datasets import MEASURES, pool_runs
 from pipeline.fleet.deployments import (
     DeploymentMap,
     find_own_table,
@@ -19,7 +19,6 @@ from pipeline.fleet.deployments import (
     read_deployments,
 )
 from pipeline.fleet.rank_tests import LEVEL
-from pipeline.fleet.runs import ComparisonError, gather_runs
 from pipeline.fleet.trend import (
     FEWEST_RUNS,
     ParameterTrend,
@@ -151,8 +150,8 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         causes: result of `find_causes`.
         figures: also write the figure to `figures/` in this format.
     """
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     written: dict[str, Path] = {}
     for name, frame in (
@@ -263,8 +262,8 @@ def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.Da
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
     """Write `map.html`, and the figure if a format is given; return the path of the page."""
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.map_page import picture_map, render_map  # noqa: PLC0415 - heavy
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     path = write_page(store, "map.html", render_map(drawn))
     write_figures(store, lambda: [picture_map(drawn)], figures)
@@ -364,8 +363,8 @@ def write_trend(store: Store, trend: Trend) -> Path:
     """Write `trend.html` and `trend.json`; return the path of the page."""
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     return write_page(store, "trend.html", render_trend(trend))
 

@@ -12,13 +12,13 @@ from typing import cast
 import numpy as np
 import polars as pl
 
+from pipeline.core import finite_or_none, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
-from pipeline.core.program import finite_or_none, pick
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
 from pipeline.estimation.verdict import enumerate_texts
+from pipeline.fleet import read_day
 from pipeline.fleet.confidence import Interval
-from pipeline.fleet.datasets import read_day
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.fleet.levels import draw_run
 from pipeline.job import JobError, lack_runs
@@ -97,8 +97,8 @@ def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
 
 def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
     """Write `fleet.json`, the table `fleet` and the page; return the path of the first."""
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import render_fleet  # noqa: PLC0415 - heavy
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
 
     store.write_results_table("fleet", tabulate_fleet(model, keys))
     content = {**summarize_fleet(model), "keys": list(keys)}

@@ -13,12 +13,10 @@ from typing import TYPE_CHECKING
 import msgspec
 import polars as pl
 
-from pipeline.core.json_objects import mapping_in, number_in, objects_in, read_object
-from pipeline.core.program import PACKAGE, SlipError, read_version
-from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.core import PACKAGE, SlipError, read_version
+from pipeline.core.untrusted import PathError, mapping_in, number_in, objects_in, read_object, resolve_inside
 from pipeline.job import INPUTS
-from pipeline.job.keys import Owner, agree_on_vehicle, hash_json
-from pipeline.job.log_setup import LogSetup
+from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
 from pipeline.job.work import Work, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.reading import list_wanted

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
+from pipeline.core import SlipError, finite_or_none, format_share
 from pipeline.core.arrays import Floats, interpolate_linearly
-from pipeline.core.program import SlipError, finite_or_none, format_share
 from pipeline.fleet.terrain import (
     CELL_M,
     LARGEST_CELL_M,
@@ -385,8 +385,8 @@ def _locate(cell_table: pl.DataFrame, origins: Mapping[str, tuple[float, float]]
 
 def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
     """Write `cells.parquet`, `terrain.html` and, if georeferenced, `terrain.geojson`; the files by name."""
-    from pipeline.report.page import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.terrain_page import render_terrain  # noqa: PLC0415 - heavy
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import render_terrain  # noqa: PLC0415 - heavy
 
     keys = " ".join(drawn.keys)
     names = drawn.cell_table.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))

@@ -16,14 +16,14 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
+from pipeline.core import SlipError
 from pipeline.core.compute import return_freed_memory
-from pipeline.core.json_objects import read_object
-from pipeline.core.program import SlipError
+from pipeline.core.untrusted import read_object
 from pipeline.job import JobError, Options
-from pipeline.job.log_setup import LogSetup, set_up_log
+from pipeline.job.keys import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded
-from pipeline.logs import SUFFIXES, GrowingLog, LogError, list_files, read_topics
-from pipeline.logs.index import find_parts
+from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
+from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
@@ -32,7 +32,6 @@ from pipeline.store import JSON, Store
 
 if TYPE_CHECKING:
     import polars as pl
-
 
 _FOLDER = "live"
 _SHOWN = 5

@@ -9,12 +9,11 @@ import msgspec
 import numpy as np
 import polars as pl
 
+from pipeline.core import SlipError, naming_os_errors, pick
 from pipeline.core.arrays import Floats
 from pipeline.core.compute import return_freed_memory
-from pipeline.core.program import SlipError, naming_os_errors, pick
 from pipeline.job import STAGES, JobError, Options
-from pipeline.job.keys import EXTRACTED, TABLES
-from pipeline.job.log_setup import LogSetup
+from pipeline.job.keys import EXTRACTED, TABLES, LogSetup
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.run.recording import Alignment, read_alignment
 from pipeline.sources import Vehicle

@@ -1,18 +1,301 @@
 """Reading of recordings (index, topics as columns, transforms) and writing of MCAP files.
 
 Reading is columnar and as fast as inflating the chunks. Damage is reported as losses, and the undamaged data
-around it are read. The package does not interpret the values of messages.
+around it are read. The package does not interpret the values of messages. Here are time series of transforms
+between frames, from ``/tf`` and ``/tf_static``.
+
+Every frame has one parent. A chain is evaluated at the stamps of its last moving link, the one next to the
+child; slower links above it, such as map to odom, are interpolated there.
 """
 
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import Any, Final
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
 from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG
 from pipeline.logs.catalog import OVER_BUDGET
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings
-from pipeline.logs.growing import GrowingLog
+from pipeline.logs.columns import Ragged, RaggedStrings, Strings, join_stamp
 from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, read_topics
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import FETCHED, RemotePath, locate_recorded, open_store, spell_location, to_location
 from pipeline.logs.schema import bundled_types, definition_text, field_names
-from pipeline.logs.transforms import TransformBuffer, TransformSeries, wanted_transforms
-from pipeline.logs.writer import LogWriter
+
+_TRANSFORM: Final = "transforms[]."
+_NUMBERS: Final = (
+    "header.stamp.sec",
+    "header.stamp.nanosec",
+    *(f"transform.translation.{axis}" for axis in "xyz"),
+    *(f"transform.rotation.{axis}" for axis in "xyzw"),
+)
+_LEAST_NORM: Final = 1e-6
+_HELD_INTERVALS: Final = 3.0
+
+TRANSFORM_FIELDS: Final = (
+    f"{_TRANSFORM}header",
+    f"{_TRANSFORM}child_frame_id",
+    f"{_TRANSFORM}transform",
+)
+"""Fields of a TFMessage that ``build_transforms`` needs."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Link:
+    """Pose of a frame in its parent.
+
+    Attributes:
+        parent: frame in which the pose is expressed.
+        child: frame whose pose it is.
+        fixed: whether it never moves; it then has one row.
+        time: stamps [ns], int64, strictly increasing, shape (n,).
+        log_time: log times of these stamps [ns], int64.
+        position: [m], shape (n, 3).
+        quaternion: unit, shape (n, 4).
+    """
+
+    parent: str
+    child: str
+    fixed: bool
+    time: Ints
+    log_time: Ints
+    position: Floats
+    quaternion: Floats
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TransformSeries:
+    """Pose of one frame in another over time.
+
+    Attributes:
+        parent: frame in which the poses are expressed.
+        child: frame whose poses they are.
+        time: stamps [ns], int64, strictly increasing, shape (n,).
+        log_time: log times of the link next to the child [ns], int64, shape (n,).
+        position: [m], shape (n, 3).
+        quaternion: (x, y, z, w), unit, shape (n, 4).
+        notes: held, omitted or ambiguous transforms.
+    """
+
+    parent: str
+    child: str
+    time: Ints
+    log_time: Ints
+    position: Floats
+    quaternion: Floats
+    notes: tuple[str, ...]
+
+
+def wanted_transforms(topics: Iterable[str]) -> list[Wanted]:
+    """Topics and fields to read for a buffer: the topics of a log named ``tf`` or ``tf_static``."""
+    return [Wanted(topic, TRANSFORM_FIELDS) for topic in topics if _base_name(topic) in ("tf", "tf_static")]
+
+
+class TransformBuffer:
+    """All transforms of a recording.
+
+    Args:
+        topics: columns of TFMessage topics, others are ignored; a transform on ``tf_static`` is fixed for
+            the whole recording.
+    """
+
+    def __init__(self, topics: Iterable[TopicColumns]) -> None:
+        self._links: dict[str, Link] = {}
+        self._notes: list[str] = []
+        self._collect(list(topics))
+
+    def frames(self) -> tuple[str, ...]:
+        """All frames, sorted."""
+        return tuple(sorted({name for link in self._links.values() for name in (link.parent, link.child)}))
+
+    def links(self) -> tuple[Link, ...]:
+        """All links, by child."""
+        return tuple(self._links[child] for child in sorted(self._links))
+
+    def chain(self, parent: str, child: str) -> tuple[str, ...]:
+        """Frames from ``parent`` to ``child``, both included.
+
+        Raises:
+            LogError: ``frame_not_found``, a frame is unknown or the two are not connected.
+        """
+        up_child = self._ancestors(_clean(child))
+        up_parent = self._ancestors(_clean(parent))
+        shared = [frame for frame in up_parent if frame in up_child]
+        if not shared:
+            raise self._missing(parent, child)
+        down = up_child[: up_child.index(shared[0])]
+        return (*up_parent[: up_parent.index(shared[0]) + 1], *reversed(down))
+
+    def lookup_series(self, parent: str, child: str, *, at: Ints | None = None) -> TransformSeries:
+        """Pose of ``child`` in ``parent`` over time.
+
+        Args:
+            parent: frame in which the poses are expressed.
+            child: frame whose poses they are.
+            at: stamps of the poses [ns]; by default those of the moving link next to the child.
+
+        Returns:
+            Poses at the times where every link of the chain is known. A link is interpolated between its
+            stamps. Beyond its first and last stamp it is held for three of its intervals plus the time by
+            which its stamps are ahead of their log times (a future-dated map to odom); others are omitted.
+
+        Raises:
+            LogError: ``frame_not_found``.
+        """
+        steps = self._steps(self.chain(parent, child))
+        leading = next((link for link, _ in reversed(steps) if not link.fixed), None)
+        if at is None:
+            time = leading.time if leading is not None else np.zeros(1, dtype=np.int64)
+        else:
+            time = np.asarray(at, dtype=np.int64)
+        known = np.ones(time.size, dtype=np.bool_)
+        for link, _ in steps:
+            known &= _covers(link, time)
+        notes = list(self._notes)
+        if not known.all():
+            notes.append(f"{int((~known).sum())} of {known.size} stamps lie where the chain is not known")
+        time = time[known]
+        position, quaternion = np.zeros((time.size, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (time.size, 1))
+        for link, forward in steps:
+            step_position, step_quaternion = _pose_at(link, time)
+            if not forward:
+                step_quaternion = invert_quaternions(step_quaternion)
+                step_position = -rotate(step_quaternion, step_position)
+            position = position + rotate(quaternion, step_position)
+            quaternion = multiply_quaternions(quaternion, step_quaternion)
+        log_time = leading.log_time[known] if leading is not None and at is None else time
+        return TransformSeries(
+            _clean(parent), _clean(child), time, log_time, position, quaternion, tuple(notes)
+        )
+
+    def _steps(self, chain: tuple[str, ...]) -> list[tuple[Link, bool]]:
+        steps: list[tuple[Link, bool]] = []
+        for upper, lower in pairwise(chain):
+            link = self._links.get(lower)
+            if link is not None and link.parent == upper:
+                steps.append((link, True))
+            else:
+                steps.append((self._links[upper], False))
+        return steps
+
+    def _ancestors(self, frame: str) -> list[str]:
+        chain = [frame]
+        while chain[-1] in self._links and self._links[chain[-1]].parent not in chain:
+            chain.append(self._links[chain[-1]].parent)
+        return chain
+
+    def _missing(self, parent: str, child: str) -> LogError:
+        frames = self.frames()
+        unknown = [frame for frame in (parent, child) if _clean(frame) not in frames]
+        what = (
+            f"there is no frame {' and no frame '.join(unknown)}"
+            if unknown
+            else f"no chain of transforms leads from {parent} to {child}"
+        )
+        hint = f"Known frames: {', '.join(frames)}" if frames else "The log holds no transforms"
+        return LogError("frame_not_found", what, hint=hint)
+
+    def _collect(self, topics: list[TopicColumns]) -> None:
+        links: dict[str, list[Link]] = {}
+        invalid: dict[str, int] = {}
+        for columns in topics:
+            for link, bad in _split_by_child(columns, fixed=_base_name(columns.topic) == "tf_static"):
+                links.setdefault(link.child, []).append(link)
+                invalid[link.child] = invalid.get(link.child, 0) + bad
+        for child, several in links.items():
+            moving = [link for link in several if not link.fixed and link.time.size]
+            chosen = moving or [link for link in several if link.time.size]
+            if not chosen:
+                self._notes.append(f"every transform of {child} is invalid")
+                continue
+            parent = max(chosen, key=lambda link: link.time.size).parent
+            others = sorted({link.parent for link in chosen} - {parent})
+            if others:
+                self._notes.append(
+                    f"{child} has several parents; {parent} was taken, not {', '.join(others)}"
+                )
+            if invalid[child]:
+                self._notes.append(f"{invalid[child]} transforms of {child} are invalid and were left out")
+            self._links[child] = _join([link for link in chosen if link.parent == parent])
+
+
+def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, int]]:
+    """Links with their valid rows, and the number of invalid rows of each."""
+    parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
+    children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
+    numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
+    if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
+        return []
+    values = [column.values for column in numbers if isinstance(column, Ragged)]
+    time = join_stamp(values[0], values[1]) if len(values) == len(_NUMBERS) else None
+    if time is None:
+        return []
+    position = np.stack(values[2:5], axis=1).astype(np.float64)
+    quaternion = np.stack(values[5:], axis=1).astype(np.float64)
+    log_time = np.repeat(columns.log_time, np.diff(children.offsets))
+    with np.errstate(over="ignore", invalid="ignore"):
+        norm = np.linalg.norm(quaternion, axis=1)
+    valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
+    links: list[tuple[Link, int]] = []
+    several = len(children.values)
+    pairs = parents.codes.astype(np.int64) * several + children.codes
+    for pair in np.unique(pairs).tolist():
+        parent, child = divmod(pair, several)
+        here = pairs == pair
+        chosen = here & valid
+        link = Link(
+            _clean(parents.values[parent]),
+            _clean(children.values[child]),
+            fixed,
+            time[chosen],
+            log_time[chosen],
+            position[chosen],
+            quaternion[chosen] / norm[chosen, None],
+        )
+        links.append((link, int((here & ~valid).sum())))
+    return links
+
+
+def _join(links: list[Link]) -> Link:
+    """Join links between the same frames; of equal stamps and of fixed links the last row is used."""
+    time = np.concatenate([link.time for link in links])
+    order = np.argsort(time, kind="stable")
+    last = order[np.r_[np.diff(time[order]) > 0, True]]
+    rows = last[-1:] if links[0].fixed else last
+
+    names = ("time", "log_time", "position", "quaternion")
+    arrays: dict[str, Any] = {
+        name: np.concatenate([getattr(link, name) for link in links])[rows] for name in names
+    }
+    return replace(links[0], **arrays)
+
+
+def _covers(link: Link, time: Ints) -> Flags:
+    """Stamps at which a link is known: within its own, and as far beyond as it is held."""
+    if link.fixed or link.time.size == 1:
+        return np.ones(time.size, dtype=np.bool_)
+    interval = float(np.median(np.diff(link.time)))
+    lead = max(0.0, float(np.median(link.time - link.log_time)))
+    held = int(_HELD_INTERVALS * interval + lead)
+    covered: Flags = (time >= link.time[0] - held) & (time <= link.time[-1] + held)
+    return covered
+
+
+def _pose_at(link: Link, time: Ints) -> tuple[Floats, Floats]:
+    start = link.time[0]
+    return interpolate_poses(
+        (time - start) * 1e-9, (link.time - start) * 1e-9, link.position, link.quaternion
+    )
+
+
+def _clean(frame: str) -> str:
+    return frame.lstrip("/")
+
+
+def _base_name(topic: str) -> str:
+    return topic.rstrip("/").rsplit("/", 1)[-1]

@@ -1,17 +1,21 @@
-"""The catalog of a file's contents, and the limit of the total inflated size of its chunks."""
+"""The catalog of a file's contents, its coverage by checksums, and the limit of its inflated size."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from mcap.records import Channel, Schema
 
 from pipeline.logs.chunks import largest_plausible
 from pipeline.logs.records import Loss
-from pipeline.logs.spans import Span, SpanKind
+from pipeline.logs.source import ByteSource, is_fetched
+from pipeline.logs.spans import Span, SpanKind, checksum_holds
+
+if TYPE_CHECKING:
+    from concurrent.futures import Executor, Future
 
 
 class Cover(IntEnum):
@@ -267,3 +271,100 @@ def _list_known(times: Iterable[int | None]) -> list[int]:
 
 def _spell(size: int) -> str:
     return f"{size / 1e6:,.1f} MB"
+
+
+_NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
+
+_LISTED: Final = 12
+"""Maximum number of topics listed in a message."""
+
+
+class DataSection:
+    """Check of the checksum of a file's data section, computed once and in parallel with reading.
+
+    Args:
+        source: the file.
+        catalog: catalog of the file.
+        beside: executor of the computation.
+    """
+
+    def __init__(self, source: ByteSource, catalog: Catalog, beside: Executor) -> None:
+        self._source = source
+        self._catalog = catalog
+        self._beside = beside
+        self._check: Future[bool] | None = None
+        # The check fetches a whole object, so it is started only if no other checksum covers its messages.
+        if not is_fetched(source):
+            self._begin()
+
+    def _begin(self) -> None:
+        end, crc = self._catalog.data_end, self._catalog.data_crc
+        if self._check is None and end is not None and crc:
+            self._check = self._beside.submit(checksum_holds, self._source, end, crc)
+
+    def holds(self) -> bool:
+        """Whether there is such a checksum and it is valid."""
+        self._begin()
+        return self._check is not None and self._check.result()
+
+    def judge(self, unchecked: int, *, is_damaged: bool) -> Loss | None:
+        """Loss if the checksum is invalid, else None.
+
+        Args:
+            unchecked: number of spans with messages that were read and have no checksum of their own.
+            is_damaged: whether damage to this file is already reported, which explains a mismatch.
+        """
+        if unchecked:
+            self._begin()
+        if self._check is None or (is_damaged and not unchecked) or self._check.result():
+            return None
+        wrong = "the checksum of the data section does not match its bytes"
+        if unchecked:
+            text = (
+                f"{wrong}, and its messages have none of their own: some are damaged, and it is not "
+                "known which. They were read; any value may be wrong"
+            )
+        else:
+            text = (
+                f"{wrong}: the messages that were read are whole, as their chunks' own checksums say; "
+                "something else is damaged, such as metadata or chunks that were not read"
+            )
+        times = [span.start_ns for span in self._catalog.spans if span.start_ns is not None]
+        ends = [span.end_ns for span in self._catalog.spans if span.end_ns is not None]
+        return Loss(
+            "checksum_mismatch",
+            text,
+            bytes=self._catalog.data_end or 0,
+            start_ns=min(times, default=None),
+            end_ns=max(ends, default=None),
+        )
+
+
+@dataclass(slots=True)
+class Coverage:
+    """Number of spans with messages that were read, and of those without a checksum.
+
+    ``topics`` are those whose definitions have neither a checksum nor a second copy.
+    """
+
+    spans: int = 0
+    unchecked: int = 0
+    topics: list[str] = field(default_factory=list)
+
+    def format_coverage(self) -> str:
+        """Description of the unchecked data; empty if all data read is covered."""
+        said = []
+        if self.unchecked and self.unchecked == self.spans:
+            said.append(_NOTHING_COVERED)
+        elif self.unchecked:
+            said.append(
+                f"{self.unchecked} of {self.spans} stretches of it carry no checksum: "
+                "damage in them cannot be seen"
+            )
+        if self.topics:
+            listed = ", ".join(self.topics[:_LISTED]) + (", ..." if len(self.topics) > _LISTED else "")
+            said.append(
+                f"no checksum and no second copy covers what the log says of {listed}: "
+                "names and types of their fields may be damaged"
+            )
+        return "; ".join(said)

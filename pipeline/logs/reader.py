@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
 from pipeline.logs.bags import BagMessages, read_bag
-from pipeline.logs.catalog import Cover, limit_inflated
+from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
 from pipeline.logs.columns import (
@@ -31,7 +31,7 @@ from pipeline.logs.columns import (
     join_stamp,
     share_times,
 )
-from pipeline.logs.index import ChannelInfo, Coverage, DataSection, LogIndex, Part, count_missing, open_log
+from pipeline.logs.index import ChannelInfo, LogIndex, Part, count_missing, open_log
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.source import (
     ByteSource,
@@ -46,7 +46,6 @@ from pipeline.logs.text_folders import TEXT_TABLE, find_table, read_table
 
 if TYPE_CHECKING:
     import os
-
 
 _LISTED: Final = 12
 """Maximum number of topics listed in an error."""

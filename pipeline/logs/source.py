@@ -11,7 +11,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Final, Protocol, TypeVar
 
-from pipeline.core.program import guess_names
+from pipeline.core import guess_names
 from pipeline.logs.records import LogError
 from pipeline.logs.remote import RemotePath, RemoteSource
 

@@ -15,7 +15,7 @@ from importlib import resources
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
-from pipeline.core.program import guess_names
+from pipeline.core import guess_names
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.run.recording import MotionError

@@ -10,7 +10,7 @@ from copy import copy
 from string import Formatter
 from typing import ClassVar, Self, TypeVar
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 from pipeline.models.parameter import (
     Conditions,
     Excitation,

@@ -9,8 +9,8 @@ from functools import partial
 
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.program import format_share
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import Model

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.program import SlipError, shorten
+from pipeline.core import SlipError, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.models.catalogue import (
     EffectClass,

@@ -1,12 +1,17 @@
 """Parameters of effects: units, bounds, levels, and their identifiability in recordings."""
 
+from __future__ import annotations
+
 import enum
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from typing import ClassVar, Literal
 
 from pipeline.core.arrays import Floats
+from pipeline.run.recording import MotionError
 
 
 class Level(enum.Enum):
@@ -105,6 +110,7 @@ _STANDING = 0.05
 """Speed and yaw rate [m/s, rad/s] that a run must both exceed to count as driving and turning."""
 _NEVER = 0.02
 """Share of the larger of speed and yaw rate; below it the smaller one counts as zero."""
+
 # Share of the largest command above which a limit has no effect.
 _REACHED = 0.99
 EXCEEDED_SHARE = 0.005
@@ -379,3 +385,86 @@ class Part:
 def is_of_one_run(parameters: Iterable[Parameter]) -> bool:
     """Whether an effect with these parameters starts at a time within one recording, unlike in other runs."""
     return any(parameter.relative_to == "duration" for parameter in parameters)
+
+
+_TOKEN = re.compile(r"\s*(?:([A-Za-z]+|1)(?:\s*(?:\^|\*\*)\s*(-?\d{1,2}))?|([*/]))\s*")
+_LONGEST = 60
+"""Largest number of characters of a unit: more than any SI unit in use."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Powers of metre, second and kilogram, and the original text of a parsed unit."""
+
+    metre: Fraction = Fraction(0)
+    second: Fraction = Fraction(0)
+    kilogram: Fraction = Fraction(0)
+    written: str = field(default="", compare=False)
+
+    def __mul__(self, other: Unit) -> Unit:
+        return Unit(self.metre + other.metre, self.second + other.second, self.kilogram + other.kilogram)
+
+    def __truediv__(self, other: Unit) -> Unit:
+        return self * other.power(Fraction(-1))
+
+    def power(self, exponent: Fraction) -> Unit:
+        """The unit to a power."""
+        return Unit(self.metre * exponent, self.second * exponent, self.kilogram * exponent)
+
+    def __str__(self) -> str:
+        if self.written:
+            return self.written
+        above = _write(("m", self.metre), ("kg", self.kilogram), ("s", self.second))
+        below = _write(("m", -self.metre), ("kg", -self.kilogram), ("s", -self.second))
+        return f"{above or '1'}/{below}" if below else above or "1"
+
+
+def _write(*parts: tuple[str, Fraction]) -> str:
+    return "*".join(name if power == 1 else f"{name}^{power}" for name, power in parts if power > 0)
+
+
+PLAIN = Unit()
+_METRE, _SECOND, _KILOGRAM = Unit(metre=Fraction(1)), Unit(second=Fraction(1)), Unit(kilogram=Fraction(1))
+_NEWTON = _KILOGRAM * _METRE / (_SECOND * _SECOND)
+_KNOWN = {
+    "1": PLAIN,
+    "rad": PLAIN,
+    "m": _METRE,
+    "s": _SECOND,
+    "kg": _KILOGRAM,
+    "N": _NEWTON,
+    "J": _NEWTON * _METRE,
+    "W": _NEWTON * _METRE / _SECOND,
+    "Hz": PLAIN / _SECOND,
+}
+
+
+def parse_unit(text: str, where: str) -> Unit:
+    """Parse a unit such as ``m/s^2`` or ``N*m``; a ``/`` divides by the next factor only.
+
+    Args:
+        text: the unit.
+        where: file and line, for the error message.
+
+    Raises:
+        MotionError: ``bad_unit``.
+    """
+    unit, position, divide, expect = PLAIN, 0, False, True
+    while position < len(text) <= _LONGEST:
+        match = _TOKEN.match(text, position)
+        if match is None or (match.group(3) is None) != expect:
+            break
+        position = match.end()
+        if match.group(3) is not None:
+            divide, expect = match.group(3) == "/", True
+            continue
+        name, power = match.group(1), match.group(2)
+        if name not in _KNOWN:
+            break
+        factor = _KNOWN[name].power(Fraction(int(power or 1)))
+        unit, expect = (unit / factor if divide else unit * factor), False
+    else:
+        if not expect:
+            return replace(unit, written=text.strip())
+    hint = f"Write products and powers of {', '.join(_KNOWN)}, for example m/s^2."
+    raise MotionError("bad_unit", f"{text[:_LONGEST]!r} is not a unit", where=where, hint=hint)

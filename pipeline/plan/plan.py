@@ -8,12 +8,12 @@ from typing import Literal
 import msgspec
 import numpy as np
 
+from pipeline.core import finite_or_none, format_share, pick
 from pipeline.core.arrays import Complex, Floats
-from pipeline.core.program import finite_or_none, format_share, pick
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, Excitation, find_effect, list_effects
 from pipeline.models.parameter import Largest
-from pipeline.plan.manoeuvres import (
+from pipeline.plan import (
     LEAD_S,
     RATE_HZ,
     Area,

@@ -9,24 +9,14 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.program import format_share
 from pipeline.core.untrusted import TomlError, parse_toml
 from pipeline.estimation import RunDiagnosis
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
+from pipeline.models import format_value
 from pipeline.models.catalogue import find_effect
-from pipeline.models.model_text import format_value
-from pipeline.plan.manoeuvres import (
-    LEAD_S,
-    RATE_HZ,
-    Commands,
-    Limits,
-    PlanError,
-    hold_within,
-    is_steered,
-    join,
-    wait,
-)
+from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_within, is_steered, join, wait
 from pipeline.plan.plan import SAFETY, ExpectedGain, Impossible, Plan, since_when
 from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal

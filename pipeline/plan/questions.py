@@ -13,13 +13,13 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
+from pipeline.core import NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints
-from pipeline.core.program import NORMAL_95
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.learning import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.models.parameter import Largest
-from pipeline.plan.manoeuvres import PlanError
+from pipeline.plan import PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
 
 # The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly

@@ -19,7 +19,7 @@ from pipeline.estimation.problem import measure_largest
 from pipeline.estimation.state import Free, pick_columns, weigh_columns
 from pipeline.models import Effect, Model, Place, Timing
 from pipeline.models.parameter import Largest
-from pipeline.plan.manoeuvres import Commands, PlanError, is_steered
+from pipeline.plan import Commands, PlanError, is_steered
 from pipeline.run.recording import Alignment, GyroFit, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Velocity
 from pipeline.sources import Vehicle

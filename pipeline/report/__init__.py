@@ -1,6 +1,428 @@
-"""Figures and the offline page of a run.
+"""Figures and the offline page of a run; here what all pages share, and the page that leads to them.
+
+Shared are formatted text, values, templates, and links between pages; the catalogue lists all runs.
 
 A figure is one file in `pipeline.report.figures`: a function from tables to a Vega-Lite chart. A section of
 the page is a function from the report to values, and a template that shows them. All numbers come from the
 tables and the summary.
 """
+
+from __future__ import annotations
+
+import base64
+import functools
+import hashlib
+import math
+import os
+import re
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from functools import partial
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+from urllib.parse import quote
+
+import polars as pl
+
+from pipeline.core import SlipError, format_share, naming_os_errors, shorten
+from pipeline.core.untrusted import mapping_in
+from pipeline.store import LOG_NOTES, Manifest, Store
+from pipeline.store.parquet_tables import scan_table
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+    from pipeline.report.figures import Drawing
+
+
+class ReportError(SlipError):
+    """A report or a figure cannot be made or written."""
+
+
+writing_export = partial(
+    naming_os_errors,
+    ReportError,
+    "export_not_written",
+    "cannot be written",
+    hint="Choose another place with --file.",
+)
+
+MISSING = "\u2013"
+_OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
+"""Command line option in a text: browsers would break it after a hyphen."""
+_KILOMETRE = 1000.0
+_MOST_PLACES = 3
+_EARLIEST_YEAR = 2000
+
+
+def begin_large(text: str) -> str:
+    """Capitalize the text; identifiers such as `drive_lag.tau` remain unchanged."""
+    first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
+    return text if "_" in first or "." in first else text[:1].upper() + text[1:]
+
+
+def format_number(value: float | None, *, digits: int = 3) -> str:
+    """Number with this many significant digits, at most three decimals; a dash if missing."""
+    if value is None or not math.isfinite(value):
+        return MISSING
+    if value == 0.0:
+        return "0"
+    places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
+    return f"{value:,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
+
+
+def format_known_share(value: float | None) -> str:
+    """Share as a percentage, a dash if missing."""
+    return MISSING if value is None else format_share(value, 0).replace("-", "\u2212").replace(" ", "\u202f")
+
+
+def format_split(drivetrain: float, ground: float, cross: float) -> str:
+    """Split of the mean square of the slip from commands; in words if the parts cancel each other.
+
+    Args:
+        drivetrain: share between command and wheels.
+        ground: share between wheels and body.
+        cross: share of twice their product.
+    """
+    if max(drivetrain, ground) <= 1.0:
+        shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
+        return ", ".join(f"{name} {format_share(share, 0)}" for name, share in shares)
+    one, two = (format_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
+    return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"
+
+
+def format_distance(metres: float | None) -> str:
+    """A distance in m or km."""
+    if metres is None:
+        return MISSING
+    return f"{metres / _KILOMETRE:.2f} km" if metres >= _KILOMETRE else f"{metres:.0f} m"
+
+
+def format_date(nanoseconds: int | None) -> str:
+    """Date and time (UTC) of a stamp; empty if the clock was never set."""
+    if nanoseconds is None:
+        return ""
+    try:
+        day = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
+    except (OverflowError, OSError, ValueError):
+        return ""
+    return day.strftime("%Y-%m-%d %H:%M UTC") if day.year >= _EARLIEST_YEAR else ""
+
+
+def format_bytes(count: float | None) -> str:
+    """A size in bytes, kB or MB."""
+    if count is None:
+        return MISSING
+    for unit, size in (("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:.1f} {unit}"
+    return f"{count:.0f} B"
+
+
+# HTML from the templates beside the code; all texts are escaped.
+#
+# A template is named by its path below `pipeline`. Only `base.html` marks content as `safe`: our own style
+# and scripts.
+
+_REPLACEMENT = "\ufffd"
+
+
+def render_template(name: str, **values: object) -> str:
+    """Render a template; an undefined name in the template is an error.
+
+    Args:
+        name: path of the template below `pipeline`.
+        values: its values; texts are escaped, and control characters, including those that change the writing
+            direction, become visible marks.
+    """
+    return _environment().get_template(name).render(values)
+
+
+def read_own(name: str) -> str:
+    """Read a file beside the code, by its path below `pipeline`."""
+    return files("pipeline").joinpath(name).read_text(encoding="utf-8")
+
+
+@functools.cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined  # noqa: PLC0415 - only pages need it
+
+    environment = Environment(
+        loader=PackageLoader("pipeline", ""),
+        autoescape=True,
+        finalize=show_text,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {
+        "bytes": format_bytes,
+        "capital": begin_large,
+        "split_options": _OPTION.split,
+        "distance": format_distance,
+        "number": format_number,
+        "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),
+        "share": format_known_share,
+    }
+    environment.policies["json.dumps_kwargs"] = {
+        "allow_nan": False,
+        "separators": (",", ":"),
+        "sort_keys": True,
+    }
+    return environment
+
+
+def show_text(value: object) -> object:
+    """Make control characters of a text visible; other types and HTML are returned unchanged."""
+    if not isinstance(value, str) or value.isprintable() or hasattr(value, "__html__"):
+        return value
+    return "".join(_REPLACEMENT if _is_control(mark) else mark for mark in value)
+
+
+def _is_control(mark: str) -> bool:
+    return unicodedata.category(mark).startswith("C") and mark not in "\n\t"
+
+
+@dataclass(frozen=True)
+class Picture:
+    """Figure of a page.
+
+    Attributes:
+        id: stable name, also of its file.
+        title: what it shows, in a few words.
+        drawing: chart, rows and words.
+        width: share of a wide page's width, `half` or `full`.
+    """
+
+    id: str
+    title: str
+    drawing: Drawing
+    width: str = "full"
+
+
+@dataclass(frozen=True)
+class Column:
+    """Column of a table.
+
+    Attributes:
+        title: its heading.
+        unit: small text after the heading.
+        number: whether it is right-aligned.
+    """
+
+    title: str
+    unit: str = ""
+    number: bool = False
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Table cell with formatting.
+
+    Attributes:
+        text: main text.
+        sub: subscript after it, as in g_x; ``after`` follows.
+        before, small: small text before and after all that.
+        notes: small lines below it.
+        tag: bold or italics of the text.
+    """
+
+    text: str = ""
+    sub: str = ""
+    after: str = ""
+    small: str = ""
+    before: str = ""
+    notes: Sequence[str] = ()
+    tag: Literal["", "b", "i"] = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """Table; the first column is the row header.
+
+    On a narrow screen a table of many columns becomes a list of rows, each cell beside its column's title.
+
+    Attributes:
+        caption: what it shows.
+        columns: the headings.
+        rows: rows with one cell per column.
+    """
+
+    caption: str
+    columns: Sequence[Column]
+    rows: Sequence[Sequence[str | Cell]] = field(default=())
+
+
+# Catalogue: one offline page over all runs, with sortable columns and a search box.
+#
+# Logs that gave no run are listed below them, with the reason.
+
+_REPORT = "report.html"
+_VERDICT = 500
+_WITHOUT_RUN = ("failed", "quarantined")
+_TEXTS = ("day", "vehicle", "terrain", "dataset")
+_NUMBERS = {
+    "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
+    "distance": (Column("distance", "m", number=True), 1.0),
+    "command": (Column("slip from commands", "m/s", number=True), 1.0),
+    "measured": (Column("slip from wheel encoders", "m/s", number=True), 1.0),
+    "samples": (Column("samples", number=True), 1.0),
+}
+
+
+def render_catalogue(store: Store) -> str:
+    """Render the page over all readable runs, and the logs that gave none; deterministic.
+
+    Args:
+        store: the results.
+    """
+    # Reading the manifests of a long season takes time, so they are read only once.
+    manifests = store.manifests()
+    links = _list_links(store, manifests)
+    # Results may be untrusted: texts may have any length.
+    verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
+    columns = [
+        Column("run"),
+        *map(Column, _TEXTS),
+        *(column for column, _ in _NUMBERS.values()),
+        Column("log"),
+    ]
+    rows = [
+        {
+            "run": row["run"],
+            "link": links.get(str(row["run"]), ""),
+            "verdict": verdicts.get(str(row["run"]), ""),
+            "complete": row["complete"],
+            "cells": list(_list_cells(row)),
+        }
+        for row in (_gather_rows(store, manifests) if manifests else [])
+    ]
+    return render_template(
+        "report/templates/catalogue.html",
+        title="Runs",
+        style=read_own("report/catalogue.css"),
+        scripts=[read_own("report/catalogue.js")],
+        columns=columns,
+        rows=rows,
+        failed=list_failed(store),
+    )
+
+
+def list_failed(store: Store) -> list[dict[str, str]]:
+    """Logs that gave no run in batches, by path: ``path state reason hint``; without those since removed."""
+    failed = []
+    for note in store.notes(LOG_NOTES).read_all():
+        path = str(mapping_in(note, "log").get("path", ""))
+        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
+            continue
+        failed.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
+    return sorted(failed, key=lambda one: one["path"])
+
+
+def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
+    runs = scan_table("runs", root=store.root, manifests=manifests).collect()
+    medians = (
+        scan_table("aggregates", root=store.root, manifests=manifests)
+        .filter(pl.col("subset") == "all")
+        .select("run", "input", "median_modulus", "distance", "samples")
+        .collect()
+    )
+    facts = medians.group_by("run").agg(pl.col("distance").max(), pl.col("samples").max())
+    for name in ("command", "measured"):
+        one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
+        facts = facts.join(one, on="run", how="left")
+    return runs.join(facts, on="run", how="left").sort("run").to_dicts()
+
+
+def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
+    """Relative address of the report of each run that has one."""
+    return {
+        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
+        for manifest in manifests
+        if _REPORT in manifest.files
+    }
+
+
+def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:
+    """Column, value to sort by, and text of a row's cells."""
+    for key in _TEXTS:
+        yield Column(key), row[key] or "", row[key] or ""
+    for key, (column, scale) in _NUMBERS.items():
+        value = row[key]
+        if isinstance(value, int | float):
+            scaled = value * scale
+            yield column, f"{scaled:.9g}", value if isinstance(value, int) else format_number(scaled)
+        else:
+            yield column, "", ""
+
+
+# Pages over all runs of a results folder, and their links.
+#
+# A page links the existing ones. Every page links the catalogue, which is rewritten with every page and so
+# links later ones.
+
+CATALOGUE = "index.html"
+PLANS = "workbench/plans"
+"""Folder of planned drives, by run."""
+PAGES = {
+    CATALOGUE: "All runs",
+    "comparison.html": "Compare",
+    "causes.html": "Causes",
+    "fleet.html": "Fleet",
+    "trend.html": "Trends",
+    "map.html": "Map",
+    "terrain.html": "Terrain",
+}
+_PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
+
+
+def write_page(store: Store, name: str, page: str) -> Path:
+    """Write one of `PAGES` with links to the others, and rewrite the catalogue, which then links it.
+
+    Other pages are not changed: others may have written them, or they may be damaged.
+
+    Raises:
+        StoreError: the disk reports an error.
+    """
+    path = store.write_results_text(name, _link(store, name, page))
+    if name != CATALOGUE:
+        store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
+    return path
+
+
+def is_page(path: str) -> bool:
+    """Whether a path in a results folder, for example `runs/a/b/report.html`, is that of a page."""
+    kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
+    return path in PAGES or any(path.startswith(top) and path.endswith(name) for top, name in kinds)
+
+
+def lead_up(run: str, page: str = CATALOGUE) -> str:
+    """Address of a page of the results, by default the catalogue, relative to the report of a run."""
+    return "../" * (run.count("/") + 3) + quote(page)
+
+
+def lead_to(results: Path, folder: Path) -> str:
+    """Address of the catalogue relative to any folder; empty without a catalogue."""
+    page = results / CATALOGUE
+    if not page.is_file():
+        return ""
+    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())
+
+
+def list_ways(catalogue: str) -> dict[str, str]:
+    """Links from a report or a plan to the pages over all runs; none without an address of the catalogue."""
+    return {PAGES[CATALOGUE]: catalogue} if catalogue else {}
+
+
+def _link(store: Store, name: str, page: str) -> str:
+    links = ""
+    for other, title in PAGES.items():
+        if other == name:
+            links += f"<b>{title}</b>"
+        elif other == CATALOGUE or (store.root / other).is_file():
+            links += f'<a href="{other}">{title}</a>'
+    return _PLACE.sub(lambda match: match[1] + links + match[2], page, count=1)

@@ -5,16 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS, format_duration, format_share
+from pipeline.core import INPUT_WORDS, format_duration, format_share
+from pipeline.fleet import MEASURES
 from pipeline.fleet.causes import Budget, Causes, Difference
-from pipeline.fleet.datasets import MEASURES, compare_orders
-from pipeline.fleet.pairs import Answer
+from pipeline.fleet.pairs import Answer, compare_orders
 from pipeline.fleet.rank_tests import LEVEL, kendall_tau, list_swaps
-from pipeline.report import theme
-from pipeline.report.figures import Drawing
-from pipeline.report.page import render_figures
-from pipeline.report.scene import format_ends
-from pipeline.report.templating import (
+from pipeline.report import (
     MISSING,
     Cell,
     Column,
@@ -23,7 +19,11 @@ from pipeline.report.templating import (
     format_distance,
     format_known_share,
     format_number,
+    theme,
 )
+from pipeline.report.figures import Drawing
+from pipeline.report.page import render_figures
+from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
 
 _ROW_HEIGHT = 34

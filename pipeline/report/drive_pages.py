@@ -9,11 +9,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.plan.plan import SAFETY, Plan
-from pipeline.report import theme
+from pipeline.report import Picture, list_ways, render_template, theme
 from pipeline.report.figures import Drawing
-from pipeline.report.page import list_ways, render_figures
+from pipeline.report.page import render_figures
 from pipeline.report.scene import break_lines
-from pipeline.report.templating import Picture, render_template
 from pipeline.report.theme import (
     Channel,
     Chart,

@@ -9,13 +9,12 @@ from typing import Any
 
 import polars as pl
 
-from pipeline.core.program import INPUT_WORDS
-from pipeline.fleet.datasets import Measure
+from pipeline.core import INPUT_WORDS
+from pipeline.fleet import Measure
 from pipeline.fleet.deployments import ZONES, DeploymentMap
-from pipeline.report import theme
+from pipeline.report import Cell, Column, Picture, Table, format_number, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.templating import Cell, Column, Picture, Table, format_number
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
 
 _LETTER, _LINE = 6.7, 13.0

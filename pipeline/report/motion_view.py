@@ -13,16 +13,16 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.json_objects import mapping_in, objects_in
+from pipeline.core.untrusted import mapping_in, objects_in
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
-from pipeline.estimation.effect_signature import VARIABLES, Signature, find_signatures, measure_variables
 from pipeline.models import ModelFile, Timing
 from pipeline.models.model_file import parse_model
-from pipeline.report.templating import ReportError
+from pipeline.report import ReportError
 from pipeline.run import MotionError, MotionRun, load_run
 
 if TYPE_CHECKING:
+    from pipeline.estimation.effect_signature import Signature
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -100,7 +100,7 @@ def load_vehicle(manifest: Manifest) -> Vehicle:
 # model takes hundredths.
 
 COMPONENTS = ("x", "y", "w")
-SIGNALS = {name: VARIABLES[name] for name in ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")}
+SIGNALS = ("f_x", "f_y", "f_w", "f_x_f_w", "a_x", "a_w", "roll", "pitch")
 
 _ARC_EVERY_S = 2.0
 _ARC_RATE_HZ = 10.0
@@ -170,6 +170,8 @@ class MotionStage:
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
+        from pipeline.estimation.effect_signature import measure_variables  # noqa: PLC0415 - for pages alone
+
         measured = measure_variables(self._comparison)
         return {name: measured[name] for name in SIGNALS}
 
@@ -183,6 +185,8 @@ class MotionStage:
             ladder: its steps as JSON.
             floor: noise floor as JSON.
         """
+        from pipeline.estimation.effect_signature import find_signatures  # noqa: PLC0415 - for pages alone
+
         comparison = self._comparison
         rows = self.problem.whole.run == 0
         ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)

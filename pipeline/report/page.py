@@ -1,292 +1,308 @@
-"""Page of a run, the catalogue, links between pages, and the JavaScript that draws the figures."""
+"""Page of a run: its sections (why and health: `sections_why`), its figures, also as files."""
 
-import contextlib
-import hashlib
-import os
+from __future__ import annotations
+
 import re
-import subprocess
-import threading
-from collections.abc import Iterator, Mapping, Sequence
-from importlib.metadata import version
+import shlex
+import statistics
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from urllib.parse import quote
+from typing import Literal, get_args
 
-import polars as pl
+import numpy as np
 
-from pipeline.core.json_objects import mapping_in
-from pipeline.core.program import format_recorded, python_command, shorten
-from pipeline.report import theme
-from pipeline.report.figures import list_figures
-from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, Scene
-from pipeline.report.sections import SECTIONS, Page
-from pipeline.report.sections_why import summarise_health
-from pipeline.report.templating import (
+from pipeline.core import INPUT_WORDS, format_recorded, naming_os_errors
+from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
+from pipeline.estimation.error_regions import format_errors
+from pipeline.report import (
+    MISSING,
+    Cell,
     Column,
     Picture,
+    ReportError,
+    Table,
     format_date,
     format_distance,
     format_number,
+    list_ways,
     read_own,
     render_template,
+    theme,
 )
-from pipeline.report.theme import build_spec, share_rows
-from pipeline.store import LOG_NOTES, Manifest, Store
-from pipeline.store.parquet_tables import scan_table
+from pipeline.report.figures import Section, list_figures
+from pipeline.report.scene import RunReport, Scene
+from pipeline.report.sections_why import (
+    format_row,
+    list_findings,
+    summarise_health,
+    view_health,
+    view_provenance,
+    view_why,
+)
+from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
 
-# Drawing JavaScript: Vega, Vega-Lite and Vega-Embed, from the Python package that contains them.
-#
-# Bundling takes most of a second and always gives the same text, so it is cached in the user's cache folder.
-# A missing, damaged or read-only cache only costs that second.
-
-_DIGEST_LENGTH = 64
-_EXPOSE = "window.vegaEmbed = vegaEmbed;"
-
-
-def load_bundle() -> str:
-    """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
-    path = cache_path()
-    cached = _read_checked(path)
-    if cached is not None:
-        return cached
-    import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
-
-    # A closing tag inside a string literal would end the script element.
-    script: str = (
-        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
-    )
-    _write_checked(path, script)
-    return script
+_MOST_REGIONS = 2
+_SPARK_BINS, _SPARK_HEIGHT = 150, 28
 
 
-def warm_bundle() -> None:
-    """Bundle in a separate process, so that it overlaps with reading the log.
-
-    The bundler holds the interpreter lock while it works, so a thread would not help. Returns immediately;
-    does nothing if the cache is filled or cannot be written.
-    """
-    path = cache_path()
-    if path.is_file() or not _can_write(path.parent):
-        return
-    threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
-
-
-def _bundle_apart() -> None:
-    with contextlib.suppress(OSError):
-        subprocess.run(  # noqa: S603 - our own words
-            python_command("-c", "from pipeline.report.page import load_bundle; load_bundle()"),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            check=False,
-        )
-
-
-def cache_path() -> Path:
-    """Cache path of the bundle of the installed version."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
-    return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
-
-
-def _read_checked(path: Path) -> str | None:
-    try:
-        content = path.read_bytes()
-    except OSError:
-        return None
-    digest, _, script = content.partition(b"\n")
-    if len(digest) != _DIGEST_LENGTH or hashlib.sha256(script).hexdigest().encode() != digest:
-        return None
-    return script.decode()
-
-
-def _write_checked(path: Path, script: str) -> None:
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
-
-    body = script.encode()
-    with contextlib.suppress(OSError):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
-
-
-def _can_write(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        return False
-    return os.access(folder, os.W_OK)
-
-
-# Catalogue: one offline page over all runs, with sortable columns and a search box.
-#
-# Logs that gave no run are listed below them, with the reason.
-
-_REPORT = "report.html"
-_VERDICT = 500
-_WITHOUT_RUN = ("failed", "quarantined")
-_TEXTS = ("day", "vehicle", "terrain", "dataset")
-_NUMBERS = {
-    "duration_s": (Column("duration", "min", number=True), 1 / 60.0),
-    "distance": (Column("distance", "m", number=True), 1.0),
-    "command": (Column("slip from commands", "m/s", number=True), 1.0),
-    "measured": (Column("slip from wheel encoders", "m/s", number=True), 1.0),
-    "samples": (Column("samples", number=True), 1.0),
-}
-
-
-def render_catalogue(store: Store) -> str:
-    """Render the page over all readable runs, and the logs that gave none; deterministic.
-
-    Args:
-        store: the results.
-    """
-    # Reading the manifests of a long season takes time, so they are read only once.
-    manifests = store.manifests()
-    links = _list_links(store, manifests)
-    # Results may be untrusted: texts may have any length.
-    verdicts = {one.run: shorten(str(one.details.get("verdict") or ""), _VERDICT) for one in manifests}
-    columns = [
-        Column("run"),
-        *map(Column, _TEXTS),
-        *(column for column, _ in _NUMBERS.values()),
-        Column("log"),
-    ]
-    rows = [
-        {
-            "run": row["run"],
-            "link": links.get(str(row["run"]), ""),
-            "verdict": verdicts.get(str(row["run"]), ""),
-            "complete": row["complete"],
-            "cells": list(_list_cells(row)),
-        }
-        for row in (_gather_rows(store, manifests) if manifests else [])
-    ]
-    return render_template(
-        "report/templates/catalogue.html",
-        title="Runs",
-        style=read_own("report/catalogue.css"),
-        scripts=[read_own("report/catalogue.js")],
-        columns=columns,
-        rows=rows,
-        failed=list_failed(store),
-    )
-
-
-def list_failed(store: Store) -> list[dict[str, str]]:
-    """Logs that gave no run in batches, by path: ``path state reason hint``; without those since removed."""
-    failed = []
-    for note in store.notes(LOG_NOTES).read_all():
-        path = str(mapping_in(note, "log").get("path", ""))
-        if note.get("state") not in _WITHOUT_RUN or not ("://" in path or Path(path).exists()):
-            continue
-        failed.append({"path": path} | {key: str(note.get(key) or "") for key in ("state", "reason", "hint")})
-    return sorted(failed, key=lambda one: one["path"])
-
-
-def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, object]]:
-    runs = scan_table("runs", root=store.root, manifests=manifests).collect()
-    medians = (
-        scan_table("aggregates", root=store.root, manifests=manifests)
-        .filter(pl.col("subset") == "all")
-        .select("run", "input", "median_modulus", "distance", "samples")
-        .collect()
-    )
-    facts = medians.group_by("run").agg(pl.col("distance").max(), pl.col("samples").max())
-    for name in ("command", "measured"):
-        one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
-        facts = facts.join(one, on="run", how="left")
-    return runs.join(facts, on="run", how="left").sort("run").to_dicts()
-
-
-def _list_links(store: Store, manifests: Sequence[Manifest]) -> Mapping[str, str]:
-    """Relative address of the report of each run that has one."""
+def view_glance(page: Page) -> dict[str, object]:
+    """Four short answers, each linked to its section; above them findings that forbid conclusions."""
+    report, name = page.report, page.report.main_input
+    main, minor = report.effects
+    verdict = report.verdict
+    doubts = (str(one.get("text", "")) for one in list_findings(report) if one.get("severity") == "error")
     return {
-        manifest.run: quote((manifest.folder / _REPORT).relative_to(store.root).as_posix())
-        for manifest in manifests
-        if _REPORT in manifest.files
+        "verdict": verdict,
+        "doubts": [text for text in doubts if text.casefold() not in verdict.casefold()],
+        "input": INPUT_WORDS[name],
+        "median": number_in(mapping_in(report.part("by_input"), name) or report.summary, "median_modulus"),
+        "spark": _draw_spark(page),
+        "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
+        "standing": format_standing(report),
+        "regions": list_regions(report, _MOST_REGIONS),
+        "pictures": page.pictures[Section.GLANCE],
+        "refusal": report.refusal,
+        "diagnosed": bool(report.diagnosis),
+        "effects": [format_row(entry) for entry in main],
+        "more_effects": len(minor),
+        "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
+        "split": _order_split(report),
+        "step": list_steps(report)[0] if report.text("run") else None,
+        "undecided": next(iter(report.undecided), None),
     }
 
 
-def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, object]]:
-    """Column, value to sort by, and text of a row's cells."""
-    for key in _TEXTS:
-        yield Column(key), row[key] or "", row[key] or ""
-    for key, (column, scale) in _NUMBERS.items():
-        value = row[key]
-        if isinstance(value, int | float):
-            scaled = value * scale
-            yield column, f"{scaled:.9g}", value if isinstance(value, int) else format_number(scaled)
-        else:
-            yield column, "", ""
-
-
-# Pages over all runs of a results folder, and their links.
-#
-# A page links the existing ones. Every page links the catalogue, which is rewritten with every page and so
-# links later ones.
-
-CATALOGUE = "index.html"
-PLANS = "workbench/plans"
-"""Folder of planned drives, by run."""
-PAGES = {
-    CATALOGUE: "All runs",
-    "comparison.html": "Compare",
-    "causes.html": "Causes",
-    "fleet.html": "Fleet",
-    "trend.html": "Trends",
-    "map.html": "Map",
-    "terrain.html": "Terrain",
-}
-_PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
-
-
-def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES` with links to the others, and rewrite the catalogue, which then links it.
-
-    Other pages are not changed: others may have written them, or they may be damaged.
-
-    Raises:
-        StoreError: the disk reports an error.
-    """
-    path = store.write_results_text(name, _link(store, name, page))
-    if name != CATALOGUE:
-        store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
-    return path
-
-
-def is_page(path: str) -> bool:
-    """Whether a path in a results folder, for example `runs/a/b/report.html`, is that of a page."""
-    kinds = (("runs/", "/report.html"), (f"{PLANS}/", "/plan.html"))
-    return path in PAGES or any(path.startswith(top) and path.endswith(name) for top, name in kinds)
-
-
-def lead_up(run: str, page: str = CATALOGUE) -> str:
-    """Address of a page of the results, by default the catalogue, relative to the report of a run."""
-    return "../" * (run.count("/") + 3) + quote(page)
-
-
-def lead_to(results: Path, folder: Path) -> str:
-    """Address of the catalogue relative to any folder; empty without a catalogue."""
-    page = results / CATALOGUE
-    if not page.is_file():
+def format_standing(report: RunReport) -> str:
+    """Compare the run with comparable ones; empty if there are none."""
+    name = report.main_input
+    others = list(report.peers.get(name, ()))
+    median = number_in(mapping_in(report.part("by_input"), name), "median_modulus")
+    if not others or median is None:
         return ""
-    return quote(Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix())
+    dataset = report.text("dataset")
+    usual = f"{format_number(statistics.median(others))} m/s"
+    if len(others) == 1:
+        comparative = "more" if median > others[0] else "less"
+        return f"{comparative} than the one other run of {dataset}: {usual}"
+    below = sum(other < median for other in others)
+    return f"vs {len(others)} runs of {dataset}: more slip than {below}; their median {usual}"
 
 
-def list_ways(catalogue: str) -> dict[str, str]:
-    """Links from a report or a plan to the pages over all runs; none without an address of the catalogue."""
-    return {PAGES[CATALOGUE]: catalogue} if catalogue else {}
+def _order_split(report: RunReport) -> list[tuple[float, str]]:
+    """Shares of ground and drivetrain, the larger first; empty if unknown."""
+    drivetrain, ground, _ = report.split
+    if drivetrain is None or ground is None:
+        return []
+    return sorted(
+        [(ground, "in the ground (wheels to body)"), (drivetrain, "in the drivetrain (command to wheels)")],
+        reverse=True,
+    )
 
 
-def _link(store: Store, name: str, page: str) -> str:
-    links = ""
-    for other, title in PAGES.items():
-        if other == name:
-            links += f"<b>{title}</b>"
-        elif other == CATALOGUE or (store.root / other).is_file():
-            links += f'<a href="{other}">{title}</a>'
-    return _PLACE.sub(lambda match: match[1] + links + match[2], page, count=1)
+def _draw_spark(page: Page) -> str:
+    """Sparkline of slip over time as an SVG path; the figure below shows details."""
+    frame = page.scene.slip.get(page.report.main_input)
+    if frame is None or frame.height < _SPARK_BINS:
+        return ""
+    times, modulus = frame["t"].to_numpy(), frame["modulus"].to_numpy()
+    edges = np.linspace(times[0], times[-1], _SPARK_BINS + 1)
+    which = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, _SPARK_BINS - 1)
+    count = np.bincount(which, minlength=_SPARK_BINS)
+    mean = np.bincount(which, np.minimum(modulus, page.scene.modulus_cap), minlength=_SPARK_BINS)
+    height = mean / np.maximum(count, 1) / max(page.scene.modulus_cap, 1e-9) * (_SPARK_HEIGHT - 2)
+    path, pen = [], "M"
+    for number, there in enumerate((count > 0).tolist()):
+        if there:
+            path.append(f"{pen}{number} {_SPARK_HEIGHT - 1 - height[number]:.1f}")
+        pen = "L" if there else "M"
+    return "".join(path)
 
+
+def view_how_bad(page: Page) -> dict[str, object]:
+    """Cards with the medians, slip over time, distributions, table of both inputs."""
+    report = page.report
+    return {
+        "refusal": report.refusal,
+        "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
+        "ladder": [format_errors(step) for step in report.ladder],
+        "pictures": page.pictures[Section.HOW_BAD],
+        "table": _tabulate(report),
+    }
+
+
+def _numbers_of(report: RunReport, name: str) -> Mapping[str, object]:
+    numbers = mapping_in(report.part("by_input"), name)
+    if numbers or name != report.main_input:
+        return numbers
+    return {key: report.summary.get(key) for key in ("samples", "median_modulus", "median_window_norm")}
+
+
+def _view_card(name: str, numbers: Mapping[str, object]) -> dict[str, object]:
+    return {
+        "input": name,
+        "words": INPUT_WORDS[name],
+        "median": number_in(numbers, "median_modulus"),
+        "norm": number_in(numbers, "median_window_norm"),
+        "transitory": number_in(numbers, "transitory_median_modulus"),
+        "steady": number_in(numbers, "steady_median_modulus"),
+    }
+
+
+def _tabulate(report: RunReport) -> Table | None:
+    columns = [_list_numbers(_numbers_of(report, name)) for name in report.inputs]
+    if not columns:
+        return None
+    scale = report.number("length_scale_m")
+    caption = "Slip g = f(u) \u2212 v of the ideal model"
+    caption += "" if scale is None else f"; slip speed with L = {scale:g} m"
+    rows: list[list[str | Cell]] = [[words, *(c[i] for c in columns)] for i, words in enumerate(_QUANTITIES)]
+    head = [Column("u"), *(Column(INPUT_WORDS[name], number=True) for name in report.inputs)]
+    return Table(caption, head, rows)
+
+
+_QUANTITIES = (
+    Cell("median slip speed", small="m/s"),
+    Cell("median 2 s window norm", small="m/s"),
+    Cell("rms g", sub="x", after=", forward", small="m/s"),
+    Cell("rms g", sub="y", after=", sideways", small="m/s"),
+    Cell("rms g", sub="w", after=", yaw rate", small="rad/s"),
+    Cell("time steps"),
+)
+
+
+def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
+    """Cells in the order of the quantities."""
+    rms = [*numbers_in(numbers, "rms"), None, None, None][:3]
+    medians = [number_in(numbers, name) for name in ("median_modulus", "median_window_norm")]
+    samples = number_in(numbers, "samples")
+    return [
+        *(format_number(value) for value in medians + rms),
+        MISSING if samples is None else f"{samples:,.0f}",
+    ]
+
+
+def view_where(page: Page) -> dict[str, object]:
+    """Regions with the largest error, linked figures, and controls to mark time without a mouse."""
+    return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
+
+
+def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
+    """Regions of the ideal model's error, as on the screen: each with its part of the error."""
+    if report.is_refused:
+        return []
+    regions = []
+    for entry in objects_in(report.diagnosis, "where")[:most]:
+        region, text = str(entry.get("region", "")), str(entry.get("text", ""))
+        regions.append((region, text.removeprefix(region).removeprefix(": ")))
+    return regions
+
+
+def view_what_now(page: Page) -> dict[str, object]:
+    """Commands for the next steps, and whether a drive could decide anything that is open."""
+    if not page.report.text("run"):
+        return {"steps": [], "settled": False, "planned": {}}
+    diagnosis = page.report.diagnosis
+    settled = bool(diagnosis.get("effects")) and not any(
+        diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
+    )
+    return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
+
+
+def list_steps(report: RunReport) -> list[tuple[str, str]]:
+    """Next steps with their commands, in descending order of usefulness."""
+    if report.is_refused:
+        return _list_mending_steps(report)
+    run = report.text("run")
+    # A run name with a leading dash would be read as an option.
+    name = shlex.quote(run) if not run.startswith("-") else shlex.quote(f"./{run}")
+    return [
+        *_list_model_steps(report, name),
+        ("Compare with other vehicles and terrains", "slip compare"),
+        ("Look at slip in the viewer that plays the log", f"slip export {name} --to mcap"),
+    ]
+
+
+def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
+    """Steps for a run without valid numbers: inspect the log, correct it, analyze again."""
+    log = shlex.quote(str(report.part("log").get("path") or "run.mcap"))
+    return [
+        ("List the contents of the log", f"slip inspect {log}"),
+        ("Correct what the findings report, then analyze again", f"slip analyze {log}"),
+    ]
+
+
+def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
+    diagnosis = report.diagnosis
+    if not diagnosis:
+        return [("Estimate the effects that the model lacks", f"slip diagnose {name}")]
+    steps = []
+    if diagnosis.get("effects"):
+        steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
+        steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
+        against = f"slip model compare model.toml --against literature --on {name}"
+        steps.append(("Compare it with models of the literature", against))
+        if mapping_in(diagnosis, "learned").get("kept"):
+            learn = f"slip model add model.toml learned_term --on {name}"
+            steps.append(("Put a learned term on top of it", learn))
+    if diagnosis.get("undecided") or diagnosis.get("unobservable"):
+        what = "is undecided" if diagnosis.get("undecided") else "is not observable"
+        steps += [
+            (f"Plan a drive that determines what {what}, where one can", f"slip plan {name} --folder plan"),
+            ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
+            ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
+        ]
+    steps.append(("Try other effects, and plan the next drive, in the browser", "slip serve"))
+    if diagnosis.get("unexplained"):
+        steps.append(("Write the effect that explains the rest yourself", "slip model new-effect mine.py"))
+    return steps
+
+
+# Sections of the page in order: how bad, where, why, what now; first a summary, then with figures.
+#
+# Health of the log and provenance come last. A section is a function from the page to values, and a template
+# that shows them; empty sections are omitted.
+
+
+@dataclass(frozen=True)
+class Page:
+    """Run with its figures drawn.
+
+    Attributes:
+        report: the run.
+        scene: its tables, joined and thinned.
+        pictures: figures with something to draw by section, in the order of the page.
+    """
+
+    report: RunReport
+    scene: Scene
+    pictures: Mapping[Section, Sequence[Picture]]
+
+
+@dataclass(frozen=True)
+class PageSection:
+    """One section of the page.
+
+    Attributes:
+        id: anchor, and the name of its template in `templates/sections`.
+        title: heading.
+        view: function that returns the values for the template; a section without values is omitted.
+    """
+
+    id: str
+    title: str
+    view: Callable[[Page], Mapping[str, object]]
+
+
+SECTIONS = (
+    PageSection("glance", "At a glance", view_glance),
+    PageSection("how-bad", "How bad", view_how_bad),
+    PageSection("where", "Where", view_where),
+    PageSection("why", "Why", view_why),
+    PageSection("what-now", "What now", view_what_now),
+    PageSection("health", "Data health", view_health),
+    PageSection("provenance", "Provenance", view_provenance),
+)
 
 # Page of a run, and common parts of all pages with figures.
 #
@@ -367,3 +383,117 @@ def _first_stamp(page: Page) -> int | None:
         if table is not None and "stamp" in table.columns:
             return int(table["stamp"][0])
     return None
+
+
+Format = Literal["svg", "pdf", "png"]
+FORMATS: tuple[Format, ...] = get_args(Format)
+
+_PNG_SCALE = 2.0
+_ID = re.compile(r"(?<=url\(#)\w+(?=\))|(?<= id=\")\w+(?=\")")
+
+
+@dataclass(frozen=True)
+class ShownFigure:
+    """Figure with its rows and title, which a notebook draws without a network.
+
+    Attributes:
+        id: stable name.
+        spec: its Vega-Lite specification.
+    """
+
+    id: str
+    spec: dict[str, object]
+
+    def to_dict(self) -> dict[str, object]:
+        """Return the Vega-Lite specification, for other programs."""
+        return self.spec.copy()
+
+    def save(self, path: str | Path) -> None:
+        """Write the figure as `svg`, `pdf` or `png`, depending on the file name's suffix.
+
+        Raises:
+            ReportError: the suffix is another one, or the file cannot be written.
+        """
+        target = Path(path)
+        _write(target, _render(self.id, self.spec, target.suffix.removeprefix(".")))
+
+    def _repr_svg_(self) -> str:
+        return _render(self.id, self.spec, "svg").decode()
+
+
+def show_figures(report: RunReport) -> dict[str, ShownFigure]:
+    """Every figure for which the run has rows, by id."""
+    return {
+        picture.id: ShownFigure(picture.id, {**fill_spec(picture.drawing), "title": picture.title})
+        for picture in _list_pictures(report)
+    }
+
+
+def write_figures(
+    report: RunReport,
+    folder: Path,
+    format: Format,  # noqa: A002 - the word people use for it
+) -> list[Path]:
+    """Write every figure for which the run has rows, in the order of the page, as `write_pictures` does."""
+    return write_pictures(_list_pictures(report), folder, format)
+
+
+def _list_pictures(report: RunReport) -> list[Picture]:
+    return [picture for pictures in draw_pictures(Scene(report)).values() for picture in pictures]
+
+
+def write_pictures(
+    pictures: Iterable[Picture],
+    folder: Path,
+    format: Format,  # noqa: A002 - the word people use for it
+) -> list[Path]:
+    """Write figures as `<figure id>.<format>`.
+
+    Args:
+        pictures: the figures.
+        folder: output folder; created if missing.
+        format: `svg`, `pdf`, or `png` (twice the size of the page's figure).
+
+    Returns:
+        The files, in the order of the figures.
+
+    Raises:
+        ReportError: the format is another one, or the folder cannot be written.
+    """
+    written = []
+    for picture in pictures:
+        path = Path(folder) / f"{picture.id}.{format}"
+        _write(path, _render(picture.id, fill_spec(picture.drawing), format))
+        written.append(path)
+    return written
+
+
+def _render(name: str, spec: dict[str, object], format: str) -> bytes:  # noqa: A002 - as above
+    if format not in FORMATS:
+        hint = f"Use one of {', '.join(FORMATS)}"
+        raise ReportError("figure_format_unknown", f"no figure can be written as {format!r}", hint=hint)
+    import vl_convert  # noqa: PLC0415 - starts a JavaScript engine
+
+    if format == "svg":
+        return _number_ids(vl_convert.vegalite_to_svg(spec), name).encode()
+    drawn: bytes = (
+        vl_convert.vegalite_to_pdf(spec)
+        if format == "pdf"
+        else vl_convert.vegalite_to_png(spec, scale=_PNG_SCALE)
+    )
+    return drawn
+
+
+def _write(path: Path, content: bytes) -> None:
+    hint = "Choose a folder that can be written"
+    with naming_os_errors(
+        ReportError, "figure_not_written", "a figure cannot be written", where=path, hint=hint
+    ):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+
+
+def _number_ids(svg: str, prefix: str) -> str:
+    """Renumber the ids of an SVG from zero; the engine's counter continues from one figure to the next."""
+    order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
+    return _ID.sub(lambda match: order[match.group()], svg)

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core.json_objects import mapping_in, number_in, objects_in
-from pipeline.report.templating import format_number
+from pipeline.core.untrusted import mapping_in, number_in, objects_in
+from pipeline.report import format_number
 from pipeline.report.theme import round_up, usual_ends
 
 if TYPE_CHECKING:

@@ -6,15 +6,13 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from pipeline.core.json_objects import mapping_in, number_in, objects_in
+from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
 from pipeline.estimation.diagnosis_lines import format_learned_share
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
-from pipeline.report.figures.figure import Section
-from pipeline.report.scene import RunReport, format_ends
-from pipeline.report.templating import (
+from pipeline.report import (
     MISSING,
     Cell,
     Column,
@@ -25,9 +23,11 @@ from pipeline.report.templating import (
     format_number,
     format_split,
 )
+from pipeline.report.figures import Section
+from pipeline.report.scene import RunReport, format_ends
 
 if TYPE_CHECKING:
-    from pipeline.report.sections import Page
+    from pipeline.report.page import Page
 
 _RANK = {"error": 0, "warning": 1, "info": 2}
 _SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}

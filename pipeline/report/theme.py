@@ -1,18 +1,28 @@
-"""Common style of all figures (colours, axes, scales), and charts as plain Vega-Lite specifications."""
+"""Charts as plain Vega-Lite: their parts, colours and ranges, and the JavaScript that draws them."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
 import math
+import os
+import subprocess
+import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from importlib.metadata import version
+from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
+from pipeline.core import python_command
+
 if TYPE_CHECKING:
     from pipeline.report.figures import Drawing
+
 
 SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 """Schema of the specifications."""
@@ -20,6 +30,7 @@ SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 Channel = dict[str, object]
 
 _TYPES = {"Q": "quantitative", "N": "nominal"}
+
 # The second end of a span has the type of the first.
 _ENDS = frozenset({"x2", "y2"})
 
@@ -358,3 +369,113 @@ def _pack_columns(frame: pl.DataFrame) -> Columns:
 
 def _round_floats(frame: pl.DataFrame) -> pl.DataFrame:
     return frame.with_columns(pl.col(pl.Float64, pl.Float32).round(_DIGITS) + 0.0)
+
+
+# Drawing JavaScript: Vega, Vega-Lite and Vega-Embed, from the Python package that contains them.
+#
+# Bundling takes most of a second and always gives the same text, so it is cached in the user's cache folder.
+# A missing, damaged or read-only cache only costs that second.
+
+_DIGEST_LENGTH = 64
+_EXPOSE = "window.vegaEmbed = vegaEmbed;"
+
+
+def load_bundle() -> str:
+    """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
+    path = cache_path()
+    cached = _read_checked(path)
+    if cached is not None:
+        return cached
+    import vl_convert  # noqa: PLC0415 - starting its JavaScript engine is what the cache avoids
+
+    # A closing tag inside a string literal would end the script element.
+    script: str = (
+        vl_convert.javascript_bundle(_EXPOSE).replace("</script", "<\\/script").replace("<!--", "<\\!--")
+    )
+    _write_checked(path, script)
+    return script
+
+
+def warm_bundle() -> None:
+    """Bundle in a separate process, so that it overlaps with reading the log.
+
+    The bundler holds the interpreter lock while it works, so a thread would not help. Returns immediately;
+    does nothing if the cache is filled or cannot be written.
+    """
+    path = cache_path()
+    if path.is_file() or not _can_write(path.parent):
+        return
+    threading.Thread(target=_bundle_apart, name="bundle", daemon=True).start()
+
+
+def _bundle_apart() -> None:
+    with contextlib.suppress(OSError):
+        subprocess.run(  # noqa: S603 - our own words
+            python_command("-c", "from pipeline.report.page import load_bundle; load_bundle()"),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            check=False,
+        )
+
+
+def cache_path() -> Path:
+    """Cache path of the bundle of the installed version."""
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    what = hashlib.sha256(_EXPOSE.encode()).hexdigest()[:8]
+    return Path(base) / "slip" / f"vega-{version('vl-convert-python')}-{what}.js"
+
+
+def _read_checked(path: Path) -> str | None:
+    try:
+        content = path.read_bytes()
+    except OSError:
+        return None
+    digest, _, script = content.partition(b"\n")
+    if len(digest) != _DIGEST_LENGTH or hashlib.sha256(script).hexdigest().encode() != digest:
+        return None
+    return script.decode()
+
+
+def _write_checked(path: Path, script: str) -> None:
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
+
+    body = script.encode()
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(path, hashlib.sha256(body).hexdigest().encode() + b"\n" + body, durable=False)
+
+
+def _can_write(folder: Path) -> bool:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        return False
+    return os.access(folder, os.W_OK)
+
+
+MAP_WIDTH, MAP_LOWEST, MAP_HIGHEST = 480, 260, 420
+_MARGIN = 0.05
+_SMALLEST_SPAN_M = 1.0
+
+
+def fit_equal_aspect(
+    x: list[float], y: list[float], *, width: float = MAP_WIDTH
+) -> tuple[float, list[float], list[float]]:
+    """Height [px] and domains [m] that give x and y the same scale and contain both extents."""
+    wide, tall = x[1] - x[0], y[1] - y[0]
+    height = min(max(width * tall / wide, MAP_LOWEST), MAP_HIGHEST)
+    scale = max(wide / width, tall / height)
+    return round(height), _widen(x, scale * width), _widen(y, scale * height)
+
+
+def _widen(extent: list[float], span: float) -> list[float]:
+    middle = (extent[0] + extent[1]) / 2.0
+    return [middle - span / 2.0, middle + span / 2.0]
+
+
+def find_extent(values: pl.Series) -> list[float]:
+    """Limits of an axis that contains the values [m], with a margin."""
+    low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
+    span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
+    return [round(value, 4) for value in _widen([low, high], span)]

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from pipeline.core import arrays, rigid
+from pipeline.core import SlipError, arrays, rigid
 from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
-from pipeline.core.program import SlipError
 from pipeline.run.signals import DriveSeries, find_fastest_wheel
 
 if TYPE_CHECKING:
@@ -275,7 +274,7 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
 
 def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     """Table `alignments` of one run, without the columns of the run."""
-    from pipeline.core.tables import tabulate  # noqa: PLC0415 - only where tables are written
+    from schemas import tabulate  # noqa: PLC0415 - only where tables are written
 
     row = {
         "hold_time": alignment.hold_s,

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 # The rule is causal: it uses past and present samples only. The same source is exported for robots
-# (`export/targets/data_formats.py`). Ratios refer to the usual speed of the body at given wheel speeds on
+# (`export/data_formats.py`). Ratios refer to the usual speed of the body at given wheel speeds on
 # this terrain: deep snow that always takes half of it is no event. Turns are excluded, because skid-steered
 # vehicles always slip in turns.
 

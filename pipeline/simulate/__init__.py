@@ -2,33 +2,43 @@
 
 A `Scenario` says everything about a run; `simulate_run` drives it and `write_log` records it. The
 physics is written here a second time, independently: nothing is shared with the models that are fitted.
+Scenarios that have a name stand here, simulated and written as logs: never a word of the truth.
 """
 
-from pipeline.simulate.cases import (
-    Case,
-    find_case,
-    list_cases,
-    list_effects,
-    make_scenario,
-    simulate_case,
-    write_log,
-    write_samples,
-)
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, Final, TypedDict, TypeVar, Unpack, get_args
+
+import numpy as np
+
+from pipeline.core.arrays import Floats, Ints
+from pipeline.simulate import messages
 from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.facts import (
+    CATALOGUE,
     LAYOUTS,
     VEHICLES,
     CommandTopic,
+    EffectSpec,
     Layout,
     PoseTopic,
     SimulateError,
     Vehicle,
     WheelTopic,
+    find_layout,
     find_vehicle,
+    read_facts,
+    resolve_effects,
+    unknown_name,
 )
-from pipeline.simulate.messages import SimulatedRun, simulate_run
+from pipeline.simulate.messages import Field, Sheet, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
-from pipeline.simulate.platforms import PLATFORMS, Platform
+from pipeline.simulate.path import CompactedGround
+from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, publish
+from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
     INCIDENTS,
     TRACTION,
@@ -41,7 +51,430 @@ from pipeline.simulate.scenario import (
     IncidentKind,
     PoseSensor,
     Program,
+    ProgramName,
     Recording,
     Scenario,
     State,
 )
+
+Stamps = Ints
+
+_SWING_S = 7.0
+_SHORTEST_BUNCH = 0.1
+_GOLDEN = 0.5 * (np.sqrt(5.0) - 1.0)
+
+
+def stamp_times(clock: Clock, time_s: Floats) -> Stamps:
+    """Nanoseconds that the recorder's clock shows when it gets what came at true times [s], shape (n,).
+
+    A clock that was set before the run began counts from its own time before the run, too: a pose that is
+    stamped early is a few moments older than the run. A clock that shows less than zero shows zero: stamps
+    are unsigned.
+    """
+    got = _bunch(time_s, clock.bunch_s)
+    if clock.real_time_factor is not None:
+        turn = 2.0 * np.pi / _SWING_S
+        passed = (got + clock.swing / turn * np.sin(turn * got)) / clock.real_time_factor
+        return clock.start_ns + np.rint(passed * 1e9).astype(np.int64)
+    return _show(clock, got)
+
+
+def stamp_headers(clock: Clock, time_s: Floats) -> Stamps:
+    """Nanoseconds that header stamps show: simulated time where there is one, else the robot's clock."""
+    if clock.real_time_factor is not None:
+        return np.maximum(np.rint(time_s * 1e9).astype(np.int64), 0)
+    return _show(clock, time_s * (1.0 + 1e-6 * clock.drift_ppm))
+
+
+def _show(clock: Clock, time_s: Floats) -> Stamps:
+    elapsed = np.rint(time_s * 1e9).astype(np.int64)
+    unset = (time_s < clock.unset_s) & (clock.unset_s > 0.0)
+    shown = np.where(unset, elapsed, clock.start_ns + elapsed)
+    gone_back = time_s >= clock.backward_at_s
+    shown = np.where(gone_back, shown - round(clock.backward_s * 1e9), shown)
+    return np.maximum(shown, 0)
+
+
+def _bunch(time_s: Floats, longest_s: float) -> Floats:
+    """When bunches arrive in which what came at these times is, the shortest a tenth of the longest."""
+    if longest_s <= 0.0 or time_s.size == 0:
+        return time_s
+    count = 2 + int((time_s.max() + longest_s) / (_SHORTEST_BUNCH * longest_s))
+    share = np.modf(np.arange(1, count) * _GOLDEN)[0]
+    ends = np.cumsum(longest_s * (_SHORTEST_BUNCH + (1.0 - _SHORTEST_BUNCH) * share))
+    return ends[np.searchsorted(ends, time_s)]
+
+
+# Logs of platforms that speak protobuf: the same sheets as messages of their types.
+#
+# Types as farm-ng/farm-ng-core and farm-ng/farm-ng-amiga declare them; enumerations stand as the numbers that
+# they are in a message.
+
+_CORE, _CANBUS, _FILTER = "farm_ng.core.proto", "farm_ng.canbus.proto", "farm_ng.filter.proto"
+TYPES: Final[dict[str, str]] = {
+    f"{_CORE}.Vec3F64": "double x = 1; double y = 2; double z = 3",
+    f"{_CORE}.QuaternionF64": f"{_CORE}.Vec3F64 imag = 1; double real = 2",
+    f"{_CORE}.Rotation3F64": f"{_CORE}.QuaternionF64 unit_quaternion = 1",
+    f"{_CORE}.Isometry3F64": f"{_CORE}.Rotation3F64 rotation = 1; {_CORE}.Vec3F64 translation = 2",
+    f"{_CORE}.Pose": f"{_CORE}.Isometry3F64 a_from_b = 1; string frame_a = 2; string frame_b = 3; "
+    f"{_CORE}.Vec3F64 linvel_of_a_in_b = 4; {_CORE}.Vec3F64 angvel_of_a_in_a = 5",
+    f"{_CANBUS}.Twist2d": "float linear_velocity_x = 1; float linear_velocity_y = 2; "
+    "float angular_velocity = 3",
+    f"{_CANBUS}.AmigaTpdo1": "uint32 node_id = 1; double stamp = 2; int32 control_state = 3; "
+    "double measured_speed = 4; double measured_angular_rate = 5; uint32 pto_bits = 6; "
+    "uint32 hbridge_bits = 7",
+    f"{_CANBUS}.AmigaV6CanbusState": f"{_CANBUS}.AmigaTpdo1 amiga_tpdo1 = 1; "
+    "double battery_charge_level = 3; bool last_send_error = 4",
+    f"{_FILTER}.FilterState": f"{_CORE}.Pose pose = 1; bool has_converged = 2; bool is_calibrated = 3; "
+    "double heading = 6",
+}
+_NUMBERS: Final = {"double": 1, "float": 2, "int32": 5, "bool": 8, "string": 9, "uint32": 13}
+_MESSAGE, _OPTIONAL = 11, 1
+
+
+def is_protobuf(type_name: str) -> bool:
+    """Whether a type is one of these."""
+    return type_name in TYPES
+
+
+def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path) -> None:
+    """Write sheets as an MCAP log of protobuf messages, in time order."""
+    from mcap_protobuf.writer import Writer  # noqa: PLC0415 - heavy
+
+    messages: list[tuple[int, int, Any]] = []
+    for number, sheet in enumerate(sheets):
+        columns = {
+            name: np.broadcast_to(np.asarray(value, dtype=object), sheet.log_s.shape).tolist()
+            for name, value in sheet.fields.items()
+        }
+        for row, time in enumerate(stamp_times(clock, sheet.log_s).tolist()):
+            message = _make_classes()[sheet.type_name]()
+            for name, column in columns.items():
+                _set(message, name, column[row])
+            messages.append((time, number, message))
+    with path.open("wb") as stream, Writer(stream) as writer:
+        for time, number, message in sorted(messages, key=lambda one: one[:2]):
+            writer.write_message(sheets[number].topic, message, time, time)
+
+
+def _set(message: Any, path: str, value: object) -> None:  # noqa: ANN401 - made at run time
+    *inner, name = path.split(".")
+    for part in inner:
+        message = getattr(message, part)
+    kind = message.DESCRIPTOR.fields_by_name[name].cpp_type
+    whole = isinstance(value, float) and kind not in {5, 6}
+    setattr(message, name, int(value) if whole else value)  # type: ignore[call-overload]
+
+
+@cache
+def _make_classes() -> dict[str, Any]:
+    """A class for every type."""
+    from google.protobuf import descriptor_pb2, descriptor_pool, message_factory  # type: ignore[import-untyped]  # noqa: PLC0415 - heavy
+
+    pool = descriptor_pool.DescriptorPool()
+    for package in (_CORE, _CANBUS, _FILTER):
+        file = descriptor_pb2.FileDescriptorProto(name=f"{package}.proto", package=package, syntax="proto3")
+        file.dependency.extend([] if package == _CORE else [f"{_CORE}.proto"])
+        for name, text in TYPES.items():
+            if name.rpartition(".")[0] != package:
+                continue
+            declared = file.message_type.add(name=name.rpartition(".")[2])
+            for line in text.split("; "):
+                kind, field, _, number = line.split(" ")
+                plain = kind in _NUMBERS
+                declared.field.add(
+                    name=field,
+                    number=int(number),
+                    label=_OPTIONAL,
+                    type=_NUMBERS.get(kind, _MESSAGE),
+                    type_name=None if plain else f".{kind}",
+                )
+        pool.Add(file)
+    return {name: message_factory.GetMessageClass(pool.FindMessageTypeByName(name)) for name in TYPES}
+
+
+_BOOTED_NS = 100_000_000_000
+
+
+def write_log(run: SimulatedRun, path: Path) -> None:
+    """Write a run as an MCAP log; the same run gives the same bytes.
+
+    Args:
+        run: what was simulated.
+        path: file to write; its folder must exist.
+
+    Raises:
+        SimulateError: ``unknown_layout`` or ``wrong_vehicle``, before anything is written.
+    """
+    # Naming cases and effects on the command line must not wait for the writer.
+    from pipeline.logs.writer import LogWriter  # noqa: PLC0415
+
+    scenario = run.scenario
+    layout = find_layout(scenario.recording.layout, scenario.vehicle)
+    sheets = (
+        publish(run, layout.topics)
+        if layout.topics
+        else [
+            *messages.command_sheets(run, layout),
+            *messages.wheel_sheets(run, layout),
+            *messages.pose_sheets(run, layout.pose),
+            *messages.static_sheets(run, layout),
+            *messages.imu_sheets(run, layout),
+            *messages.state_sheets(run),
+            *messages.decoy_sheets(run),
+        ]
+    )
+    if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
+        write_protobuf(messages.cut_gaps(run, sheets), scenario.clock, path)
+        return
+    with LogWriter(path) as writer:
+        for sheet in messages.cut_gaps(run, sheets):
+            header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
+            if header is not None and sheet.topic in scenario.recording.zero_stamps:
+                header = np.zeros_like(header)
+            fields = sheet.fields
+            if header is not None and sheet.stamp != "header":
+                fields, header = fields | _write_stamp(sheet.stamp, header, scenario.clock.start_ns), None
+            writer.write_columns(
+                sheet.topic,
+                sheet.type_name,
+                stamp_times(scenario.clock, sheet.log_s),
+                fields,
+                header_time=header,
+            )
+        if scenario.recording.deployment == "written":
+            writer.metadata(
+                "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}
+            )
+
+
+def _write_stamp(field: str, stamps: Ints, start_ns: int) -> dict[str, Field]:
+    """Fields of a stamp [ns] outside a header; a counter of microseconds began some time before the run."""
+    if field.startswith("timestamp"):
+        return {field: ((stamps - start_ns + _BOOTED_NS) // 1000).astype(np.float64)}
+    seconds, rest = np.divmod(stamps, 1_000_000_000)
+    return {f"{field}.sec": seconds.astype(np.float64), f"{field}.nanosec": rest.astype(np.float64)}
+
+
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class Case:
+    """A named scenario and what it shows, in one line; a machine when it is built of rigid bodies."""
+
+    name: str
+    shows: str
+    scenario: Scenario
+    machine: SkidSteer | None = None
+
+
+def _ride_oval_wheel(state: State) -> tuple[float, float, float]:
+    # An out-of-round left wheel: 4 % of radius, once a turn.
+    vehicle, uneven = VEHICLES["husky"], 0.04 * math.sin(state.left_angle)
+    rim = vehicle.wheel_radius_m * state.left_speed
+    return 0.5 * uneven * rim, 0.0, -uneven * rim / vehicle.track_width_m
+
+
+_EXTRAS = {"oval_wheel": _ride_oval_wheel, "compacted_snow": CompactedGround(0.3, 0.88, 4.0)}
+
+
+def _change(base: Made, changes: Mapping[str, Any]) -> Made:
+    """A copy with other fields; a table changes fields of what stands there."""
+    fields = {}
+    for name, given in changes.items():
+        before = getattr(base, name)
+        inner = is_dataclass(before) and isinstance(given, dict)
+        fields[name] = _change(before, given) if inner else given
+    return replace(base, **fields)  # type: ignore[type-var]
+
+
+def _change_scenario(base: Scenario, given: dict[str, Any]) -> Scenario:
+    if isinstance(given.get("vehicle"), str):
+        given["vehicle"] = VEHICLES[given["vehicle"]]
+    if "extra" in given:
+        given["extra"] = _EXTRAS[given["extra"]]
+    return _change(base, given)
+
+
+_BASES: dict[str, Scenario] = {}
+for _name, _given in read_facts("bases.toml").items():
+    _BASES[_name] = _change_scenario(_BASES.get(_given.pop("base", ""), Scenario()), _given)
+
+
+def _make_case(name: str, given: dict[str, Any]) -> Case:
+    shows, base, machine = given.pop("shows"), _BASES[given.pop("base")], given.pop("machine", None)
+    if isinstance(machine, str):
+        machine = {"base": machine}
+    made = None if machine is None else _change(MACHINES[machine.pop("base")], machine)
+    return Case(name, shows, _change_scenario(base, given), made)
+
+
+CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml").items())
+
+_BY_NAME = {case.name: case for case in CASES}
+_SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
+_LESSON_SLOPE_RAD = math.radians(8.0)
+
+
+class Changes(TypedDict, total=False):
+    """What is otherwise than in a case; None keeps what it has.
+
+    Attributes:
+        seed: of all random numbers.
+        duration_s: length of the run.
+        vehicle: a name of `VEHICLES`; brings its usual layout along.
+        layout: a name of `LAYOUTS`.
+        program: what is driven.
+        platform: a name of `PLATFORMS`; brings its vehicle and topics along.
+    """
+
+    seed: int | None
+    duration_s: float | None
+    vehicle: str | None
+    layout: str | None
+    program: str | None
+    platform: str | None
+
+
+def list_cases() -> tuple[Case, ...]:
+    """Every named case."""
+    return CASES
+
+
+def list_effects() -> tuple[EffectSpec, ...]:
+    """Every effect that can be asked for, in the order of a command's way."""
+    return tuple(CATALOGUE.values())
+
+
+def find_case(name: str) -> Case:
+    """The named case.
+
+    Raises:
+        SimulateError: ``unknown_case``.
+    """
+    if name not in _BY_NAME:
+        raise unknown_name("case", name, sorted(_BY_NAME))
+    return _BY_NAME[name]
+
+
+def simulate_case(
+    name: str | None,
+    effects: Mapping[str, Mapping[str, float] | float] | None = None,
+    *,
+    out: Path,
+    play: Path | None = None,
+    **changes: Unpack[Changes],
+) -> Path:
+    """Simulate a named case, or a plain one, with changes, and write its log.
+
+    Args:
+        name: a case of `list_cases`; None for a plain vehicle without any effect.
+        effects: added to the case's own, or in place of them where the id is the same. An empty mapping means
+            the effect's usual size.
+        out: file to write, or a folder, which gets ``<case>.mcap``.
+        play: a recording of commands that are driven in place of a program, for as long as they last.
+        changes: see `Changes`.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        SimulateError: an unknown case, effect, parameter, vehicle, layout or program, an impossible value or
+            combination, or a folder that cannot be written.
+    """
+    scenario = make_scenario(name, effects, **changes)
+    if play is not None:
+        scenario = _play(scenario, play, name)
+    target = out / f"{name or 'simulated'}.mcap" if out.is_dir() else out
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        machine = None if name is None else find_case(name).machine
+        run = simulate_run(scenario) if machine is None else simulate_skid_steer(scenario, machine)
+        write_log(run, target)
+    except OSError as problem:
+        what = f"the log cannot be written ({problem.strerror})"
+        raise SimulateError(
+            "cannot_write", what, where=str(target), hint="Choose another --file"
+        ) from problem
+    return target
+
+
+def _play(scenario: Scenario, path: Path, name: str | None) -> Scenario:
+    """The scenario driven with the commands of a recording."""
+    _refuse_machine(name, "drives its own program", "Leave --play out")
+    played = read_played(path, scenario.vehicle)
+    return replace(scenario, played=played, duration_s=max(float(played.time_s[-1]) + 0.5, 1.0))
+
+
+def _refuse_machine(name: str | None, why: str, hint: str) -> None:
+    if name is not None and find_case(name).machine is not None:
+        what, hint = f"a case of rigid bodies {why}", f"{hint} or choose another case"
+        raise SimulateError("wrong_vehicle", what, where=name, hint=hint)
+
+
+def make_scenario(
+    name: str | None,
+    effects: Mapping[str, Mapping[str, float] | float] | None = None,
+    *,
+    seed: int | None = None,
+    duration_s: float | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+    platform: str | None = None,
+) -> Scenario:
+    """The scenario of a named case with changes; see `Changes`."""
+    scenario = Scenario() if name is None else find_case(name).scenario
+    if vehicle or platform:
+        _refuse_machine(name, "keeps its own vehicle", "Leave the vehicle out")
+    if vehicle is not None:
+        usual = replace(scenario.recording, layout="usual")
+        scenario = replace(scenario, vehicle=find_vehicle(vehicle), recording=usual)
+    if layout is not None:
+        scenario = replace(scenario, recording=replace(scenario.recording, layout=layout))
+    if platform is not None:
+        made = find_platform(platform)
+        recording = replace(scenario.recording, layout=made.layout, deployment="absent")
+        scenario = replace(scenario, vehicle=made.vehicle, recording=recording)
+    find_layout(scenario.recording.layout, scenario.vehicle)
+    if program is not None:
+        known = get_args(ProgramName)
+        if program not in known:
+            raise unknown_name("program", program, sorted(known))
+        scenario = replace(scenario, program=replace(scenario.program, name=program))  # type: ignore[arg-type]
+    asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
+    resolve_effects(asked, scenario.vehicle.kind)
+    ground = scenario.ground
+    if not {"slope_drift", "grade_load"}.isdisjoint(asked) and ground == Ground():
+        # On level ground these effects would leave no trace at all.
+        ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
+    return replace(
+        scenario,
+        effects=asked,
+        ground=ground,
+        seed=scenario.seed if seed is None else seed,
+        duration_s=scenario.duration_s if duration_s is None else duration_s,
+    )
+
+
+def _fill_usual_sizes(
+    effects: Mapping[str, Mapping[str, float] | float],
+) -> dict[str, Mapping[str, float] | float]:
+    filled: dict[str, Mapping[str, float] | float] = dict(effects)
+    for name, given in effects.items():
+        if given == {} and name in CATALOGUE:
+            filled[name] = {
+                item.name: item.typical for item in CATALOGUE[name].parameters if not math.isnan(item.typical)
+            }
+    return filled
+
+
+def write_samples(directory: Path) -> list[Path]:
+    """Write the three sample logs into a folder, which is made if need be.
+
+    Returns:
+        The files written: ``husky_tile.mcap``, ``warthog_ice.mcap`` and ``ackermann_gravel.mcap``.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    return [simulate_case(name, out=directory / f"{name}.mcap") for name in _SAMPLES]

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import msgspec
 
-from pipeline.core.program import SlipError, guess_names
+from pipeline.core import SlipError, guess_names
 from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.program import guess_names, shorten
+from pipeline.core import guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, require_finite
 from pipeline.sources.configuration import Configuration, ConfigurationError, find_preset, list_presets
 

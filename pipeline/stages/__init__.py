@@ -10,8 +10,7 @@ from typing import Literal
 
 import polars as pl
 
-from pipeline.core.program import SlipError
-from pipeline.core.tables import tabulate
+from pipeline.core import SlipError
 from pipeline.logs import Loss
 
 SURE = 5.0
@@ -60,5 +59,7 @@ class Finding:
 
 def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
     """Findings of one stage as a table (without the run's columns)."""
+    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
+
     rows = [{"stage": stage, **vars(finding)} for finding in findings]
     return tabulate("findings", rows)

@@ -10,9 +10,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import arrays
+from pipeline.core import NORMAL_95, arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.core.program import NORMAL_95
 from pipeline.run.heading import fit_gyro
 from pipeline.run.recording import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.run.signals import STILL_MPS
@@ -20,7 +19,7 @@ from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.command_timeout import find_timeout, report_timeout
+from pipeline.stages.drive_numbers import find_timeout, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs

@@ -6,20 +6,20 @@ from typing import Final
 
 import numpy as np
 
+from pipeline.core import format_share
 from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
-from pipeline.core.program import format_share
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.run.signals import LIVE_SHARE, STILL_MPS
 from pipeline.sources import Vehicle, list_factors
 from pipeline.stages import SURE, Finding
-from pipeline.stages.map_shape import check_map_shape
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
     LEAST_CORRELATION,
     ONE_SCALE,
     Samples,
     check_live_commands,
+    check_map_shape,
     estimate_delay,
 )
 

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from pipeline.core import SlipError, format_share
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -36,8 +36,8 @@ from pipeline.stages.drive import (
     read_signal,
     read_speed,
 )
+from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.pose_topics import read_bodies
-from pipeline.stages.power_table import tabulate_power
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 

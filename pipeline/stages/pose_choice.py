@@ -13,9 +13,8 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import arrays, rigid
+from pipeline.core import SlipError, arrays, format_share, rigid
 from pipeline.core.arrays import Floats
-from pipeline.core.program import SlipError, format_share
 from pipeline.logs import LogData
 from pipeline.run.signals import ANSWERS_S, LIVE_SHARE
 from pipeline.run.windows import WINDOW_S

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import arrays
+from pipeline.core import arrays, format_share
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
-from pipeline.core.program import format_share
 from pipeline.run.heading import align_heading, has_excluded, mark_excluded
 from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs

@@ -8,9 +8,8 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import rigid
+from pipeline.core import format_share, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.program import format_share
 from pipeline.logs import LogError, Ragged, RaggedStrings, TopicColumns, TransformBuffer, TransformSeries
 from pipeline.sources import PoseSource, Vehicle
 from pipeline.sources.candidates import LOCALIZED

@@ -11,9 +11,8 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, rigid
+from pipeline.core import arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.program import format_share
 from pipeline.logs import TopicColumns
 from pipeline.run.heading import fit_turning
 from pipeline.run.signals import MOVING_MPS, STILL_MPS

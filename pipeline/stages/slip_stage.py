@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.tables import tabulate
 from pipeline.run.recording import read_wheel_times
 from pipeline.run.signals import STILL_MPS
 from pipeline.sources import Configuration, Vehicle
@@ -395,6 +394,8 @@ def aggregate_run(
                     "length_scale": length,
                 }
             )
+    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
+
     return tabulate("aggregates", rows)
 
 

@@ -6,8 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, robust_spread
-from pipeline.core.numerics import solve_tridiagonal
+from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, robust_spread, solve_tridiagonal
 from pipeline.core.rigid import LONGEST_WAIT_S
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run.heading import align_heading, fit_gyro, mark_excluded

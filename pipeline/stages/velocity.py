@@ -16,10 +16,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, rigid
+from pipeline.core import arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.program import format_share
-from pipeline.core.tables import tabulate
 from pipeline.run.heading import SPAN_S
 from pipeline.run.recording import Alignment, GyroFit
 from pipeline.run.signals import ANSWERS_S
@@ -27,6 +25,7 @@ from pipeline.run.traction import Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
 from pipeline.stages.incidents import LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
+from schemas import tabulate
 
 if TYPE_CHECKING:
     from pipeline.sources import Vehicle

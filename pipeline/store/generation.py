@@ -9,9 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
-from pipeline.store.files import remove_folder, temporary_beside
-from pipeline.store.listing import Replacement
-from pipeline.store.manifest import (
+from pipeline.store.files import (
     JSON,
     MANIFEST,
     MARKER,
@@ -21,7 +19,10 @@ from pipeline.store.manifest import (
     hash_bytes,
     hash_file,
     read_parquet,
+    remove_folder,
+    temporary_beside,
 )
+from pipeline.store.listing import Replacement
 from pipeline.store.names import (
     QUARANTINE,
     StoreError,

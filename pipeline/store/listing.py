@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.core.untrusted import PathError, check_name
 from pipeline.store import files
-from pipeline.store.manifest import MANIFEST, Manifest, hash_bytes
+from pipeline.store.files import MANIFEST, Manifest, hash_bytes
 from pipeline.store.names import StoreError, join_inside
 from pipeline.store.seals import Key, seal, unseal
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.store.files import make_folder, replace_file
+from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_bytes, make_folder, replace_file
 from pipeline.store.listing import (
     ABSENT,
     KEY_MARK,
@@ -30,7 +30,6 @@ from pipeline.store.listing import (
     renew_register,
     require_unsealed,
 )
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes
 from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
 from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import (
@@ -46,7 +45,6 @@ from pipeline.store.verification import SEEN, Examination, examine_files, seal_e
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
-
 
 _TOGETHER = 200
 """Objects fetched by one call: bounds the memory that waits to be written."""

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.core.untrusted import PathError, may_lead_out, resolve_inside
 
 

@@ -32,7 +32,7 @@ from schemas import Contract, contract_of, list_contracts
 if TYPE_CHECKING:
     from dataframely import FailureInfo
 
-    from pipeline.store.manifest import Manifest
+    from pipeline.store.files import Manifest
 
 BROKEN_RULES = "broken_rules"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
-from pipeline.store.files import hold_lock
+from pipeline.store.files import MANIFEST, MARKER, Manifest, Partition, hash_bytes, hash_file, hold_lock
 from pipeline.store.generation import Generation, point_latest, remove_orphans
 from pipeline.store.listing import (
     KEY_MARK,
@@ -27,7 +27,6 @@ from pipeline.store.listing import (
     require_key,
     require_unsealed,
 )
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, Partition, hash_bytes, hash_file
 from pipeline.store.names import (
     QUARANTINE,
     Sample,

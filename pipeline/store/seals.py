@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import Any, Final, cast
 
 from pipeline.core.untrusted import PathError, resolve_inside
-from pipeline.store.files import replace_file
-from pipeline.store.manifest import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes
+from pipeline.store.files import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes, replace_file
 from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
 
 # Small JSON files that carry a checksum of themselves, so that no byte of them changes unnoticed.

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from pipeline.core.untrusted import walk_files
-from pipeline.store.files import do_nothing
+from pipeline.store.files import MANIFEST, MARKER, Manifest, do_nothing, hash_bytes, hash_file
 from pipeline.store.listing import (
     ABSENT,
     KEY_MARK,
@@ -22,7 +22,6 @@ from pipeline.store.listing import (
     parse_mark,
     parse_register,
 )
-from pipeline.store.manifest import MANIFEST, MARKER, Manifest, hash_bytes, hash_file
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
 from pipeline.store.seals import NOTES, Key, check_seal, encode_marker, parse_manifest, parse_marker, unseal
 

@@ -40,7 +40,7 @@ from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
-from pipeline.web.answers import WorkbenchError
+from pipeline.web import WorkbenchError
 from pipeline.web.session import (
     Session,
     SessionFile,

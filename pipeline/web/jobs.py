@@ -11,13 +11,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.batch.batch_work import Entry, Report, Task
-from pipeline.batch.executors import LocalExecutor, Settings
-from pipeline.core.program import SlipError
+from pipeline.batch.batch_work import Entry, Report, Settings, Task
+from pipeline.batch.executors import LocalExecutor
+from pipeline.core import SlipError
 from pipeline.job import STAGE_WORDS, STAGES, Options
-from pipeline.job.log_setup import name_run
+from pipeline.job.keys import name_run
 from pipeline.store import LogSighting, Manifest, Store, see_log
-from pipeline.web.answers import Limits, ServerFolders, WorkbenchError
+from pipeline.web import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 
 # Analyses and diagnoses run in a separate process, so that a crash or a hang affects nothing else.

@@ -1,28 +1,47 @@
-"""HTTP routes of the workbench, and start of its server."""
+"""HTTP routes of the workbench, limits of its connections, and start of its server."""
 
 from __future__ import annotations
 
+import asyncio
+import logging
 import os
 import socket
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from importlib.resources import files
 from pathlib import Path
 from typing import TYPE_CHECKING
 from urllib.parse import quote
 
+import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Route
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.server import ServerState
 
 from pipeline.job.analyze import PREVIEW, REPORT
 from pipeline.job.watch import read_statements
-from pipeline.report.page import CATALOGUE, PAGES, PLANS, is_page, load_bundle, warm_bundle
+from pipeline.report import CATALOGUE, PAGES, PLANS, is_page
+from pipeline.report.theme import load_bundle, warm_bundle
 from pipeline.sources import list_presets
-from pipeline.web.answers import Ask, Limits, ServerFolders, WorkbenchError, answer, make_handlers, read_ask
-from pipeline.web.guard import LOOPBACK, Guard, make_token
+from pipeline.web import (
+    ADMIT,
+    LOOPBACK,
+    Ask,
+    Guard,
+    Limits,
+    ServerFolders,
+    WorkbenchError,
+    answer,
+    bind_port,
+    is_loopback,
+    make_handlers,
+    make_token,
+    read_ask,
+)
 from pipeline.web.jobs import Jobs
 from pipeline.web.stored_runs import KINDS, find_file, find_run, list_runs
 from pipeline.web.workbench import Sessions
@@ -34,6 +53,163 @@ if TYPE_CHECKING:
     from pipeline.batch.batch_work import Report, Task
 
     Answer = Callable[[Request], Awaitable[Response]]
+
+# Connections of the workbench: limits of number, time and size for those that have not shown the token.
+#
+# Every user of the machine can connect. A connection is pending until a request on it has shown the token. A
+# pending connection is closed after `PENDING_S`, after the first answer, and if it is the oldest of too many.
+# Clients with the token show it with the first bytes, long before the limit is reached.
+
+PENDING_S = 10.0
+"""Longest time until a connection has shown the token [s]: enough for two lost packets and the headers."""
+ANSWER_S = 1.0
+"""Time to read the answer to a request whose body is not read, before the connection is reset [s]."""
+MOST_PENDING = 256
+"""Largest number of pending connections: a quarter of the usual limit of 1,024 open files."""
+_HEAD_BYTES = 16_384
+"""Largest request head of a pending connection [bytes]: h11's own limit for a head that arrives in parts."""
+_HEAD_LINES = 100
+"""Largest number of lines of such a head: h11 takes 22 us per line, and browsers send about 20."""
+_ACCEPTS = 8
+"""Ratio of the limit of pending connections to those accepted at once. A connection is closed three rounds of
+the event loop after it was accepted, so fewer connections are waiting to be closed than may be pending, and a
+connection that has sent its headers is read before it becomes the oldest."""
+_QUEUE = 512
+"""Length of the kernel's queue of connections, 0.3 s of refused requests; further ones are dropped, and the
+client retries after 1 s."""
+
+
+class Connections(ServerState):
+    """Shared state of the connections of a server.
+
+    Args:
+        most_pending: largest number of pending connections.
+
+    Attributes:
+        pending: pending connections, the oldest first.
+    """
+
+    def __init__(self, most_pending: int) -> None:
+        super().__init__()
+        self.most_pending = most_pending
+        self.pending: dict[WorkbenchProtocol, None] = {}
+
+
+class WorkbenchProtocol(H11Protocol):
+    """HTTP on one connection, pending until the application calls `ADMIT` of a request's state."""
+
+    def __init__(
+        self,
+        config: uvicorn.Config,
+        server_state: Connections,
+        app_state: Mapping[str, object],
+        _loop: asyncio.AbstractEventLoop | None = None,
+    ) -> None:
+        super().__init__(config, server_state, {**app_state, ADMIT: self._end_pending}, _loop)
+        self._shared = server_state
+        self._lines = 0
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override] # as uvicorn
+        """Start to wait for the token, and close the oldest connection if there are too many."""
+        super().connection_made(transport)
+        pending = self._shared.pending
+        pending[self] = None
+        self._deadline = self.loop.call_later(PENDING_S, transport.abort)
+        if len(pending) > self._shared.most_pending:
+            oldest = next(iter(pending))
+            del pending[oldest]
+            oldest.transport.abort()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Forget the connection."""
+        self._end_pending()
+        super().connection_lost(exc)
+
+    def _end_pending(self) -> None:
+        self._deadline.cancel()
+        self._shared.pending.pop(self, None)
+
+    def data_received(self, data: bytes) -> None:
+        """Process data, unless the head is so long that parsing it would delay other clients."""
+        if self in self._shared.pending:
+            head = data.partition(b"\r\n\r\n")[0]
+            self._lines += head.count(b"\n")
+            if len(head) > _HEAD_BYTES or self._lines > _HEAD_LINES:
+                self.send_400_response("The head of the request is too long.")
+                return
+        super().data_received(data)
+
+    def on_response_complete(self) -> None:
+        """Close the connection if the token was not shown or the body was not read; else keep it open."""
+        if self.cycle.more_body:
+            # If closed immediately, incoming data would reset it, and the answer might be lost.
+            self.flow.pause_reading()
+            with suppress(OSError):
+                self.transport.write_eof()
+            self.loop.call_later(ANSWER_S, self.transport.abort)
+            return
+        if self in self._shared.pending:
+            self.transport.close()
+        super().on_response_complete()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer data that are not HTTP, unless a response is already being sent."""
+        answers = self.cycle is not None and not self.cycle.response_complete
+        if answers:
+            # The application must not answer a second time.
+            self.cycle.disconnected = True
+        if answers and self.cycle.response_started:
+            self.transport.abort()
+        else:
+            super().send_400_response(msg)
+
+
+class WorkbenchServer(uvicorn.Server):
+    """Serves the workbench on listening sockets.
+
+    Args:
+        app: the workbench.
+        open_files: limit of open files and connections of the process.
+    """
+
+    def __init__(self, app: ASGIApp, open_files: int) -> None:
+        most_pending = min(MOST_PENDING, open_files // 4)
+        super().__init__(
+            uvicorn.Config(
+                app,
+                http=WorkbenchProtocol,
+                loop="asyncio",
+                ws="none",
+                # Warnings report errors of clients.
+                log_level="error",
+                server_header=False,
+                access_log=False,
+                backlog=max(1, most_pending // _ACCEPTS),
+                timeout_graceful_shutdown=2,
+            )
+        )
+        self.server_state = Connections(most_pending)
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start to accept connections."""
+        asyncio.get_running_loop().set_exception_handler(_report_defect)
+        logging.getLogger("uvicorn.error").addFilter(_is_defect)
+        await super().startup(sockets)
+        for listener in sockets or []:
+            # asyncio uses the same value for the queue and for the connections accepted at once.
+            listener.listen(_QUEUE)
+
+
+def _report_defect(loop: asyncio.AbstractEventLoop, context: dict[str, object]) -> None:
+    """Report errors of the event loop except socket errors: asyncio retries if there are too many files."""
+    if not isinstance(context.get("exception"), OSError):
+        loop.default_exception_handler(context)
+
+
+def _is_defect(record: logging.LogRecord) -> bool:
+    """Whether to print a log record: all except requests cancelled by the shutdown."""
+    return not (record.exc_info and isinstance(record.exc_info[1], asyncio.CancelledError))
+
 
 _LONGEST_LENGTH = 18
 """Largest number of digits of an announced log size, checked before parsing."""
@@ -54,6 +230,7 @@ _SCRIPTS = {
     ),
     "pipeline.report": ("marks", "plots"),
 }
+
 # The report contains its own policy: it may run its own scripts, and access nothing else.
 _SHUT_OFF = {
     "content-security-policy": "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; "
@@ -254,14 +431,6 @@ def _serve_own(package: str, name: str, kind: str) -> Answer:
     return serve
 
 
-_LAST_PORT = 65535
-
-
-def is_loopback(host: str) -> bool:
-    """Whether an address is reachable from this machine only."""
-    return host in LOOPBACK or host == "::1"
-
-
 def serve(
     results: Path,
     *,
@@ -284,14 +453,14 @@ def serve(
     Raises:
         WorkbenchError: ``no_such_port``; ``port_taken``, the port cannot be opened.
     """
-    from pipeline.web.guard import WorkbenchServer, raise_open_files  # noqa: PLC0415 - heavy
+    from pipeline.web import raise_open_files  # noqa: PLC0415 - heavy
 
     # Child processes must not import code from their working folder.
     os.environ["PYTHONSAFEPATH"] = "1"
     if host == "localhost":
         # Another program may listen on the other address of that name, and would receive the token.
         host = LOOPBACK[0]
-    listener = _listen(host, port)
+    listener = bind_port(host, port)
     hosts = LOOPBACK if is_loopback(host) else (*LOOPBACK, host.lower(), *_own_names(host))
     token = make_token()
     app = build_app(results, token=token, hosts=hosts, limits=limits, diagnosis=diagnosis)
@@ -299,28 +468,6 @@ def serve(
     shown = f"[{host}]" if ":" in host else host
     notify(f"http://{shown}:{listener.getsockname()[1]}/", token)
     WorkbenchServer(app, raise_open_files()).run(sockets=[listener])
-
-
-def _listen(host: str, port: int) -> socket.socket:
-    if not 0 <= port <= _LAST_PORT:
-        hint = "Give another --port, or 0 for any that is free."
-        raise WorkbenchError(
-            "no_such_port", f"ports are 0 to {_LAST_PORT}", where=f"{host}:{port}", hint=hint
-        )
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
-    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    try:
-        listener.bind((host, port))
-        # Clients may connect as soon as the address is printed; the answer comes when the server is ready.
-        listener.listen()
-    except OSError as error:
-        listener.close()
-        hint = "Give another --port, or 0 for any that is free."
-        raise WorkbenchError(
-            "port_taken", f"nothing can listen there: {error.strerror}", where=f"{host}:{port}", hint=hint
-        ) from error
-    return listener
 
 
 def _own_names(host: str) -> tuple[str, ...]:

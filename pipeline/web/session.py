@@ -12,17 +12,16 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.program import naming_os_errors
+from pipeline.core import naming_os_errors
 from pipeline.job.run_results import locate_beside
-from pipeline.models import Effect, Model, Parameter, list_effects
+from pipeline.models import Effect, Model, Parameter, format_model, list_effects
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.model_file import ModelFile, parse_model
-from pipeline.models.model_text import format_model
 from pipeline.models.parameter import stands_at_bound
 from pipeline.sources import Vehicle
 from pipeline.store.files import make_folder, replace_file
-from pipeline.web.answers import WorkbenchError
+from pipeline.web import WorkbenchError
 
 SLOTS = ("a", "b")
 

@@ -10,12 +10,11 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.core.json_objects import number_in
+from pipeline.core.untrusted import number_in
 from pipeline.estimation.diagnosis import budget_as_json
 from pipeline.job.work import find_residual_modulus
-from pipeline.report import theme
-from pipeline.report.figures import figure, list_figures, over_ground
-from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report import figures, theme
+from pipeline.report.figures import Drawing, Figure, Section, list_figures, slip_figures
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import RunReport, Scene, break_lines
 from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
@@ -94,7 +93,7 @@ class StretchScene(Scene):
 
 def _colour_series(source: str) -> Channel:
     """Colours of the measured, ideal and modelled motion, with a legend in one line."""
-    colour = figure.series_colour(["velocity", source, "model"], figure.SERIES_WORDS)
+    colour = figures.series_colour(["velocity", source, "model"], figures.SERIES_WORDS)
     return {**colour, "legend": {**colour["legend"], "columns": 3}}  # type: ignore[dict-item]
 
 
@@ -104,11 +103,11 @@ def draw_paths(scene: Scene) -> Drawing | None:
         return None
     ideal = scene.cut_arcs(scene.report.motion.ideal_arcs)
     both = pl.concat([scene.driven.select("x", "y"), ideal.select("x", "y")])
-    extent = [over_ground.find_extent(both["x"]), over_ground.find_extent(both["y"])]
-    height, x_domain, y_domain = over_ground.fit_equal_aspect(extent[0], extent[1])
+    extent = [theme.find_extent(both["x"]), theme.find_extent(both["y"])]
+    height, x_domain, y_domain = theme.fit_equal_aspect(extent[0], extent[1])
     scales = [{"domain": domain, "nice": False, "zero": False} for domain in (x_domain, y_domain)]
     x = make_axis("x", "x in the map [m]", scale=scales[0], tickCount=5)
-    y = make_axis("y", "y in the map [m]", scale=scales[1], tickCount=5, minExtent=figure.GUTTER - 20)
+    y = make_axis("y", "y in the map [m]", scale=scales[1], tickCount=5, minExtent=figures.GUTTER - 20)
     colour = _colour_series(scene.report.motion.input)
 
     def line(name: str, **look: object) -> Chart:
@@ -130,7 +129,7 @@ def draw_paths(scene: Scene) -> Drawing | None:
         width=480,
         height=height,
         usermeta={
-            "gutter": figure.GUTTER + 4,
+            "gutter": figures.GUTTER + 4,
             "equal": {"x": extent[0], "y": extent[1], "lowest": 300, "highest": 330},
         },
     )
@@ -186,10 +185,10 @@ def draw_motion(scene: Scene) -> Drawing | None:
         rows[f"stretch_v_{name}"] = fixed
         known = pl.concat([fixed, rows[f"stretch_model_{name}"]])["value"].drop_nulls()
         panels.append(_draw_panel(scene, name, f"{words} [{unit}]", known, colour))
-    chart = stack(*panels).properties(usermeta=figure.brush_over_time())
+    chart = stack(*panels).properties(usermeta=figures.brush_over_time())
     words = "Forward velocity and yaw rate of the stretch: measured, ideal and model."
     return Drawing(
-        chart, rows | {figure.MARKED_SPANS: figure.span_rows(scene)[figure.MARKED_SPANS]}, "", words
+        chart, rows | {figures.MARKED_SPANS: figures.span_rows(scene)[figures.MARKED_SPANS]}, "", words
     )
 
 
@@ -208,11 +207,11 @@ def _draw_panel(
         None,
         scale={"domain": [ends[0] - room, ends[1] + room], "nice": True},
         tickCount=4,
-        minExtent=figure.GUTTER - 10,
+        minExtent=figures.GUTTER - 10,
     )
     widths = {f"stretch_v_{name}": 1.6, f"stretch_model_{name}": 2.0}
     marked = (
-        Chart.of_rows(figure.MARKED_SPANS)
+        Chart.of_rows(figures.MARKED_SPANS)
         .mark("rect", color=theme.MARK, opacity=0.2, clip=True)
         .encode(x="t_start:Q", x2="t_end:Q")
     )
@@ -257,7 +256,7 @@ TABS: Mapping[str, tuple[str, ...]] = {
 }
 """Figures of every tab, in order."""
 BUDGET = "budget"
-_COLOURED = {"trajectory": over_ground.format_map, "command_space": over_ground.format_cells}
+_COLOURED = {"trajectory": slip_figures.format_map, "command_space": slip_figures.format_cells}
 _LEFT = "Colours: residual slip of the model."
 
 

@@ -13,9 +13,8 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core.json_objects import mapping_in, objects_in, read_object
-from pipeline.core.program import SlipError, naming_os_errors
-from pipeline.core.untrusted import resolve_inside
+from pipeline.core import SlipError, naming_os_errors
+from pipeline.core.untrusted import mapping_in, objects_in, read_object, resolve_inside
 from pipeline.estimation.verdict import find_refusal
 from pipeline.job import INPUTS
 from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
@@ -29,7 +28,7 @@ from pipeline.job.run_results import (
 )
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock
-from pipeline.web.answers import Limits, WorkbenchError
+from pipeline.web import Limits, WorkbenchError
 
 _LONGEST = 500
 """Largest number of characters of a text from a log; longer ones are cut on the page."""
@@ -136,7 +135,7 @@ def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
     from pipeline.job.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
-    from pipeline.plan.manoeuvres import parse_area, parse_time  # noqa: PLC0415
+    from pipeline.plan import parse_area, parse_time  # noqa: PLC0415
 
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))

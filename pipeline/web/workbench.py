@@ -7,20 +7,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import find_refusal
-from pipeline.models import Effect, Model
+from pipeline.models import Effect, Model, write_model
 from pipeline.models.model_file import ModelFile
-from pipeline.models.model_text import write_model
 from pipeline.report.motion_view import read_model_text
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
+from pipeline.web import Ask, WorkbenchError, evaluating
 from pipeline.web.actions import Editor, PreparedRun, RunCache, Shown, keep_floor, move, open_session
-from pipeline.web.answers import Ask, WorkbenchError, evaluating
 from pipeline.web.jobs import Jobs
 from pipeline.web.session import (
     Session,

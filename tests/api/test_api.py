@@ -72,7 +72,7 @@ def test_what_the_analysis_found_is_not_looked_for_again(
 ) -> None:
     where = {"results": find_results(run), "report": False}
     again = slip.analyze(str(run.summary["log"]["path"]), **where)  # type: ignore[index, arg-type]
-    monkeypatch.setattr("pipeline.api.run.diagnose_stored", None)
+    monkeypatch.setattr("pipeline.api.diagnose_stored", None)
     assert as_json(again.diagnose().to_json()) == as_json(diagnosis.to_json())
     assert repr(again.diagnose()) == repr(diagnosis)
 
@@ -209,7 +209,7 @@ def test_what_a_model_leaves_out_and_a_log_lost_is_said(run: slip.Run, tmp_path:
 
 def test_the_name_alone_loads_nothing_and_verbs_do_without_it() -> None:
     heavy = "{'numpy', 'polars', 'altair', 'pipeline.api'} & set(sys.modules)"
-    code = f"import sys, pipeline, pipeline.cli.app as a; a.build_app(); print({heavy}); print(dir(pipeline))"
+    code = f"import sys, pipeline, pipeline.cli as a; a.build_app(); print({heavy}); print(dir(pipeline))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     loaded, names = done.stdout.splitlines()
     assert loaded == "set()"

@@ -154,7 +154,7 @@ def odd_folders() -> Iterator[None]:
 def run_batch(logs: Path, out: Path) -> tuple[int, dict[str, object], str]:
     """Exit code, JSON and errors of a batch."""
     from pipeline.batch import recordings  # noqa: PLC0415 - the repository is put on the path first
-    from pipeline.cli.app import main as slip  # noqa: PLC0415
+    from pipeline.cli import main as slip  # noqa: PLC0415
 
     arguments = ["batch", str(logs), "--out", str(out), "--executor", "inline", "--settle", "600", "--json"]
     said, errors = io.StringIO(), io.StringIO()

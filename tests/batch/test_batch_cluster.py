@@ -122,7 +122,7 @@ def test_poison_on_a_cluster_of_our_own_is_named(
 def test_a_scheduler_that_does_not_answer_is_said(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.batch.cluster._CONNECT_S", 0.5)
+    monkeypatch.setattr("pipeline.batch.executors._CONNECT_S", 0.5)
     with pytest.raises(BatchError) as caught:
         batch(season, tmp_path / "out", executor="tcp://127.0.0.1:9")
     assert caught.value.code == "cluster_not_reached"
@@ -133,7 +133,7 @@ def test_a_scheduler_that_does_not_answer_is_said(
 def test_a_scheduler_that_is_silent_is_not_waited_for(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.batch.cluster._CONNECT_S", 0.5)
+    monkeypatch.setattr("pipeline.batch.executors._CONNECT_S", 0.5)
     started = time.monotonic()
     with socket.create_server(("127.0.0.1", 0)) as place, pytest.raises(BatchError) as caught:
         batch(season, tmp_path / "out", executor=f"tcp://127.0.0.1:{place.getsockname()[1]}")
@@ -151,9 +151,9 @@ def test_a_scheduler_that_is_silent_is_not_waited_for(
 def test_a_scheduler_lost_in_the_middle_ends_the_batch(
     how: signal.Signals, season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pipeline.batch.cluster._CONNECT_S", 1.0)
-    monkeypatch.setattr("pipeline.batch.cluster._LOST_S", 1.0)
-    monkeypatch.setattr("pipeline.batch.cluster._LOOK_PERIOD_S", 0.1)
+    monkeypatch.setattr("pipeline.batch.executors._CONNECT_S", 1.0)
+    monkeypatch.setattr("pipeline.batch.executors._LOST_S", 1.0)
+    monkeypatch.setattr("pipeline.batch.executors._ASK_PERIOD_S", 0.1)
     begun = tmp_path / "begun"
     begun.mkdir()
     monkeypatch.setenv("BEGUN", str(begun))

@@ -20,18 +20,11 @@ from pipeline.batch import Pruning
 from pipeline.batch.batch_check import verify_results
 from pipeline.batch.recordings import find_recordings
 from pipeline.cli import main
-from pipeline.logs import (
-    LogError,
-    LogWriter,
-    RemotePath,
-    Wanted,
-    hash_log,
-    open_log,
-    read_topics,
-    to_location,
-)
-from pipeline.store import Mirror, Partition, Store, StoreError
+from pipeline.logs import LogError, RemotePath, Wanted, hash_log, open_log, read_topics, to_location
+from pipeline.logs.writer import LogWriter
+from pipeline.store import Partition, Store, StoreError
 from pipeline.store import mirror as mirror_room
+from pipeline.store.mirror import Mirror
 
 if TYPE_CHECKING:
     import fsspec

@@ -14,7 +14,7 @@ import pytest
 from damage_season import KINDS, NO_TEXT, cut_in_future, odd_folders, run_batch
 
 from pipeline.batch.recordings import find_recordings
-from pipeline.cli.app import main
+from pipeline.cli import main
 from pipeline.logs import LogError, open_log, spell_location, to_location
 from pipeline.store import Store
 

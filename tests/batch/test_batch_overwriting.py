@@ -15,8 +15,9 @@ pytest.importorskip("moto", reason="moto is not installed")
 import s3fs
 from object_store import BUCKET, upload
 
-from pipeline.logs import LogError, LogWriter, RemotePath, Wanted, open_log, read_topics
+from pipeline.logs import LogError, RemotePath, Wanted, open_log, read_topics
 from pipeline.logs import remote as bucket_room
+from pipeline.logs.writer import LogWriter
 from pipeline.store import Store
 
 if TYPE_CHECKING:

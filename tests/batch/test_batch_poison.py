@@ -14,8 +14,7 @@ from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
 
 from pipeline.batch import BatchError
-from pipeline.batch.batch_work import Task
-from pipeline.batch.executors import Settings
+from pipeline.batch.batch_work import Settings, Task
 from pipeline.batch.season import open_executor
 from pipeline.job import Options
 from pipeline.store import LogSighting

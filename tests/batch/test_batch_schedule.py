@@ -15,12 +15,11 @@ from typing import TYPE_CHECKING
 import pytest
 from batch_tools import HERE
 
-from pipeline.batch import BatchError
-from pipeline.batch.request import Nightly, parse_clock, print_units
+from pipeline.batch import BatchError, Nightly, parse_clock, print_units
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from pipeline.batch.request import System
+    from pipeline.batch import System
 
 needs_flock = pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 

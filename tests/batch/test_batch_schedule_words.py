@@ -10,8 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.batch import BatchError
-from pipeline.batch.request import Nightly, print_units
+from pipeline.batch import BatchError, Nightly, print_units
 
 HOSTILE = (
     "a b",

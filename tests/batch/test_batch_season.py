@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
-from pipeline.batch import Pruning, Shard, batch_plan, measure_memory, parse_shard, parse_size
+from pipeline.batch import Pruning, Shard, batch_plan, parse_shard, parse_size
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.season import run_batch
+from pipeline.core import measure_memory
 from pipeline.job import keys
 from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.store import Partition, Store

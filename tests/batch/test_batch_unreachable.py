@@ -12,7 +12,7 @@ pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 
 import fsspec
 
-from pipeline.cli.app import main
+from pipeline.cli import main
 from pipeline.logs import remote as bucket_room
 
 if TYPE_CHECKING:

@@ -64,7 +64,7 @@ def test_processes_that_libraries_start_do_not_look_there(trap: Path) -> None:
     program = """import sys
 sys.path.pop(0)
 import multiprocessing
-from pipeline.core.program import keep_current_folder_out
+from pipeline.core import keep_current_folder_out
 keep_current_folder_out()
 process = multiprocessing.get_context("spawn").Process(target=print)
 process.start()

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.cli.app import build_app
+from pipeline.cli import build_app
 from pipeline.estimation.diagnosis_lines import choose_lines
 from pipeline.simulate import simulate_case
 from pipeline.store import Store

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 import pytest
 from verbs import run_verb
 
-from pipeline.cli.app import _MOVED
-from pipeline.cli.app import build_app as build
+from pipeline.cli import _MOVED
+from pipeline.cli import build_app as build
 from pipeline.models import Excitation, find_effect
 
 if TYPE_CHECKING:

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import polars as pl
 import pytest
 
-from pipeline.cli import query_process
-from pipeline.cli.app import main
+from pipeline.cli import main, query_process
 from pipeline.store import Store
 
 if TYPE_CHECKING:

@@ -18,9 +18,9 @@ import pyarrow.parquet as pq
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.core.program import slip_command
+from pipeline.core import slip_command
 from pipeline.store import Manifest, Store, StoreError
-from pipeline.store.manifest import MANIFEST
+from pipeline.store.files import MANIFEST
 from pipeline.store.parquet_tables import schema_of
 from pipeline.store.seals import encode_manifest
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from pipeline.cli import main
 from pipeline.cli.conventions import fold_line, print_error, print_lines, tidy_line
 from pipeline.cli.screen import format_run
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -13,7 +13,7 @@ from verbs import run_program, run_verb
 
 from pipeline.cli import main
 from pipeline.cli.screen import format_run
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 from pipeline.simulate import simulate_case
 
 START = 1_700_000_000_000_000_000

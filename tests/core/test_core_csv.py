@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 import pipeline
-from pipeline.core.tables import format_csv, unquote_formulas
+from pipeline.core.untrusted import format_csv, unquote_formulas
 from pipeline.fleet.deployments import find_own_table, read_deployments, write_deployments
 from pipeline.fleet.pairs import write_csv
 
@@ -53,4 +53,4 @@ def test_one_function_writes_all_csv() -> None:
         for path in room.rglob("*.py")
         for _ in range(path.read_text(encoding="utf-8").count(".write_csv("))
     ]
-    assert found == [room / "core" / "tables.py"]
+    assert found == [room / "core" / "untrusted.py"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pickle
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 
 
 class RoomError(SlipError):

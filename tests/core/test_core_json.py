@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.json_objects import mapping_in, number_in, numbers_in, objects_in, read_object
+from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in, read_object
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from scipy.linalg import solveh_banded
 from scipy.optimize import nnls
 from scipy.special import ndtr, stdtrit
 
-from pipeline.core.numerics import (
+from pipeline.core.arrays import (
     _solve_tridiagonal,
     jackknife_deviation,
     normal_tail,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
+from pipeline.core import python_command
 from pipeline.core.compute import both_cores, map_parallel, measure_cpu
-from pipeline.core.program import python_command
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

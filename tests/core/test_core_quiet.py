@@ -4,7 +4,7 @@ import subprocess
 import sys
 
 WARNING = "import warnings; warnings.warn('overflow', RuntimeWarning, stacklevel=1)"
-QUIET = f"from pipeline.core.program import silence_warnings; silence_warnings(); {WARNING}"
+QUIET = f"from pipeline.core import silence_warnings; silence_warnings(); {WARNING}"
 
 
 def test_warnings_reach_those_alone_who_ask_for_them() -> None:

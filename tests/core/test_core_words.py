@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 

@@ -14,7 +14,7 @@ from blocks import find_difference, list_pages, read_commands
 from effects_pages import list_settings
 from reference import list_verbs, write_reference
 
-from pipeline.cli.app import build_app
+from pipeline.cli import build_app
 from pipeline.models import find_effect, list_effects
 from pipeline.sources import Configuration, list_presets
 from schemas import list_contracts

@@ -43,7 +43,7 @@ PUBLIC = {
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"kept"},
-    "pipeline/report/figures/over_ground.py": {"place"},  # a column of a figure's rows
+    "pipeline/report/figures/slip_figures.py": {"place"},  # a column of a figure's rows
     "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column
 }

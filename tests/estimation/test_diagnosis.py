@@ -13,7 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.core.program import NORMAL_95
+from pipeline.core import NORMAL_95
 from pipeline.estimation import Diagnosis, Estimates, Recording, diagnose_runs
 from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values

@@ -11,7 +11,8 @@ from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
 from pipeline.estimation.diagnosis_lines import list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
-from pipeline.models.expression import parse_expression, parse_unit
+from pipeline.models.formula import parse_expression
+from pipeline.models.parameter import parse_unit
 from pipeline.report.sections_why import format_row
 from pipeline.run.recording import MotionError
 from pipeline.sources import find_preset

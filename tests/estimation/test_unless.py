@@ -17,7 +17,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ask, study
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
-from pipeline.plan.manoeuvres import Limits
+from pipeline.plan import Limits
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.cli.app import main
+from pipeline.cli import main
 from pipeline.store import Store
 
 if TYPE_CHECKING:

@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.cli.app import main
+from pipeline.cli import main
+from pipeline.fleet import ComparisonError
 from pipeline.fleet.deployments import (
     TERRAINS,
     add_deployment,
@@ -21,7 +22,6 @@ from pipeline.fleet.deployments import (
     read_deployments,
     write_deployments,
 )
-from pipeline.fleet.runs import ComparisonError
 from pipeline.job.over_runs import draw_up_map, write_map
 from pipeline.report.map_page import Box, arrange_labels
 from pipeline.store import Store

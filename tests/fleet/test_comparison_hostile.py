@@ -12,7 +12,7 @@ from comparison_store import Run, write_run
 
 from pipeline.job.compare import Question, compare_results, write_answer
 from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
-from pipeline.report.page import render_catalogue
+from pipeline.report import render_catalogue
 from pipeline.store import Store
 
 DAY_NS = 86_400_000_000_000

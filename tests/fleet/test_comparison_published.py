@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.published_chain import Limits, follow_published
+from pipeline.fleet.exchange import Limits, follow_published
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results

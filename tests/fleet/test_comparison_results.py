@@ -10,14 +10,13 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.cli.app import main
-from pipeline.fleet.datasets import compare_orders
-from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups
-from pipeline.fleet.runs import ComparisonError
+from pipeline.cli import main
+from pipeline.fleet import ComparisonError
+from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders
 from pipeline.job import JobError
 from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer
 from pipeline.store import Store
-from schemas.contract import list_contracts
+from schemas import list_contracts
 from schemas.run_tables import Slip
 
 TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}

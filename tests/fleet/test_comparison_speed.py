@@ -41,7 +41,7 @@ def test_a_hundred_runs_take_ten_seconds_and_a_gigabyte(tmp_path: Path) -> None:
             ),
             seed=i,
         )
-    program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
+    program = "import sys; from pipeline.cli import main; main(sys.argv[1:])"
     # The first start on a machine bundles the scripts of the page once.
     subprocess.run([sys.executable, "-c", program, "fleet", "map", str(tmp_path), "--quiet"], check=True)
     spent = _run([program, "compare", str(tmp_path), "--quiet"])
@@ -58,7 +58,7 @@ def test_three_hundred_runs_by_cause_take_ten_seconds_and_a_gigabyte(
     tmp_path: Path, verb: tuple[str, ...]
 ) -> None:
     write_budgets(Store(tmp_path), 300)
-    program = "import sys; from pipeline.cli.app import main; main(sys.argv[1:])"
+    program = "import sys; from pipeline.cli import main; main(sys.argv[1:])"
     spent = _run([program, *verb, str(tmp_path), "--quiet"])
     assert spent.cpu_s < 10.0
     assert spent.memory_gb < 1.0

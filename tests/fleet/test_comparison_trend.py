@@ -11,8 +11,8 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.cli.app import main
-from pipeline.fleet.datasets import read_day
+from pipeline.cli import main
+from pipeline.fleet import read_day
 from pipeline.fleet.rank_tests import LEVEL
 from pipeline.fleet.trend import Trend, follow_quantities, format_quiet
 from pipeline.job import JobError

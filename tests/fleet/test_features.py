@@ -16,9 +16,9 @@ import pyarrow.parquet as pq
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.cli.app import main
-from pipeline.fleet.features import LARGEST_BYTES, merge_features, read_features, write_features
-from pipeline.fleet.runs import ComparisonError
+from pipeline.cli import main
+from pipeline.fleet import ComparisonError
+from pipeline.fleet.exchange import LARGEST_BYTES, merge_features, read_features, write_features
 from pipeline.job.compare import gather_features
 from pipeline.job.over_runs import draw_up_map
 from pipeline.store import Store
@@ -216,7 +216,7 @@ def test_a_file_that_inflates_without_compression_is_refused_in_little_memory(
     assert path.stat().st_size < 2**20
     script = (
         "import sys, pyarrow as pa; from pathlib import Path\n"
-        "from pipeline.fleet.features import read_features\n"
+        "from pipeline.fleet.exchange import read_features\n"
         "try: read_features(Path(sys.argv[1]))\n"
         "except Exception as error: print(error)\n"
         "print(pa.default_memory_pool().max_memory())"
@@ -245,10 +245,10 @@ def test_a_file_that_fills_the_memory_all_the_same_ends_the_program_with_one_lin
     path = tmp_path / "f.parquet"
     path.write_bytes(b"PAR1")
     script = (
-        "import sys, time, pipeline.fleet.features as features, pipeline.cli.verbs_datasets as verb\n"
+        "import sys, time, pipeline.fleet.exchange as features, pipeline.cli.verbs_datasets as verb\n"
         "features.read_features = lambda path: time.sleep(60)\n"
         "verb._FEATURES_MEMORY = '1MB'\n"
-        "from pipeline.cli.app import main\n"
+        "from pipeline.cli import main\n"
         "main(sys.argv[1:])"
     )
     for arguments in (

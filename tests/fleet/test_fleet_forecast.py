@@ -9,10 +9,10 @@ import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
+from pipeline.fleet import ComparisonError
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
 from pipeline.fleet.joint_levels import RunEvidence
-from pipeline.fleet.runs import ComparisonError
 from pipeline.job.prediction import Expected, Prediction, make_model_file, summarize_prediction
 from pipeline.models.parameter import Level
 from pipeline.sources import find_preset

@@ -12,13 +12,14 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.batch.upkeep import refresh_pools, refresh_remote_pools
+from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
 from pipeline.fleet.forecast import FleetModel, FleetNumber, fit_fleet
 from pipeline.job.over_runs import update_trend
 from pipeline.job.prediction import summarize_fleet
 from pipeline.models.parameter import Level
-from pipeline.store import Mirror, Store
+from pipeline.store import Store
+from pipeline.store.mirror import Mirror
 
 ERROR = 0.02
 ICE_AND_OTHERS = {"asphalt": 1.0, "gravel": 0.98, "ice": 0.7}

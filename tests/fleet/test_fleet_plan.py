@@ -15,7 +15,7 @@ from pipeline.cli import main
 from pipeline.estimation.diagnose import load_recording
 from pipeline.job.next_drive import UNDECIDED, ask, expect
 from pipeline.models import find_effect
-from pipeline.plan.manoeuvres import choose_limits
+from pipeline.plan import choose_limits
 from pipeline.plan.rehearsal import learn
 from pipeline.simulate import Program, make_scenario
 from pipeline.sources import Vehicle, find_preset, list_configuration_files

@@ -11,7 +11,7 @@ from comparison_store import Run, write_run
 from pipeline.batch.batch_work import Entry, Ledger
 from pipeline.job.analyze import update_datasets
 from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
-from pipeline.report.page import lead_to
+from pipeline.report import lead_to
 from pipeline.store import Store, see_log
 
 if TYPE_CHECKING:

@@ -32,7 +32,7 @@ def work(pipe: Connection, home: str) -> None:
     """A worker: runs cases until it is told to stop."""
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
     os.environ |= {"HOME": home, "XDG_CACHE_HOME": f"{home}/.cache", "POLARS_MAX_THREADS": "1"}
-    from pipeline.cli.app import main as slip  # noqa: PLC0415 - after the environment is set
+    from pipeline.cli import main as slip  # noqa: PLC0415 - after the environment is set
 
     with tempfile.TemporaryFile() as out, tempfile.TemporaryFile() as err:
         os.dup2(out.fileno(), 1)

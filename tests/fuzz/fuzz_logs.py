@@ -28,20 +28,13 @@ from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: E402
 from google.protobuf.struct_pb2 import Value  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
 
-from pipeline.logs import (  # noqa: E402
-    LogError,
-    LogWriter,
-    TransformBuffer,
-    Wanted,
-    definition_text,
-    open_log,
-    read_topics,
-)
+from pipeline.logs import LogError, TransformBuffer, Wanted, definition_text, open_log, read_topics  # noqa: E402
 from pipeline.logs.schema import (  # noqa: E402
     SchemaError,
     parse_idl,
     parse_msg,
 )
+from pipeline.logs.writer import LogWriter  # noqa: E402
 
 START = 1_700_000_000_000_000_000
 HANG_S = 20

@@ -28,13 +28,12 @@ sys.path[:0] = [str(ROOT)]
 import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
 
-from pipeline.core.program import SlipError  # noqa: E402
+from pipeline.core import SlipError  # noqa: E402
 from pipeline.export import export_model, find_target, list_targets  # noqa: E402
-from pipeline.models import list_effects  # noqa: E402
-from pipeline.models.expression import parse_expression, parse_unit  # noqa: E402
-from pipeline.models.formula import SIGNAL_UNITS  # noqa: E402
+from pipeline.models import format_model, list_effects  # noqa: E402
+from pipeline.models.formula import SIGNAL_UNITS, parse_expression  # noqa: E402
 from pipeline.models.model_file import parse_model  # noqa: E402
-from pipeline.models.model_text import format_model  # noqa: E402
+from pipeline.models.parameter import parse_unit  # noqa: E402
 from pipeline.sources import load_configuration, resolve_vehicle  # noqa: E402
 
 HANG_S = 10

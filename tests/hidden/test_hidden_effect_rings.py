@@ -28,7 +28,7 @@ from seal_truth import SealError, open_ring, read_key, unseal
 from task_draws import NAMES, Lengths, draw_task
 from test_injections import DRIVE, tables  # noqa: F401 - a fixture
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 
 HERE = Path(make_rings.__file__).parent
 SHORT = ["--seconds", "30", "--held-out-seconds", "14"]
@@ -231,7 +231,7 @@ def test_generators_know_no_estimator() -> None:
         known = {one for one in found if one.startswith("pipeline")}
         assert known <= {
             "pipeline.simulate", "pipeline.simulate.messages", "pipeline.simulate.programs",
-            "pipeline.core.program",
+            "pipeline.core",
         }, name  # fmt: skip
 
 

@@ -13,12 +13,11 @@ import polars as pl
 import pytest
 
 from pipeline.cli.screen import format_run
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
 from pipeline.logs import LogData
-from pipeline.simulate import Recording, simulate_case, simulate_run, write_log
-from pipeline.simulate.cases import make_scenario
+from pipeline.simulate import Recording, make_scenario, simulate_case, simulate_run, write_log
 from pipeline.sources import Sources
 from pipeline.stages import StageError
 from pipeline.stages.extract import Extracted, extract_tables

@@ -30,9 +30,9 @@ from pipeline.job.check import (
     keep_baseline,
     read_limits,
 )
-from pipeline.job.check_numbers import POSITION_ERROR
 from pipeline.job.check_sides import Sides, read_baseline, read_under, unite_effects
 from pipeline.job.check_text import format_junit, format_markdown, format_verdict, list_lines
+from pipeline.job.stored_fits import POSITION_ERROR
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

@@ -39,7 +39,7 @@ def test_a_checkout_that_is_not_installed_says_its_version(tmp_path: Path) -> No
         "import importlib.metadata as m\n"
         "def missing(name): raise m.PackageNotFoundError(name)\n"
         "m.version = missing\n"
-        "from pipeline.core.program import read_version; print(read_version())"
+        "from pipeline.core import read_version; print(read_version())"
     )
     done = subprocess.run(
         [sys.executable, "-c", code],

@@ -36,8 +36,14 @@ from pipeline.job.live_receiver import LiveReceiver
 from pipeline.job.live_source import LiveLog, name_folder, parse_address, receive_live
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import LISTING
-from pipeline.logs.live_protocol import MOST_TOPICS, Foxglove, FrameError, LiveChannel, Rosbridge
-from pipeline.logs.live_recording import LiveRecording
+from pipeline.logs.live_recording import (
+    MOST_TOPICS,
+    Foxglove,
+    FrameError,
+    LiveChannel,
+    LiveRecording,
+    Rosbridge,
+)
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
 

@@ -13,14 +13,24 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import Choice, choose
-from pipeline.logs import LogWriter, definition_text, open_log
+from pipeline.logs import definition_text, open_log
+from pipeline.logs.writer import LogWriter
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
-from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
-from pipeline.simulate.published import Published, Q
+from pipeline.simulate.platforms import (
+    Fields,
+    Published,
+    Q,
+    fix,
+    ground_velocity,
+    imu,
+    joints,
+    odometry,
+    twist,
+)
 from pipeline.sources import load_configuration
 
 if TYPE_CHECKING:

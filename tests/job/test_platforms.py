@@ -11,11 +11,11 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from platforms import hidden_effects, try_platform
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.job import JobError, Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.keys import set_up_log
 from pipeline.job.log_choice import Choice, choose
-from pipeline.job.log_setup import set_up_log
 from pipeline.logs import Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.sources import load_configuration

@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.core.program import JSON_DIGITS, finite_or_none
+from pipeline.core import JSON_DIGITS, finite_or_none
 from pipeline.estimation.problem import average_sustained
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -12,8 +12,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import choose
 from pipeline.logs import open_log
-from pipeline.simulate import PLATFORMS, simulate_case, simulate_run, write_log
-from pipeline.simulate.cases import make_scenario
+from pipeline.simulate import PLATFORMS, make_scenario, simulate_case, simulate_run, write_log
 from pipeline.sources import load_configuration
 
 Hidden = dict[str, float]

@@ -27,7 +27,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate.path import CompactedGround
-from pipeline.simulate.published import ORIGIN_DEG
+from pipeline.simulate.sensors import ORIGIN_DEG
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 from pipeline.store import Store
 

@@ -12,13 +12,11 @@ from verbs import run_verb
 
 from pipeline.export import export_model
 from pipeline.export.twin_body import build_twin_body
-from pipeline.job import Options, twin_world
+from pipeline.job import Options, twin_replay
 from pipeline.job.analyze import analyze_log
-from pipeline.job.stored import read_runs
-from pipeline.job.twin_replay import LEAST_REPRODUCED, replay_twin
-from pipeline.job.twin_world import TwinGround, make_twin_effects
-from pipeline.models import Model, ModelFile, find_effect
-from pipeline.models.model_text import write_model
+from pipeline.job.stored_fits import read_runs
+from pipeline.job.twin_replay import LEAST_REPRODUCED, TwinGround, make_twin_effects, replay_twin
+from pipeline.models import Model, ModelFile, find_effect, write_model
 from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
@@ -149,7 +147,7 @@ def test_what_mujoco_cannot_read_or_compute_is_one_clear_error(
 ) -> None:
     file = make_file(manifest, HIDDEN, **OF_ANOTHER)
     run = load_motion_run(manifest, file.model.vehicle)
-    monkeypatch.setattr(twin_world, name, value)
+    monkeypatch.setattr(twin_replay, name, value)
     with pytest.raises(MotionError) as error:
         replay_twin(file, run)
     assert error.value.code == code

@@ -20,7 +20,8 @@ from pipeline.cli.verb_watch import format_watch
 from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job import Options
 from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
-from pipeline.logs import GrowingLog, LogError, open_log, read_topics
+from pipeline.logs import LogError, open_log, read_topics
+from pipeline.logs.index import GrowingLog
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store

@@ -19,7 +19,6 @@ from mcap_ros2.decoder import DecoderFactory
 from pipeline.logs import (
     LogData,
     LogError,
-    LogWriter,
     Ragged,
     RaggedStrings,
     Strings,
@@ -28,8 +27,8 @@ from pipeline.logs import (
     open_log,
     read_topics,
 )
-from pipeline.logs.encode import encode_rows
 from pipeline.logs.schema import parse_msg
+from pipeline.logs.writer import LogWriter, encode_rows
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -21,7 +21,8 @@ from mcap_files import (
     write_small,
 )
 
-from pipeline.logs import LogError, LogWriter, Wanted, open_log, read_topics
+from pipeline.logs import LogError, Wanted, open_log, read_topics
+from pipeline.logs.writer import LogWriter
 
 if TYPE_CHECKING:
     from pathlib import Path

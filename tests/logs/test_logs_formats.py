@@ -28,7 +28,6 @@ from mcap_files import (
 
 from pipeline.logs import (
     LogError,
-    LogWriter,
     Ragged,
     RaggedStrings,
     TransformBuffer,
@@ -37,6 +36,7 @@ from pipeline.logs import (
     open_log,
     read_topics,
 )
+from pipeline.logs.writer import LogWriter
 
 IDL = """================================================================================
 IDL: demo_msgs/msg/Status

@@ -10,7 +10,8 @@ import pytest
 from mcap.writer import CompressionType
 from mcap_files import START, read_small, record_starts, write_official
 
-from pipeline.logs import LogWriter, Wanted, open_log, read_topics
+from pipeline.logs import Wanted, open_log, read_topics
+from pipeline.logs.writer import LogWriter
 
 MESSAGE, CHUNK, DATA_END = 5, 6, 15
 

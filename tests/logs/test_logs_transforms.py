@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 from mcap_files import START
 
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_yaw, rotate
-from pipeline.logs import LogError, LogWriter, TransformBuffer, open_log, read_topics, wanted_transforms
+from pipeline.logs import LogError, TransformBuffer, open_log, read_topics, wanted_transforms
+from pipeline.logs.writer import LogWriter
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -11,16 +11,8 @@ import pytest
 from mcap.reader import make_reader
 from mcap_files import FLOAT, JOINTS, START, TEXT, assert_equals_official, read_small, write_small
 
-from pipeline.logs import (
-    LogError,
-    LogWriter,
-    Ragged,
-    RaggedStrings,
-    Wanted,
-    bundled_types,
-    open_log,
-    read_topics,
-)
+from pipeline.logs import LogError, Ragged, RaggedStrings, Wanted, bundled_types, open_log, read_topics
+from pipeline.logs.writer import LogWriter
 
 if TYPE_CHECKING:
     from pathlib import Path

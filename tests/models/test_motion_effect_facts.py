@@ -29,7 +29,7 @@ GENERIC = sorted(
 NAMESAKES = {
     "sources/recognition.py": {"'wheel_radius'"},
     # An element of Gazebo's DiffDrive and AckermannSteering.
-    "export/targets/twin_gazebo.py": {"'wheel_radius'"},
+    "export/twin_gazebo.py": {"'wheel_radius'"},
 }
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 

@@ -16,7 +16,8 @@ from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import Excitation, KinematicEffect, Late
-from pipeline.models.expression import parse_expression, parse_unit
+from pipeline.models.formula import parse_expression
+from pipeline.models.parameter import parse_unit
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
 from pipeline.simulate import list_effects as list_simulated

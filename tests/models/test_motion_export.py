@@ -21,10 +21,9 @@ from motion_runs import QUIET, simulate, vehicle_of
 from pipeline.estimation import Input
 from pipeline.estimation.comparison import Comparison
 from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, Place, Timing, find_effect, list_effects
+from pipeline.models import Model, ModelFile, Place, Timing, find_effect, format_model, list_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
-from pipeline.models.model_text import format_model
 from pipeline.run import MotionError
 from pipeline.simulate import VEHICLES, Disturbance, Program
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from motion_runs import vehicle_of
 
-from pipeline.models.expression import parse_expression, parse_unit
-from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.models.formula import FormulaEffect, make_parameter, parse_expression
 from pipeline.models.model_file import parse_model
+from pipeline.models.parameter import parse_unit
 from pipeline.run import MotionError
 
 HEAD = '[vehicle]\npreset = "husky_a200"\n'

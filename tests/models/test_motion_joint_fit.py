@@ -10,7 +10,7 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
-from pipeline.job.fleet_evidence import read_values
+from pipeline.job.next_drive import read_values
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES, Program
 

@@ -34,10 +34,9 @@ from pipeline.estimation.learned_step import (
 )
 from pipeline.estimation.rivals import judge_rival
 from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, Timing, find_effect, list_effects
+from pipeline.models import Model, ModelFile, Timing, find_effect, format_model, list_effects
 from pipeline.models.learned_term import INPUTS, Bands, InputProbe, LearnedInput, ResidualTerm
 from pipeline.models.model_file import parse_model
-from pipeline.models.model_text import format_model
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 

@@ -5,10 +5,9 @@ from pathlib import Path
 import pytest
 from motion_runs import vehicle_of
 
-from pipeline.models import Model, ModelFile, find_effect, list_effects, read_model, write_model
+from pipeline.models import Model, ModelFile, find_effect, format_model, list_effects, read_model, write_model
 from pipeline.models.catalogue import trust
 from pipeline.models.model_file import list_code, parse_model
-from pipeline.models.model_text import format_model
 from pipeline.run import MotionError
 from pipeline.sources import list_configuration_files, load_configuration
 

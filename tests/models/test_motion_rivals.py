@@ -13,7 +13,7 @@ from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
 import pipeline as slip
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.estimation import Comparison, Errors, HeldOut, Input, Problem, fit_model, hold_out
 from pipeline.estimation.learned import Lesson, judge_learned, list_learners, make_features, score_learned
 from pipeline.estimation.parts import WheelPart

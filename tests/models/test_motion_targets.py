@@ -17,7 +17,8 @@ from motion_runs import vehicle_of
 from target_schemas import ALL, SCHEMAS
 from verbs import run_verb
 
-from pipeline.export import export_model, find_target, list_targets, read_current, targets
+from pipeline import export
+from pipeline.export import export_model, find_target, list_targets, read_current
 from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
@@ -107,7 +108,7 @@ CASES = [
 
 
 def test_targets_are_found_by_being_there() -> None:
-    texts = [path.read_text("utf-8") for path in Path(targets.__path__[0]).glob("[!_]*.py")]
+    texts = [path.read_text("utf-8") for path in Path(export.__path__[0]).glob("[!_]*.py")]
     names = {target.name for target in list_targets()}
     assert names == {*SCHEMAS, "json", "mjcf", "python", "sdf", "traction"}
     assert sum(text.count(" = Target(") for text in texts) == len(names)

@@ -13,10 +13,9 @@ import pytest
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.models import read_model, write_model
+from pipeline.models import format_model, read_model, write_model
 from pipeline.models.catalogue import distrust, list_trusted, trust
 from pipeline.models.model_file import list_code, parse_model
-from pipeline.models.model_text import format_model
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.web.session import Session, SessionFile, Step, show_session

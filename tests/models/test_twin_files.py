@@ -14,11 +14,9 @@ import pytest
 from motion_runs import vehicle_of
 from verbs import run_verb
 
-from pipeline.export import export_model
-from pipeline.export.targets import twin_files
+from pipeline.export import export_model, twin_files
 from pipeline.export.twin_body import build_twin_body, weigh_chassis, weigh_wheel
-from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
-from pipeline.models.model_text import write_model
+from pipeline.models import Model, ModelFile, Place, find_effect, list_effects, write_model
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:

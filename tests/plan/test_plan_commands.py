@@ -21,7 +21,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
 from pipeline.models import find_effect
-from pipeline.plan.manoeuvres import (
+from pipeline.plan import (
     LEAD_S,
     RATE_HZ,
     PlanError,

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core.json_objects import mapping_in, objects_in
+from pipeline.core.untrusted import mapping_in, objects_in
 from pipeline.estimation.effect_signature import SINCE_STEP, Signature
 from pipeline.estimation.verdict import format_verdict
 from pipeline.report.figures import list_figures

@@ -13,8 +13,7 @@ from chrome import LAPTOP, PHONE
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.report import theme
-from pipeline.report.page import CATALOGUE, render_catalogue, write_page
+from pipeline.report import CATALOGUE, render_catalogue, theme, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -20,17 +20,21 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from pipeline.core.program import python_command
+from pipeline.core import python_command
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 from pipeline.models import Model, find_effect
-from pipeline.report import derived_log as derived_module
-from pipeline.report.derived_log import write_derived_log
+from pipeline.report import ReportError
+from pipeline.report import viewer_files as derived_module
 from pipeline.report.export_source import ExportSource
 from pipeline.report.motion_view import load_vehicle
-from pipeline.report.templating import ReportError
-from pipeline.report.viewer_layouts import write_csv, write_foxglove_layout, write_plotjuggler_layout
+from pipeline.report.viewer_files import (
+    write_csv,
+    write_derived_log,
+    write_foxglove_layout,
+    write_plotjuggler_layout,
+)
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
@@ -360,7 +364,7 @@ def test_a_table_that_is_cut_is_one_clear_error(results: Path, tmp_path: Path) -
 MEASURE = """
 import resource, sys
 from pathlib import Path
-from pipeline.report.viewer_layouts import write_csv
+from pipeline.report.viewer_files import write_csv
 from pipeline.report.export_source import ExportSource
 from pipeline.store import Store
 def peak():

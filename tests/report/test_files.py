@@ -12,13 +12,19 @@ import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
-from pipeline.report import theme
-from pipeline.report.figure_files import FORMATS, write_figures
+from pipeline.report import ReportError, theme
 from pipeline.report.figures import list_figures
-from pipeline.report.page import cache_path, load_bundle, warm_bundle
+from pipeline.report.page import FORMATS, write_figures
 from pipeline.report.scene import Scene
-from pipeline.report.templating import ReportError
-from pipeline.report.theme import build_spec, find_range, round_up, usual_ends
+from pipeline.report.theme import (
+    build_spec,
+    cache_path,
+    find_range,
+    load_bundle,
+    round_up,
+    usual_ends,
+    warm_bundle,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -7,15 +7,14 @@ import polars as pl
 import pytest
 from report_synthesis import make_report
 
-from pipeline.core.json_objects import objects_in
+from pipeline.core.untrusted import objects_in
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
-from pipeline.models import Model, ModelFile, Timing, find_effect
-from pipeline.models.model_text import format_model
-from pipeline.report.figures.drive_figures import find_steps, list_parts
-from pipeline.report.figures.model_figures import list_ladder_steps
+from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
+from pipeline.report.figures.model_figures import list_ladder_steps, list_parts
 from pipeline.report.figures.residual_figures import choose_signal
+from pipeline.report.figures.slip_figures import find_steps
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
 from pipeline.report.scene import RunReport, Scene
 from pipeline.run import load_run

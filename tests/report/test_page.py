@@ -14,12 +14,9 @@ import polars as pl
 import pytest
 from report_synthesis import join_commands, list_places, make_report
 
-from pipeline.core.program import format_duration, format_recorded
-from pipeline.report import templating
-from pipeline.report.page import render_report
-from pipeline.report.scene import RunReport
-from pipeline.report.sections import format_standing
-from pipeline.report.templating import (
+from pipeline import report
+from pipeline.core import format_duration, format_recorded
+from pipeline.report import (
     begin_large,
     format_date,
     format_known_share,
@@ -28,8 +25,10 @@ from pipeline.report.templating import (
     render_template,
     show_text,
 )
+from pipeline.report.page import format_standing, render_report
+from pipeline.report.scene import RunReport
 
-TEMPLATES = Path(templating.__file__).parents[1]
+TEMPLATES = Path(report.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
 
 # Names of formats and an unused link to an editor inside the bundle; nothing fetches them.

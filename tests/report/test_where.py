@@ -5,9 +5,8 @@ import polars as pl
 import pytest
 from report_synthesis import join_commands, make_report
 
-from pipeline.report.page import render_report
+from pipeline.report.page import list_regions, render_report
 from pipeline.report.scene import RunReport, Scene
-from pipeline.report.sections import list_regions
 
 
 def test_where_is_what_the_screen_says() -> None:

@@ -12,9 +12,18 @@ from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.job.log_choice import Choice, choose
-from pipeline.logs import LogWriter, Ragged, RaggedStrings, Strings, TopicColumns, open_log, read_topics
-from pipeline.simulate import Clock, Encoders, PoseSensor, Recording, Scenario, simulate_run, write_log
-from pipeline.simulate.cases import make_scenario
+from pipeline.logs import Ragged, RaggedStrings, Strings, TopicColumns, open_log, read_topics
+from pipeline.logs.writer import LogWriter
+from pipeline.simulate import (
+    Clock,
+    Encoders,
+    PoseSensor,
+    Recording,
+    Scenario,
+    make_scenario,
+    simulate_run,
+    write_log,
+)
 from pipeline.sources import Configuration, DriveForm, DriveSection, find_preset, load_configuration
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, read_pair, unwrap_counter

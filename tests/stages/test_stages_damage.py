@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 from stage_logs import FIELD, record, take
 
-from pipeline.core.program import SlipError
-from pipeline.logs import LogWriter, Loss, open_log, read_topics
+from pipeline.core import SlipError
+from pipeline.logs import Loss, open_log, read_topics
 from pipeline.logs.reader import Wanted
+from pipeline.logs.writer import LogWriter
 from pipeline.simulate import Recording
 from pipeline.stages import blame_damage
 

@@ -13,8 +13,8 @@ from verbs import run_verb
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.logs import LogWriter
-from pipeline.report.figures.over_time import draw_power
+from pipeline.logs.writer import LogWriter
+from pipeline.report.figures.slip_figures import draw_power
 from pipeline.report.scene import RunReport, Scene
 from pipeline.sources.candidates import Topics, choose_power
 from pipeline.store import Manifest

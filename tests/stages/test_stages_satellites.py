@@ -13,8 +13,8 @@ from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
 from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Program, Scenario
-from pipeline.simulate.platforms import fix, ground_velocity, imu, joints, twist
-from pipeline.simulate.published import Published, to_earth
+from pipeline.simulate.platforms import Published, fix, ground_velocity, imu, joints, twist
+from pipeline.simulate.sensors import to_earth
 from pipeline.sources import PoseContent
 from pipeline.sources.candidates import Topics
 from pipeline.stages.satellite import Receiver, follow_track, locate_vehicle, read_over_ground, to_local_plane

@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
 

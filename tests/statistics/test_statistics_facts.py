@@ -20,6 +20,7 @@ from pipeline.fleet.confidence import (
     integrated_time,
     number_blocks,
 )
+from pipeline.fleet.joint_levels import find_changes
 from pipeline.fleet.rank_tests import (
     StatisticsError,
     adjust_holm,
@@ -36,7 +37,6 @@ from pipeline.fleet.rank_tests import (
     shift_between,
     smallest_p,
 )
-from pipeline.fleet.shifts import find_changes
 
 NUMBERS = st.floats(-100.0, 100.0, allow_nan=False).map(lambda value: round(value, 3))
 SIDE = st.lists(NUMBERS, min_size=1, max_size=5)

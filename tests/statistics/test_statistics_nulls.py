@@ -13,8 +13,8 @@ import pytest
 from simulated_runs import RATE, simulate_runs
 
 from pipeline.fleet.confidence import bootstrap_median, bound_typical, compare_runs, cut_blocks
+from pipeline.fleet.joint_levels import find_changes
 from pipeline.fleet.rank_tests import adjust_max_t, mann_whitney, permute_studentized
-from pipeline.fleet.shifts import find_changes
 
 SPREAD = 0.1
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import pytest
 from store_samples import read_seed, write_generation
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.store import Store
 
 pytest.importorskip("_testcapi", reason="this Python cannot refuse memory on purpose")

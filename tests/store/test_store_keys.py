@@ -11,9 +11,10 @@ from typing import TYPE_CHECKING
 import pytest
 from store_samples import read_seed, write_generation
 
-from pipeline.store import Mirror, Store, StoreError
+from pipeline.store import Store, StoreError
+from pipeline.store.files import hash_bytes
 from pipeline.store.listing import entry_name, make_entry, parse_entry
-from pipeline.store.manifest import hash_bytes
+from pipeline.store.mirror import Mirror
 from pipeline.store.seals import KEY_VARIABLE, encode_manifest, encode_marker, find_key, read_key, seal
 
 if TYPE_CHECKING:

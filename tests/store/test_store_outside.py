@@ -13,8 +13,9 @@ import polars as pl
 import pytest
 from store_samples import read_seed, write_generation
 
-from pipeline.store import Mirror, Store, StoreError
-from pipeline.store.manifest import hash_bytes
+from pipeline.store import Store, StoreError
+from pipeline.store.files import hash_bytes
+from pipeline.store.mirror import Mirror
 
 fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
 

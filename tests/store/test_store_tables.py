@@ -101,7 +101,7 @@ def test_same_frame_gives_same_bytes_however_it_was_put_together() -> None:
 
 def test_same_frame_gives_same_bytes_in_another_process() -> None:
     program = (
-        "from store_samples import *; from pipeline.store.manifest import hash_bytes;"
+        "from store_samples import *; from pipeline.store.files import hash_bytes;"
         "from pipeline.store.parquet_tables import check_table;"
         "table = check_table('windows', break_windows(make_windows('r', 1)));"
         "print(hash_bytes(table.encode()[0]), hash_bytes(table.encode()[1]))"

@@ -18,7 +18,7 @@ from pipeline.cli.verbs_machine import _open_browser
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import find_peers
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 from pipeline.models import model_file
 from pipeline.report import theme
 from pipeline.simulate import simulate_case

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING
 import pytest
 from workbench_server import LIMITS, RUN, TOKEN
 
-from pipeline.web import WorkbenchError, serve
-from pipeline.web.guard import Guard, make_token, strip_port
+from pipeline.web import Guard, WorkbenchError, make_token, strip_port
+from pipeline.web.server import serve
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.logs import columns, index, schema
 from pipeline.logs import schema as idl
-from pipeline.models.expression import parse_unit
+from pipeline.models.parameter import parse_unit
 from pipeline.sources import Signal, candidates, loading, read_description
 from pipeline.stages import drive, pose_choice
 from pipeline.web.session import make_formula

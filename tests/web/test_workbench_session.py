@@ -10,7 +10,7 @@ from typing import cast
 import pytest
 from workbench_server import RUN, TRACK, Workbench
 
-from pipeline.core.program import SlipError
+from pipeline.core import SlipError
 from pipeline.models import read_model
 from pipeline.simulate import simulate_case
 

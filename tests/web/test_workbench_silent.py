@@ -20,7 +20,8 @@ from test_workbench_upload import begin_upload, files_below, wait_for
 from test_workbench_workers import read_object
 from workbench_server import LIMITS, OPEN_FILES, PATIENCE_S, TOKEN, Workbench
 
-from pipeline.web import guard, serve
+from pipeline.web import server as serving
+from pipeline.web.server import serve
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -131,7 +132,7 @@ def test_who_has_the_token_is_answered_whatever_others_hold_open(served: Served,
                 assert served.ask() < ANSWERED_S
         assert served.ask() < ANSWERED_S
         assert served.ask("/vega.js") < ANSWERED_S
-        assert sum(is_open(line) for line in lines) <= guard.MOST_PENDING
+        assert sum(is_open(line) for line in lines) <= serving.MOST_PENDING
 
 
 def test_who_has_the_token_is_answered_while_others_connect_without_end(served: Served) -> None:
@@ -302,7 +303,7 @@ def test_the_server_raises_its_own_limit_of_open_files(tmp_path: Path) -> None:
 @pytest.fixture
 def hasty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workbench]:
     """A workbench that soon gives up who does not show the token."""
-    monkeypatch.setattr(guard, "PENDING_S", 0.5)
+    monkeypatch.setattr(serving, "PENDING_S", 0.5)
     server = Workbench(tmp_path / "results")
     yield server
     server.close()
@@ -334,7 +335,7 @@ def test_uploads_and_downloads_of_somebody_with_the_token_take_their_time(hasty:
         down.connect(("127.0.0.1", hasty.port))
         down.sendall(b"GET /vega.js HTTP/1.1\r\n" + HOST + f"Authorization: Bearer {TOKEN}\r\n\r\n".encode())
         whole = len(hasty.request("GET", "/vega.js")[2])
-        for _ in range(guard.MOST_PENDING + 50):
+        for _ in range(serving.MOST_PENDING + 50):
             crowd.enter_context(socket.create_connection(("127.0.0.1", hasty.port)))
         for _ in range(3):
             time.sleep(0.4)
@@ -366,6 +367,6 @@ def test_the_printed_address_is_the_one_that_is_listened_on(
 ) -> None:
     """Another user may listen on the other address that `localhost` has, and would be sent the token."""
     told: list[str] = []
-    monkeypatch.setattr(guard.WorkbenchServer, "run", lambda _, sockets: sockets[0].close())
+    monkeypatch.setattr(serving.WorkbenchServer, "run", lambda _, sockets: sockets[0].close())
     serve(tmp_path, host="localhost", port=0, notify=lambda address, _: told.append(address), limits=LIMITS)
     assert told[0].startswith("http://127.0.0.1:")

@@ -18,7 +18,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.report.motion_view import read_model_text
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-from pipeline.web.answers import Ask, Limits, ServerFolders
+from pipeline.web import Ask, Limits, ServerFolders
 from pipeline.web.jobs import Jobs
 from pipeline.web.workbench import Sessions
 

@@ -16,7 +16,7 @@ import pytest
 from workbench_server import LIMITS, TOKEN, Workbench
 
 from pipeline.batch.batch_check import verify_results
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 from pipeline.store import Store
 from pipeline.web.stored_runs import clean_name
 

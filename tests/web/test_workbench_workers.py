@@ -18,7 +18,7 @@ from test_workbench_upload import files_below
 from workbench_server import LIMITS, PATIENCE_S, RUN, Workbench
 from workbench_works import work_poisoned
 
-from pipeline.logs import LogWriter
+from pipeline.logs.writer import LogWriter
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

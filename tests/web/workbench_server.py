@@ -10,8 +10,8 @@ import time
 from typing import TYPE_CHECKING, cast
 from urllib.parse import urlencode
 
-from pipeline.web import Limits, build_app
-from pipeline.web.guard import WorkbenchServer
+from pipeline.web import Limits
+from pipeline.web.server import WorkbenchServer, build_app
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -20,7 +20,6 @@ from mcap.records import Channel, Schema
 
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.columns import Group, Payloads
-from pipeline.logs.encode import Given, encode_rows
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import to_location
 from pipeline.logs.schema import definition_text, parse_msg
@@ -28,6 +27,7 @@ from pipeline.logs.schema import definition_text, parse_msg
 if TYPE_CHECKING:
     from pipeline.core.arrays import Floats, Ints
     from pipeline.logs.source import ByteSource
+    from pipeline.logs.writer import Given
 
 TEXT_TABLE: Final = "text table"
 
@@ -180,6 +180,8 @@ def read_table(source: ByteSource, table: TextTable) -> Payloads | None:
     rows = _read_rows(source, table)
     if not rows.times.size:
         return None
+    from pipeline.logs.writer import encode_rows  # noqa: PLC0415 - for such folders alone
+
     structure = parse_msg(table.type, definition_text(table.type) or "")
     given: dict[str, Given] = {path: rows.columns[name] for path, name in table.fields.items()}
     if any(member.name == "header" for member in structure.members):

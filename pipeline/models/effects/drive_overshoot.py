@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 from pipeline.models.effect import (
     NAN,
     WHEELED,

@@ -10,7 +10,7 @@ Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 
 from collections.abc import Iterable
 
-from pipeline.core.program import format_share
+from pipeline.core import format_share
 from pipeline.models.effect import (
     SIDES,
     Effect,

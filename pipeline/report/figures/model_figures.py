@@ -1,21 +1,100 @@
-"""Figures of the model: ladder of steps, and sufficiency of the log."""
+"""Figures of the model: velocities, ladder of steps, slip budget, drivetrain and ground, sufficiency."""
+
+from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core.json_objects import mapping_in, number_in, numbers_in, objects_in
-from pipeline.core.program import INPUT_WORDS
+from pipeline.core import INPUT_WORDS
+from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
-from pipeline.report import theme
-from pipeline.report.figures import figure
-from pipeline.report.figures.figure import Drawing, Figure, Section
-from pipeline.report.scene import Scene
-from pipeline.report.templating import begin_large
-from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
+from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
+from pipeline.report.figures import Drawing, Figure, Section
+from pipeline.report.scene import (
+    COMPONENTS,
+    LINE_BINS,
+    Scene,
+    Thinned,
+    break_lines,
+    drop_flat_rows,
+    thin_series,
+)
+from pipeline.report.theme import Channel, Chart, encode_column, find_range, layer, make_axis, stack
+
+_QUANTITIES = {
+    "x": ("forward velocity v_x", "m/s"),
+    "y": ("sideways velocity v_y, left positive", "m/s"),
+    "w": ("yaw rate v_w, left positive", "rad/s"),
+}
+
+
+def draw_velocities(scene: Scene) -> Drawing | None:
+    """Draw three panels over one time axis: measured, ideal from commands, ideal from wheel encoders."""
+    lines = {component: scene.component_lines(component) for component in COMPONENTS}
+    there = {component: line for component, line in lines.items() if line is not None}
+    if not there:
+        return None
+    chart = stack(*(_draw_velocity(scene, component, line) for component, line in there.items()))
+    rows = {f"velocity_{component}": line.frame for component, line in there.items()} | model_rows(scene)
+    note = figures.format_thinning(*there.values(), rule="first, last, lowest and highest of every bin")
+    # Initially the page shows only the worst stretch.
+    window = {} if scene.worst_span is None else {"window": list(scene.worst_span)}
+    return Drawing(
+        chart.properties(usermeta=figures.brush_over_time() | window),
+        rows | figures.span_rows(scene),
+        f"{figures.format_bands(scene)} {note}".strip(),
+        _format_velocities(scene),
+    )
+
+
+def _draw_velocity(scene: Scene, component: str, lines: Thinned) -> Chart:
+    shown = find_range(lines.frame, lines.usual)
+    title = figures.title_panel(*_QUANTITIES[component], shown)
+    last = component == COMPONENTS[-1]
+    series = [*scene.slip, "velocity", *(["model"] if scene.report.motion else [])]
+    names = [f"velocity_{component}", *([f"model_{component}"] if scene.report.motion else [])]
+    colour = figures.series_colour(series, figures.SERIES_WORDS)
+    x = figures.time_axis(scene) if last else figures.time_axis(scene, title=None)
+    return figures.draw_lines(scene, names, shown, colour, x).properties(height=118, title=title)
+
+
+def model_rows(scene: Scene) -> dict[str, pl.DataFrame]:
+    """The model's velocity by component, thinned: ``t value series``; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    rows = {}
+    for component in COMPONENTS:
+        line = motion.velocity.select("t", "piece", value=pl.col(f"v_{component}"))
+        thinned = thin_series(drop_flat_rows(line, "value"), "value", bins=LINE_BINS, whole=scene.worst_span)
+        rows[f"model_{component}"] = break_lines(thinned, "value").with_columns(series=pl.lit("model"))
+    return rows
+
+
+def _format_velocities(scene: Scene) -> str:
+    """Names of the lines and their root mean square distance."""
+    words = [figures.SERIES_WORDS[name] for name in scene.slip]
+    return (
+        "Forward velocity, sideways velocity and yaw rate over time in three panels: measured"
+        + "".join(f", {word}" for word in words)
+        + (", model" if scene.report.motion else "")
+        + ". The distance between a line and the measured one is the slip in that direction."
+    )
+
+
+VELOCITIES = Figure(
+    "Velocities: measured against ideal",
+    Section.WHERE,
+    draw_velocities,
+    order=30,
+    width="full",
+    live=model_rows,
+    id="velocities",
+)
 
 _SCHEMA = {"rung": pl.Int64, "step": pl.String, "t": pl.Float64, "told": pl.String, "series": pl.String}
 _BOUND = {"t": pl.Float64, "told": pl.String, "label": pl.String, "right": pl.Boolean, "raised": pl.Boolean}
@@ -38,7 +117,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     top = float(rows["ladder"]["t"].max() or 1.0)  # type: ignore[arg-type]
     title = "held-out error over 2 s [m]"
     x = make_axis("t", title, (0.0, top * _ROOM), tickCount=5, grid=False)
-    base = figure.name_bars("ladder", "step")
+    base = figures.name_bars("ladder", "step")
     bars = base.bars.encode(x=x, color=encode_column("series:N", scale=scale, legend=None))
     # One line per bar, so that it crosses no text.
     bounds = [
@@ -47,7 +126,7 @@ def draw_ladder(scene: Scene) -> Drawing | None:
     ]
     names = [_name_bound(f"ladder_{word}") for word in _BOUNDS]
     chart = layer(bars, *bounds, base.words, *names).properties(
-        width=480, height={"step": figure.BAR_STEP}, usermeta={"gutter": 10}
+        width=480, height={"step": figures.BAR_STEP}, usermeta={"gutter": 10}
     )
     note = "Ceiling: the error of the ideal model."
     if rows["ladder_floor"].height:
@@ -153,13 +232,14 @@ LADDER = Figure(
     id="ladder",
 )
 
-
 _SCHEMA_ENOUGH = {"effect": pl.String, "number": pl.String, "seconds": pl.Float64, "value": pl.Float64}
 _COLOURS = (
     theme.ON_COMMAND, theme.SLIP, theme.ON_MEASURED, theme.MODEL, theme.GROUND, theme.DRIVETRAIN, theme.CROSS,
 )  # fmt: skip
+
 # Above four colours, dashes distinguish the lines as well.
 _DASHES = ([1, 0], [1, 0], [1, 0], [1, 0], [8, 3], [3, 3], [8, 3, 2, 3])
+
 # Relative half-widths above this are not drawn: the interval is wider than the value itself.
 _WIDEST = 1.0
 
@@ -186,7 +266,7 @@ def draw_enough(scene: Scene) -> Drawing | None:
     note = f"{begin_large(sentence)}. " if sentence else ""
     note += "Lines: 5 %, and the detection threshold in t."
     words = f"Data: {sentence}." if sentence else "No effect has an interval that narrows with driving."
-    return Drawing(stack(*panels).properties(usermeta={"gutter": figure.GUTTER}), shown, note, words)
+    return Drawing(stack(*panels).properties(usermeta={"gutter": figures.GUTTER}), shown, note, words)
 
 
 def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: float) -> Chart:
@@ -202,7 +282,7 @@ def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: floa
                 scale={"domain": [0.0, end], "nice": False},
                 axis={"title": None if wide else "driving used [s]", "grid": False},
             ),
-            y=make_axis("value", None, scale=scale, minExtent=figure.GUTTER - 10, **ticks),
+            y=make_axis("value", None, scale=scale, minExtent=figures.GUTTER - 10, **ticks),
             color=colour,
             strokeDash=dash,
             detail="number:N",
@@ -215,7 +295,7 @@ def _draw_panel(name: str, title: str, colour: Channel, dash: Channel, end: floa
     )
     bound = Chart.of_rows(f"{name}_bound").mark("rule", color=theme.INK, strokeDash=[4, 3])
     bound = bound.encode(y="value:Q")
-    return layer(line, bound).properties(width=figure.WIDTH, height=120, title=title)
+    return layer(line, bound).properties(width=figures.WIDTH, height=120, title=title)
 
 
 def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -246,3 +326,167 @@ def _list_points(curve: Mapping[str, object], key: str) -> Iterator[tuple[float,
 
 
 ENOUGH = Figure("Is the log long enough", Section.WHY, draw_enough, order=6, width="full", id="enough")
+
+_NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
+_SCHEMA_BUDGET = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
+_LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
+_COLOURS_BUDGET = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
+
+
+def draw_budget(scene: Scene) -> Drawing | None:
+    """Waterfall from the total mean square slip of the ideal model to zero, one step per cause."""
+    rows = list_parts(scene)
+    if rows.is_empty():
+        return None
+    ends = rows.select(
+        low=pl.min_horizontal("from", "to", "low"), high=pl.max_horizontal("from", "to", "high")
+    )
+    domain = (min(0.0, float(ends["low"].min() or 0.0)), max(1.0, float(ends["high"].max() or 1.0)))  # type: ignore[arg-type]
+    ticks = [0.0, 0.25, 0.5, 0.75, 1.0]
+    title = "share of the mean square slip"
+    x = make_axis("from", title, domain, format="%", grid=False, values=ticks)
+    colour = encode_column(
+        "kind:N",
+        scale={"domain": list(_COLOURS_BUDGET), "range": list(_COLOURS_BUDGET.values())},
+        legend=None,
+    )
+    base = figures.name_bars("budget", "cause")
+    bars = base.bars.encode(x=x, x2="to:Q", color=colour)
+    intervals = base.rules.encode(x="low:Q", x2="high:Q")
+    chart = layer(bars, intervals, base.words).properties(
+        width=480, height={"step": figures.BAR_STEP}, usermeta={"gutter": 20}
+    )
+    note = (
+        "Bars: share of the mean square slip; the 2 s error is the mean square error of position. "
+        "Shapley shares (independent of order). Lines are 95 % intervals. "
+        "A bar to the right makes slip larger."
+    )
+    return Drawing(chart, {"budget": rows}, note, _format_split(scene, rows))
+
+
+def list_parts(scene: Scene) -> pl.DataFrame:
+    """Rows ``cause from to low high kind told``: start and end of each cause's step, and its text."""
+    slip, position = _find_budget(scene, "slip"), _find_budget(scene, "position")
+    errors = {str(part.get("effect")): number_in(part, "share") for part in objects_in(position, "shares")}
+    errors |= {kind: number_in(mapping_in(position, kind), "share") for kind in _LEFT}
+    parts = [("effect", str(part.get("effect")), part) for part in objects_in(slip, "shares")]
+    parts += [(kind, kind, mapping_in(slip, kind)) for kind in _LEFT if mapping_in(slip, kind)]
+    rows, top = [], 1.0
+    for kind, name, part in parts:
+        share = number_in(part, "share") or 0.0
+        low, high = number_in(part, "low"), number_in(part, "high")
+        rows.append(
+            {
+                "cause": _LEFT.get(name, name),
+                "from": top,
+                "to": top - share,
+                "low": None if high is None else top - high,
+                "high": None if low is None else top - low,
+                "kind": kind,
+                "told": f"slip {format_known_share(share)}, 2 s error {format_known_share(errors.get(name))}",
+            }
+        )
+        top -= share
+    return pl.DataFrame(rows, schema=_SCHEMA_BUDGET)
+
+
+def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
+    """Budget of a quantity on the leading input; empty without one."""
+    diagnosis = scene.report.diagnosis
+    wanted = (diagnosis.get("input"), quantity)
+    budgets = objects_in(diagnosis, "budget")
+    return next((one for one in budgets if (one.get("input"), one.get("quantity")) == wanted), {})
+
+
+def _format_split(scene: Scene, rows: pl.DataFrame) -> str:
+    """Format every cause with its share."""
+    slip = _find_budget(scene, "slip")
+    total = number_in(slip, "total")
+    sentence = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
+    words = INPUT_WORDS.get(str(slip.get("input")), "")
+    size = f"{format_number(total)} m\u00b2/s\u00b2"
+    return (
+        f"Mean square slip {words}, {size} over half a second by cause, shares of it and of the 2 s error. "
+        f"{sentence}."
+    )
+
+
+BUDGET = Figure("Error budget by cause", Section.WHY, draw_budget, order=1, id="budget")
+
+_PARTS = {
+    "drivetrain": "drivetrain (command to wheels)",
+    "ground": "ground (wheels to body)",
+    "cross": "cross term",
+}
+_COLOURS_SPLIT = {"drivetrain": theme.DRIVETRAIN, "ground": theme.GROUND, "cross": theme.CROSS}
+_SUBSETS = ("all", "transitory", "steady")
+
+
+def draw_split(scene: Scene) -> Drawing | None:
+    """Mean squares of the two parts of slip from commands, for all, transitory and steady samples."""
+    rows = _list_parts(scene)
+    if rows is None:
+        return None
+    scale = {"domain": list(_PARTS), "range": list(_COLOURS_SPLIT.values())}
+    label = " : ".join(f"datum.value === '{name}' ? '{words}'" for name, words in _PARTS.items())
+    legend = {"title": None, "labelExpr": f"{label} : datum.value", "symbolType": "square"}
+    span = [min(0.0, float(rows["mean_square"].min())), max(0.0, float(rows["mean_square"].max()))]  # type: ignore[arg-type]
+    room = 0.12 * (span[1] - span[0] or 1.0)
+    title = "mean square of slip from commands [m²/s²]"
+    shown = (span[0] - (room if span[0] < 0 else 0), span[1] + room)
+    base = Chart.of_rows("split").encode(
+        y=encode_column(
+            "subset:N", sort=list(_SUBSETS), axis={"title": None, "minExtent": 58, "grid": False}
+        ),
+        yOffset=encode_column("part:N", sort=list(_PARTS)),
+        x=make_axis("mean_square", title, shown, tickCount=6),
+    )
+    bars = base.mark("bar", cornerRadiusEnd=2).encode(
+        color=encode_column("part:N", scale=scale, legend=legend)
+    )
+    positive = base.filter("datum.mean_square >= 0").mark("text", align="left", dx=5)
+    negative = base.filter("datum.mean_square < 0").mark("text", align="right", dx=-5)
+    words = [side.encode(text="label:N") for side in (positive, negative)]
+    chart = layer(bars, *words).properties(
+        width=640, height=34 * 3 * rows["subset"].n_unique() // 2 + 40, usermeta={"gutter": 60}
+    )
+    note = "Vectors add, moduli do not: shares of the mean square; the cross term is twice the mean product."
+    first = rows.filter(pl.col("subset") == rows["subset"][0])
+    shares = format_split(**dict(zip(first["part"], first["share"], strict=True)))
+    return Drawing(chart, {"split": rows}, note, f"Mean square of the slip from commands: {shares}.")
+
+
+def _list_parts(scene: Scene) -> pl.DataFrame | None:
+    """Long rows ``subset part mean_square share label``; None without measured wheels."""
+    table = scene.report.table("aggregates")
+    if table is None:
+        return None
+    wanted = table.filter(
+        (pl.col("input").cast(pl.String) == "command")
+        & pl.col("drivetrain_mean_square").is_not_null()
+        & (pl.col("mean_square") > 0.0)
+    )
+    if wanted.is_empty():
+        return None
+    return (
+        wanted.select(
+            pl.col("subset").cast(pl.String),
+            pl.col("mean_square").alias("total"),
+            *(pl.col(f"{part}_mean_square").fill_null(0.0).alias(part) for part in _PARTS),
+        )
+        .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
+        .with_columns(share=pl.col("mean_square") / pl.col("total"))
+        # A part larger than the total is not a share of it; the bar shows its size.
+        .with_columns(
+            label=pl.when((pl.col("share") > 1.0).any().over("subset"))
+            .then(pl.lit(""))
+            .otherwise((pl.col("share") * 100.0).round(0).cast(pl.Int64).cast(pl.String) + " %")
+        )
+        .drop("total")
+        .sort(
+            pl.col("subset").replace_strict({name: i for i, name in enumerate(_SUBSETS)}), maintain_order=True
+        )
+    )
+
+
+SPLIT = Figure("Drivetrain and ground", Section.WHY, draw_split, order=10, width="full", id="split")

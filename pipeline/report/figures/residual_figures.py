@@ -1,5 +1,7 @@
 """Figures of residuals: against signals, their own past, the input, and each effect."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 
 import numpy as np
@@ -15,13 +17,58 @@ from pipeline.estimation.effect_signature import (
     autocorrelate,
     cross_correlate,
 )
-from pipeline.report import theme
-from pipeline.report.figures import figure
-from pipeline.report.figures.figure import Drawing, Figure, Section
+from pipeline.report import figures, format_known_share, format_number, theme
+from pipeline.report.figures import Drawing, Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
-from pipeline.report.scene import Scene
-from pipeline.report.templating import format_known_share, format_number
-from pipeline.report.theme import Chart, encode_column, layer, make_axis, stack
+from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series
+from pipeline.report.theme import Chart, encode_column, find_range, layer, make_axis, stack, usual_ends
+
+
+def draw_horizon_errors(scene: Scene) -> Drawing | None:
+    """Draw two lines over time; None without a model."""
+    motion = scene.report.motion
+    if motion is None or motion.horizon_errors.is_empty():
+        return None
+    rows = list_horizon_errors(scene)
+    ends = usual_ends(motion.horizon_errors["ideal"], exact=False)
+    shown = find_range(rows["reach"], (ends[0], ends[1]))
+    colour = figures.before_and_after(motion.input)
+    chart = figures.draw_lines(scene, ["reach"], shown, colour).properties(
+        height=130,
+        title=figures.title_panel("error of a 2 s prediction", "m", shown),
+        usermeta=figures.brush_over_time(),
+    )
+    row = motion.horizon_errors.row(motion.horizon_errors["model"].arg_max() or 0, named=True)
+    medians = [float(motion.horizon_errors[name].median() or 0.0) for name in ("ideal", "model")]  # type: ignore[arg-type]
+    words = (
+        f"Error of two-second predictions over time: median {medians[0]:.3f} m for the ideal model, "
+        f"{medians[1]:.3f} m for the model, which is worst, {row['model']:.2f} m, at {row['t']:.0f} s."
+    )
+    return Drawing(chart, rows | figures.span_rows(scene), words=words)
+
+
+def list_horizon_errors(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``t value series``, thinned to peaks; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    lines = []
+    for name in ("ideal", "model"):
+        line = motion.horizon_errors.select("t", "piece", value=pl.col(name))
+        thinned = thin_series(line, "value", bins=LINE_BINS)
+        lines.append(break_lines(thinned, "value").with_columns(series=pl.lit(name)))
+    return {"reach": pl.concat(lines)}
+
+
+REACH = Figure(
+    "Predictions over two seconds",
+    Section.WHY,
+    draw_horizon_errors,
+    order=6,
+    width="full",
+    live=list_horizon_errors,
+    id="reach",
+)
 
 QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
 
@@ -43,7 +90,7 @@ def draw_residuals(scene: Scene) -> Drawing | None:
     chart = stack(*panels).resolve_scale(x="independent", y="independent")
     note = "Lines: medians; bands: the middle half. A line along zero does not depend on that signal."
     return Drawing(
-        chart.properties(usermeta={"gutter": figure.GUTTER}), rows, note, _format_residuals(motion)
+        chart.properties(usermeta={"gutter": figures.GUTTER}), rows, note, _format_residuals(motion)
     )
 
 
@@ -115,13 +162,13 @@ def _bin_residuals(motion: MotionView, component: str) -> pl.DataFrame:
 
 def _draw_panel(motion: MotionView, component: str, rows: pl.DataFrame) -> Chart:
     what, unit = QUANTITIES[component]
-    signal, signal_unit = SIGNALS[choose_signal(motion, component)]
+    signal, signal_unit = VARIABLES[choose_signal(motion, component)]
     before = rows.filter(pl.col("series") == "ideal")
     size = max(abs(float(before["low"].min() or 0.0)), abs(float(before["high"].max() or 0.0)), 1e-3)  # type: ignore[arg-type]
     x = make_axis("value", f"{signal} [{signal_unit}]", tickCount=6)
     ends = (-1.1 * size, 1.1 * size)
-    y = make_axis("middle", None, ends, tickCount=3, minExtent=figure.GUTTER - 10)
-    colour = figure.before_and_after(motion.input)
+    y = make_axis("middle", None, ends, tickCount=3, minExtent=figures.GUTTER - 10)
+    colour = figures.before_and_after(motion.input)
     base = Chart.of_rows(f"residual_{component}")
     band = base.mark("area", opacity=0.16, clip=True).encode(x=x, y="low:Q", y2="high:Q", color=colour)
     line = base.mark("line", clip=True, strokeWidth=2, point={"size": 18}).encode(x=x, y=y, color=colour)
@@ -140,7 +187,7 @@ def _format_residuals(motion: MotionView) -> str:
             float(np.sqrt(np.mean(motion.residuals[f"{series}_{component}"].to_numpy() ** 2)))
             for series in ("ideal", "model")
         ]
-        signal = SIGNALS[choose_signal(motion, component)][0]
+        signal = VARIABLES[choose_signal(motion, component)][0]
         sentences.append(
             f"{what} over {signal}, root mean square {sizes[0]:.3f} before, {sizes[1]:.3f} {unit} after"
         )
@@ -155,7 +202,6 @@ RESIDUALS = Figure(
     live=list_residuals,
     id="residuals",
 )
-
 
 Correlation = tuple[Floats, Floats, float]
 
@@ -189,15 +235,15 @@ def draw_correlations(scene: Scene, name: str, titles: dict[str, str], axis: tup
             "lag:Q", scale=lags, axis={"title": axis[1] if last else None, "labels": last, "grid": False}
         )
         ends, ticks = (-1.0 if axis[0] else -0.6, 1.0), [-0.5, 0, 0.5, 1]
-        y = make_axis("value", None, ends, values=ticks, minExtent=figure.GUTTER - 10)
+        y = make_axis("value", None, ends, values=ticks, minExtent=figures.GUTTER - 10)
         base = Chart.of_rows(f"{name}_{component}")
-        colour = figure.before_and_after(motion.input if motion else "")
+        colour = figures.before_and_after(motion.input if motion else "")
         band = base.filter("datum.series === 'model'").mark("area", color=theme.SHADE, clip=True)
         zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
         line = base.mark("line", clip=True, strokeWidth=2).encode(x=x, y=y, color=colour)
         drawn = layer(band.encode(x=x, y="low:Q", y2="high:Q"), zero, line)
         panels.append(drawn.properties(width=480, height=96, title={"text": title}))
-    return stack(*panels).properties(usermeta={"gutter": figure.GUTTER})
+    return stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
 
 
 def list_autocorrelations(scene: Scene) -> dict[str, pl.DataFrame]:
@@ -264,7 +310,6 @@ AUTOCORRELATION = Figure(
     id="autocorrelation",
 )
 
-
 _WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 
 
@@ -323,7 +368,6 @@ CROSSCORRELATION = Figure(
     id="crosscorrelation",
 )
 
-
 _SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
 
 
@@ -337,7 +381,7 @@ def draw_signature(scene: Scene) -> Drawing | None:
         "Error bars: 95 % between blocks of ten seconds.",
         [panel.words for panel in panels.values()],
     )
-    chart = chart.properties(usermeta={"gutter": figure.GUTTER})
+    chart = chart.properties(usermeta={"gutter": figures.GUTTER})
     return Drawing(chart, list_signatures(scene), note, " ".join(words))
 
 
@@ -404,7 +448,7 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
     wide = {"zero": False, "nice": False, "padding": 8}
     x = make_axis("value", variable, scale=wide, tickCount=6, grid=False)
     tall = {"nice": False, "padding": 12}
-    y = make_axis("mean", None, scale=tall, tickCount=5, minExtent=figure.GUTTER - 10)
+    y = make_axis("mean", None, scale=tall, tickCount=5, minExtent=figures.GUTTER - 10)
     base = Chart.of_rows(_name_rows(signature))
     zero = base.mark("rule", color=theme.QUIET, strokeWidth=0.8).encode(y={"datum": 0.0})
     measured = base.filter("datum.series !== 'curve'")
@@ -412,7 +456,7 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
     points = measured.mark("circle", size=42, opacity=1).encode(x=x, y=y, color=shade)
     curve = base.filter("datum.series === 'curve'").mark("line", strokeWidth=1.8, order=False)
     return layer(zero, curve.encode(x=x, y=y, color=shade), bars, points).properties(
-        width=480, height=170, title={"text": error}, usermeta={"gutter": figure.GUTTER}
+        width=480, height=170, title={"text": error}, usermeta={"gutter": figures.GUTTER}
     )
 
 

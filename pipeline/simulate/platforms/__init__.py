@@ -1,52 +1,298 @@
 """What popular platforms publish, so that logs with exactly their topics, types and frames can be made.
 
 A platform is one file here: its vehicle, and its topics. A topic is one of the few that many platforms share
-(``twist = TOPIC`` and what the function `twist` takes), or says its type, source, constants and quantities.
+(``twist = TOPIC`` and what the function `twist` takes), or says its type, source, constants and quantities:
+its fields, each filled from a quantity of the run.
 """
 
+import json
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal
 
-from pipeline.simulate.facts import Layout, PoseTopic, Vehicle, find_vehicle, unknown_name
-from pipeline.simulate.published import Json, Published, Q, Source, Value
+import numpy as np
 
-_WIDTH_M = 0.05
+from pipeline.core import rigid
+from pipeline.core.arrays import Floats
+from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
+from pipeline.simulate.facts import (
+    Layout,
+    PoseTopic,
+    SimulateError,
+    Vehicle,
+    describe_robot,
+    find_vehicle,
+    open_stream,
+    unknown_name,
+)
+from pipeline.simulate.messages import Field, Sheet, SimulatedRun
+from pipeline.simulate.programs import integrate_cells, make_wishes, walk_in_plane
+from pipeline.simulate.sensors import to_earth
+
+Series = dict[str, Floats]
+Source = Literal[
+    "command",
+    "wish",
+    "wheels",
+    "odometry",
+    "filter",
+    "localization",
+    "satellites",
+    "correction",
+    "imu",
+    "battery",
+    "once",
+]
+
+_LATE_S = 0.002
+_TURN = 2.0 * np.pi
+_COMPASS_OFF_RAD = 0.7
+"""An attitude is seldom against the true north."""
+_DOPPLER_S = 0.05
+_DOPPLER_NOISE_MPS = 0.03
+_BATTERY_V, _IDLE_W, _RESISTANCE_N = 36.0, 40.0, 120.0
+_ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
+_FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def describe_robot(name: str, vehicle: Vehicle, joints: Mapping[str, str]) -> str:
-    """A description in which every wheel is a joint of base_link.
+@dataclass(frozen=True)
+class Q:
+    """A quantity of the run: ``gain * quantity + offset``, cut to a whole number where one is wanted."""
 
-    Args:
-        name: of the robot.
-        vehicle: its geometry.
-        joints: names of the wheel joints by their place, ``front_left`` and the like; ``left`` for the only
-            axle. Places that begin with ``steer`` steer.
+    name: str
+    gain: float = 1.0
+    offset: float = 0.0
+    whole: bool = False
+
+
+@dataclass(frozen=True)
+class Json:
+    """A text with a JSON object of quantities by key."""
+
+    numbers: Mapping[str, Q]
+
+
+Value = Q | Json | tuple[Q, ...] | str | list[str] | float
+
+
+@dataclass(frozen=True)
+class Published:
+    """A topic.
+
+    Attributes:
+        topic, type_name: where and what.
+        source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
+            ``filter`` the same with the gyro's heading; ``localization``; ``satellites``, its place on Earth
+            and the velocity of its sensor over ground; ``correction``, the transform from
+            the localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start;
+            ``wish``, a body command that the controller never gets.
+        fields: by field path a quantity, several for an array, a text of them, or a constant.
+        every: one message in so many is published.
+        stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
     """
-    parts = ['<link name="base_link"/>']
-    for corner, joint in joints.items():
-        y = 0.5 * vehicle.track_width_m * (1.0 if corner.endswith("left") else -1.0)
-        if vehicle.kind == "ackermann":
-            x = vehicle.wheelbase_m if "front" in corner or corner.startswith("steer") else 0.0
-        else:
-            x = vehicle.wheelbase_m * {"front": 0.5, "rear": -0.5}.get(corner.split("_")[0], 0.0)
-        parts.append(_write_joint(joint, (x, y), vehicle.wheel_radius_m, steers=corner.startswith("steer")))
-    return f'<?xml version="1.0"?><robot name="{name}">{"".join(parts)}</robot>'
+
+    topic: str
+    type_name: str
+    source: Source
+    fields: Mapping[str, Value] = field(default_factory=dict)
+    every: int = 1
+    stamp: str = "header"
 
 
-def _write_joint(joint: str, position: tuple[float, float], radius_m: float, *, steers: bool) -> str:
-    link = joint.removesuffix("_joint") + "_link"
-    shape = f'<cylinder radius="{radius_m}" length="{_WIDTH_M}"/>'
-    geometry = "" if steers else f"<collision><geometry>{shape}</geometry></collision>"
-    kind, axis = ("revolute", "0 0 1") if steers else ("continuous", "0 1 0")
-    return (
-        f'<link name="{link}">{geometry}</link><joint name="{joint}" type="{kind}">'
-        f'<parent link="base_link"/><child link="{link}"/>'
-        f'<origin xyz="{position[0]} {position[1]} 0" rpy="0 0 0"/><axis xyz="{axis}"/></joint>'
+def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
+    """Messages of every topic.
+
+    Raises:
+        SimulateError: ``encoders_needed``, a topic needs wheels or a gyro that the scenario leaves out.
+    """
+    known: dict[str, tuple[Floats, Floats, Series]] = {}
+    sheets = []
+    for one in topics:
+        if one.source not in known:
+            known[one.source] = _SOURCES[one.source](run)
+        stamp, log, series = known[one.source]
+        rows = slice(None, None, one.every)
+        fields = {path: _fill(value, series, rows) for path, value in one.fields.items()}
+        header = None if one.stamp == "none" else stamp[rows]
+        sheets.append(Sheet(one.topic, one.type_name, log[rows], header, fields, one.stamp))
+    return sheets
+
+
+def _fill(value: Value, series: Series, rows: slice) -> Field:
+    if isinstance(value, Json):
+        columns = [_take(each, series, rows).tolist() for each in value.numbers.values()]
+        return [json.dumps(dict(zip(value.numbers, row, strict=True))) for row in zip(*columns, strict=True)]
+    if isinstance(value, tuple):
+        return np.stack([_take(each, series, rows) for each in value], axis=1)
+    return _take(value, series, rows) if isinstance(value, Q) else value
+
+
+def _take(quantity: Q, series: Series, rows: slice) -> Floats:
+    values = quantity.gain * series[quantity.name][rows] + quantity.offset
+    return np.floor(values) if quantity.whole else values
+
+
+def _of_command(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    commands, vehicle = run.commands, run.scenario.vehicle
+    left, right = invert_ideal_model(vehicle, commands.speed_mps, commands.turn)
+    series = {
+        "speed": commands.speed_mps,
+        "yaw_rate": commands.yaw_rate(vehicle),
+        "steering": commands.turn,
+        "left": left,
+        "right": right,
+        "sideways": commands.sideways,
+    }
+    return commands.time_s, commands.time_s + run.scenario.recording.command_latency_s, series
+
+
+def _of_wish(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    wished = make_wishes(run.scenario, "wish")
+    series = {"speed": wished.speed_mps, "yaw_rate": wished.turn, "sideways": wished.sideways}
+    return wished.time_s, wished.time_s, series
+
+
+def _of_wheels(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    wheels = run.wheels
+    if wheels is None:
+        raise _missing("encoders")
+    speed, rate = apply_ideal_model(run.scenario.vehicle, wheels.left, wheels.right, wheels.steering)
+    series = {
+        name: getattr(wheels, name) for name in ("left", "right", "left_angle", "right_angle", "steering")
+    }
+    series |= {"speed": speed, "yaw_rate": rate, "zero": np.zeros_like(speed)}
+    series["sideways"] = wheels.sideways_mps(run.scenario.vehicle)
+    series |= dict(wheels.corners or {})
+    series |= {f"{corner}_angle": angle for corner, angle in (wheels.corner_angles or {}).items()}
+    series |= {f"{side}_turns": series[f"{side}_angle"] / _TURN for side in ("left", "right")}
+    if run.imu is not None:
+        # Where one message holds both.
+        for name, values in (("rate", run.imu.rates), ("force", run.imu.accelerations)):
+            for i, axis in enumerate("xyz"):
+                series[f"{name}_{axis}"] = np.interp(wheels.time_s, run.imu.time_s, values[:, i])
+    return wheels.time_s, wheels.time_s + _LATE_S, series
+
+
+def _of_odometry(run: SimulatedRun, *, gyro: bool = False) -> tuple[Floats, Floats, Series]:
+    stamp, log, series = _of_wheels(run)
+    rate = series["yaw_rate"]
+    if gyro:
+        if run.imu is None:
+            raise _missing("an inertial unit")
+        rate = np.interp(stamp, run.imu.time_s, run.imu.rates[:, 2])
+    step = float(np.median(np.diff(stamp)))
+    heading = integrate_cells(rate, step_s=step)
+    speed, aside = series["speed"], series["sideways"]
+    position = walk_in_plane(speed, aside, heading, step_s=step)[:-1]
+    named = _name(position, rigid.quaternions_from_yaw(heading[:-1]))
+    return stamp, log, named | {"speed": speed, "yaw_rate": rate, "sideways": aside}
+
+
+def _of_filter(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    return _of_odometry(run, gyro=True)
+
+
+def _of_localization(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    position, quaternion = run.poses.in_map()
+    ned = rigid.multiply_quaternions(
+        np.broadcast_to(_ENU_IN_NED, quaternion.shape),
+        rigid.multiply_quaternions(quaternion, np.broadcast_to(_FRD_IN_FLU, quaternion.shape)),
+    )
+    series = _name(position, quaternion) | {f"ned_q{axis}": ned[:, i] for i, axis in enumerate("xyzw")}
+    return run.poses.stamp_s, run.poses.log_s, series
+
+
+def _of_satellites(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """What a receiver says whose antenna is where the localization's sensor is."""
+    poses, sensor, path = run.poses, run.scenario.pose, run.truth.path
+    latitude, longitude, altitude = to_earth(poses.in_map()[0])
+    arm = np.zeros(3)
+    if sensor.child_frame != "base_link":
+        arm = np.array([sensor.mount_x_m, sensor.mount_y_m, 0.0])
+    before, after = (
+        position + rigid.rotate(turn, np.broadcast_to(arm, position.shape))
+        for position, turn in (
+            rigid.interpolate_poses(poses.sampled_s + by, path.time_s, path.position, path.quaternion)
+            for by in (-_DOPPLER_S, _DOPPLER_S)
+        )
+    )
+    noise = open_stream(run.scenario.seed, "satellites").standard_normal((poses.stamp_s.size, 2))
+    velocity = (after - before)[:, :2] / (2.0 * _DOPPLER_S) + _DOPPLER_NOISE_MPS * noise
+    series = {"latitude": latitude, "longitude": longitude, "altitude": altitude}
+    series |= {"east_speed": velocity[:, 0], "north_speed": velocity[:, 1], "fixed": np.zeros_like(latitude)}
+    return poses.stamp_s, poses.log_s, series
+
+
+def _of_correction(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """The localization over the odometry at the odometry's stamps, as a matcher of every scan gives it."""
+    stamp, _, drift = _of_odometry(run)
+    position, quaternion = run.poses.in_map()
+    at = np.clip(stamp, run.poses.stamp_s[0], run.poses.stamp_s[-1])
+    order = np.argsort(run.poses.stamp_s, kind="stable")
+    there, turned = rigid.interpolate_poses(at, run.poses.stamp_s[order], position[order], quaternion[order])
+    offset = np.stack([drift[axis] for axis in "xyz"], axis=1)
+    turn = rigid.multiply_quaternions(
+        turned, rigid.invert_quaternions(np.stack([drift[f"q{axis}"] for axis in "xyzw"], axis=1))
+    )
+    series = _name(there - rigid.rotate(turn, offset), turn)
+    return stamp, stamp + run.scenario.pose.latency_s, series
+
+
+def _of_imu(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    if run.imu is None:
+        raise _missing("an inertial unit")
+    series = {f"rate_{axis}": run.imu.rates[:, i] for i, axis in enumerate("xyz")}
+    series |= {f"force_{axis}": run.imu.accelerations[:, i] for i, axis in enumerate("xyz")}
+    path = run.truth.path
+    _, turn = rigid.interpolate_poses(run.imu.time_s, path.time_s, path.position, path.quaternion)
+    start = np.broadcast_to(rigid.quaternions_from_yaw(np.array([_COMPASS_OFF_RAD])), turn.shape)
+    turn = rigid.multiply_quaternions(start, turn)
+    series |= {f"attitude_{axis}": turn[:, i] for i, axis in enumerate("xyzw")}
+    return run.imu.time_s, run.imu.time_s + _LATE_S, series
+
+
+def _of_battery(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    """What the wheels draw: an idle load, and rolling resistance over the speed of the rims."""
+    stamp, log, series = _of_wheels(run)
+    rims = run.scenario.vehicle.wheel_radius_m * (np.abs(series["left"]) + np.abs(series["right"]))
+    current = -(_IDLE_W + _RESISTANCE_N * 0.5 * rims) / _BATTERY_V
+    return stamp, log, {"voltage": np.full_like(current, _BATTERY_V), "current": current}
+
+
+def _once(run: SimulatedRun) -> tuple[Floats, Floats, Series]:
+    del run
+    return np.zeros(1), np.zeros(1), {}
+
+
+def _name(position: Floats, quaternion: Floats) -> Series:
+    named = {axis: position[:, i] for i, axis in enumerate("xyz")}
+    return named | {f"q{axis}": quaternion[:, i] for i, axis in enumerate("xyzw")}
+
+
+def _missing(what: str) -> SimulateError:
+    return SimulateError(
+        "encoders_needed",
+        f"the platform publishes {what}, and the scenario has none",
+        where="platform",
+        hint="Choose a case with encoders and an inertial unit",
     )
 
+
+_SOURCES: dict[Source, Callable[[SimulatedRun], tuple[Floats, Floats, Series]]] = {
+    "command": _of_command,
+    "wish": _of_wish,
+    "wheels": _of_wheels,
+    "odometry": _of_odometry,
+    "filter": _of_filter,
+    "localization": _of_localization,
+    "satellites": _of_satellites,
+    "correction": _of_correction,
+    "imu": _of_imu,
+    "battery": _of_battery,
+    "once": _once,
+}
 
 _XYZ, _XYZW = "xyz", "xyzw"
 

@@ -9,8 +9,7 @@ from xml.etree import ElementTree as ET
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.export import Current, Target
-from pipeline.export.settings import Facts, make_plain
+from pipeline.export import Current, Facts, Target, make_plain
 from pipeline.export.twin_body import (
     GRIP,
     TwinBody,

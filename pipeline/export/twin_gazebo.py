@@ -1,35 +1,89 @@
-"""Export of the base as a Gazebo world that moves like the fitted model."""
+"""Export to Gazebo: its drive plugins, and the base as a world that moves like the fitted model."""
 
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from xml.etree import ElementTree as ET
 
 import msgspec
 
-from pipeline.export import Current, Target
-from pipeline.export.targets.twin_files import (
-    find_driven_speed,
-    format_numbers,
-    list_head,
-    list_notes,
-    write_comment,
-)
-from pipeline.export.targets.vehicle_stacks import write_gazebo
-from pipeline.export.twin_body import (
-    GRIP,
-    TwinBody,
-    TwinWheel,
-    build_twin_body,
-    weigh_chassis,
-    weigh_wheel,
-)
+from pipeline.export import Current, Facts, Sheet, Target, list_comments, make_plain, start_sheet
+from pipeline.export.twin_body import GRIP, TwinBody, TwinWheel, build_twin_body, weigh_chassis, weigh_wheel
+from pipeline.export.twin_files import find_driven_speed, format_numbers, list_head, list_notes, write_comment
 from pipeline.models import Model
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity, TwinRole
+
+_DRIVE_PLUGINS = {
+    "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),
+    "ackermann": ("gz-sim-ackermann-steering-system", "gz::sim::systems::AckermannSteering"),
+}
+
+
+def write_gazebo(file: ModelFile, current: Current) -> str:
+    """Write a plugin element without its joints and topics, which only the model's SDF contains.
+
+    Raises:
+        MotionError: ``wrong_vehicle``.
+    """
+    facts, sheet = start_sheet(file, GAZEBO, *_DRIVE_PLUGINS)
+    sheet.add("plugin.wheel_radius", facts.find_radius())
+    if facts.vehicle.kind == "differential":
+        note = "for a simulated ground on which the wheels skid as on the real one"
+        sheet.add("plugin.wheel_separation", facts.find_track(), note)
+    else:
+        sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
+        sheet.add("plugin.wheel_base", facts.measure("wheelbase_m"))
+        angle = facts.measure("max_steering_rad").change(operator.mul, facts.take(Quantity.STEERING_GAIN))
+        sheet.add("plugin.steering_limit", angle)
+    _add_limits_of_gazebo(facts, sheet)
+    return _write_element(facts, sheet)
+
+
+def _add_limits_of_gazebo(facts: Facts, sheet: Sheet) -> None:
+    linear = "linear_" if facts.vehicle.kind == "differential" else ""
+    limits = [
+        (f"{linear}velocity", facts.find_speed_limit()),
+        (f"{linear}acceleration", facts.find_speed_acceleration()),
+    ]
+    if facts.vehicle.kind == "differential":
+        limits += [
+            ("angular_velocity", facts.find_turn_limit()),
+            ("angular_acceleration", facts.find_turn_acceleration()),
+        ]
+    for name, limit in limits:
+        sheet.add(f"plugin.min_{name}", -limit)
+        sheet.add(f"plugin.max_{name}", limit)
+
+
+def _write_element(facts: Facts, sheet: Sheet) -> str:
+    filename, name = _DRIVE_PLUGINS[facts.vehicle.kind]
+    plugin = ET.Element("plugin", {"filename": filename, "name": name})
+    for line in list_comments(facts, sheet):
+        plugin.append(ET.Comment(_make_comment(line)))
+    for setting in sheet.settings:
+        for line in setting.sources:
+            plugin.append(ET.Comment(_make_comment(line)))
+        ET.SubElement(plugin, setting.path.rpartition(".")[2]).text = repr(setting.value)
+    ET.indent(plugin)
+    return ET.tostring(plugin, encoding="unicode") + "\n"
+
+
+def _make_comment(text: str) -> str:
+    """Format a comment; XML does not allow two adjacent dashes in it."""
+    return f" {'- -'.join(make_plain(text).split('--'))} "
+
+
+GAZEBO = Target(
+    "gazebo",
+    "the drive plugin of a model in Gazebo, without joints and topics",
+    "gazebosim/gz-sim 11, src/systems: diff_drive/DiffDrive.hh, ackermann_steering/AckermannSteering.hh",
+    write_gazebo,
+)
 
 _STEP_S = 0.001
 """Gazebo's default time step [s]."""

@@ -11,9 +11,8 @@ import textwrap
 from importlib import resources
 from typing import cast
 
-from pipeline.core.program import finite_or_none, pick
-from pipeline.export import Current, Target
-from pipeline.export.settings import Amount, Facts, start_sheet, write_yaml
+from pipeline.core import finite_or_none, pick
+from pipeline.export import Amount, Current, Facts, Target, start_sheet, write_yaml
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Place
 from pipeline.models.formula import FormulaEffect
@@ -74,7 +73,6 @@ def _plain(value: object) -> object:
 JSON_OBJECT = Target(
     "json", "the model with values, intervals and units", "the handbook, Models", write_json_object
 )
-
 
 _PLAIN_NAMES = ("abs", "min", "max", "sign")
 _PLACES = tuple(stage for stage in Place if stage is not Place.LOCALIZATION)
@@ -212,7 +210,6 @@ PYTHON = Target(
     "the function's docstring",
     lambda file, _current: write_function(file.model),
 )
-
 
 _NODE = "traction_monitor.ros__parameters"
 _USUAL_TOP_MPS = 1.0

@@ -1,1 +1,0 @@
-"""Export targets: a `Target` in a module of this folder is discovered automatically."""

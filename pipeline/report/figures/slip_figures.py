@@ -1,0 +1,491 @@
+"""Figures of slip: over the path, the commands and time, its distributions; power, steps of commands."""
+
+from __future__ import annotations
+
+import numpy as np
+import polars as pl
+
+from pipeline.core import INPUT_WORDS, format_share
+from pipeline.core.arrays import Floats
+from pipeline.report import figures, format_number, theme
+from pipeline.report.figures import Drawing, Figure, Section, draw_shares, format_events, list_events
+from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series, thin_to_peaks
+from pipeline.report.theme import (
+    MAP_HIGHEST,
+    MAP_LOWEST,
+    MAP_WIDTH,
+    Channel,
+    Chart,
+    encode_column,
+    find_extent,
+    find_range,
+    fit_equal_aspect,
+    layer,
+    make_axis,
+    round_up,
+    stack,
+    usual_ends,
+)
+
+
+def draw_trajectory(scene: Scene) -> Drawing | None:
+    """Draw a map with equal scales in x and y; start and end marked, segments not joined."""
+    track = scene.track
+    if track is None:
+        return None
+    frame = track.frame
+    extent = [find_extent(frame["x"]), find_extent(frame["y"])]
+    height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1])
+    x = _make_axis("x", scene.origin[0], x_domain)
+    y = _make_axis("y", scene.origin[1], y_domain)
+    base = Chart.of_rows("track")
+    line = Chart.of_rows("path").mark("line", color=theme.QUIET, strokeWidth=0.8, opacity=0.5, order=False)
+    path = line.encode(x=x, y=y)
+    tooltip = [
+        encode_column("t:Q", title="time [s]", format=".2f"),
+        encode_column("modulus:Q", title="slip speed [m/s]", format=".2f"),
+    ]
+    dots = base.mark("circle", size=16, opacity=1).encode(
+        x="x:Q", y="y:Q", color=figures.slip_colour(scene), tooltip=tooltip
+    )
+    marked = (
+        Chart.of_rows(figures.MARKED_POINTS)
+        .mark("circle", size=52, opacity=0.9, color=theme.MARK)
+        .encode(x="x:Q", y="y:Q")
+    )
+    ends = Chart.of_rows("track_ends").encode(x="x:Q", y="y:Q")
+    spots = ends.mark(
+        "point", size=85, filled=True, fill=theme.PAPER, stroke=theme.INK, strokeWidth=2, opacity=1
+    ).encode(
+        shape=encode_column(
+            "place:N", scale={"domain": ["start", "end"], "range": ["circle", "square"]}, legend=None
+        )
+    )
+    happened = list_events(scene)
+    events = [
+        Chart.of_rows("events")
+        .mark("point", shape="triangle-up", size=90, filled=True, opacity=1, color=theme.MARK)
+        .encode(
+            x="x:Q",
+            y="y:Q",
+            tooltip=[
+                encode_column("kind:N", title="event"),
+                encode_column("t:Q", title="time [s]", format=".1f"),
+            ],
+        )
+    ]
+    # Above and below, so that both are legible if a run ends where it began.
+    words = [
+        ends.filter(f"datum.place === '{end}'")
+        .mark("text", align="left", dx=10, dy=dy, fontWeight=600, color=theme.INK)
+        .encode(text="place:N")
+        for end, dy in (("start", -9), ("end", 12))
+    ]
+    meta = figures.brush_over_plane("x", "y") | {
+        "equal": {"x": extent[0], "y": extent[1], "lowest": MAP_LOWEST, "highest": MAP_HIGHEST}
+    }
+    predicted = [
+        Chart.of_rows("arcs")
+        .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
+        .encode(x="x:Q", y="y:Q")
+    ]
+    above = [*(predicted if scene.report.motion else []), *(events if happened else [])]
+    chart = layer(path, marked, dots, *above, spots, *words).properties(
+        width=MAP_WIDTH, height=height, usermeta=meta
+    )
+    first, last = (
+        frame.head(1).with_columns(place=pl.lit("start")),
+        frame.tail(1).with_columns(place=pl.lit("end")),
+    )
+    steps = break_lines(frame.select("x", "y", "piece"), "x", "y")
+    rows = (
+        list_arcs(scene)
+        | happened
+        | {"track": frame, "path": steps, "track_ends": pl.concat([first, last])}
+        | figures.marked_rows()
+    )
+    note = figures.format_thinning(track, rule="the highest slip of every bin")
+    arcs = " Lines: where the model goes in two seconds from measured poses." if scene.report.motion else ""
+    sentence = f" Triangles: {format_events(happened['events'])}." if happened else ""
+    note = f"Colours end at {scene.modulus_cap:g} m/s, the 98th percentile.{arcs}{sentence} {note}".strip()
+    return Drawing(chart, rows, note, format_map(scene))
+
+
+def list_arcs(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Predicted paths as one broken line: ``t x y``; empty without a model."""
+    motion = scene.report.motion
+    if motion is None:
+        return {}
+    east, north = scene.origin
+    # Over a whole run they would cover the path.
+    shown = motion.arcs.filter(pl.col("piece") % 2 == 0)
+    moved = shown.with_columns(pl.col("x") - east, pl.col("y") - north)
+    return {"arcs": break_lines(moved, "x", "y")}
+
+
+def _make_axis(name: str, offset: float, domain: list[float]) -> Channel:
+    less = f", less {offset:,.0f} m" if offset else ""
+    title, scale = f"{name} in the map{less} [m]", {"domain": domain, "nice": False, "zero": False}
+    return make_axis(name, title, scale=scale, tickCount=5, minExtent=figures.GUTTER - 20)
+
+
+def format_map(scene: Scene) -> str:
+    """Size of the area, distance, and position of the largest slip."""
+    if scene.track is None:
+        return "There are no poses to draw."
+    frame = scene.track.frame
+    x, y = find_extent(frame["x"]), find_extent(frame["y"])
+    sentence = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip speed."
+    known = frame.filter(pl.col("modulus").is_not_null())
+    if known.is_empty():
+        return sentence
+    row = known.row(known["modulus"].arg_max() or 0, named=True)
+    return (
+        f"{sentence} Slip was highest, {row['modulus']:.2f} m/s, at x {row['x']:.1f} m, y {row['y']:.1f} m."
+    )
+
+
+TRAJECTORY = Figure("On the map", Section.GLANCE, draw_trajectory, order=10, live=list_arcs, id="trajectory")
+
+_CELLS = 20
+_FEWEST_SAMPLES = 3
+_SMALLEST_BOUND = 0.1
+
+
+def draw_command_space(scene: Scene) -> Drawing | None:
+    """A heat map: colour is the median slip speed of the samples in a cell; empty cells stay empty."""
+    slip = scene.sound_slip.get(scene.report.main_input)
+    if slip is None:
+        return None
+    bounds = {name: _bound(slip, name) for name in ("f_x", "f_w")}
+    words = INPUT_WORDS[scene.report.main_input]
+    turn, speed = f"ideal yaw rate f_w {words} [rad/s]", f"ideal speed f_x {words} [m/s]"
+    x = make_axis("f_w", turn, bounds["f_w"], tickCount=6)
+    y = make_axis("f_x", speed, bounds["f_x"], tickCount=6, minExtent=26)
+    tooltip = [
+        encode_column("modulus:Q", title="median slip [m/s]", format=".2f"),
+        encode_column("samples:Q", title="samples", format=","),
+    ]
+    base = Chart.of_rows("command_cells")
+    heat = base.mark("rect").encode(
+        x="w_low:Q",
+        x2="w_high:Q",
+        y="x_low:Q",
+        y2="x_high:Q",
+        color=figures.slip_colour(scene),
+        tooltip=tooltip,
+    )
+    marked = (
+        Chart.of_rows(figures.MARKED_POINTS)
+        .mark("circle", size=26, opacity=0.9, color=theme.MARK, stroke=theme.INK, strokeWidth=0.5)
+        .encode(x=x, y=y)
+    )
+    meta = figures.brush_over_plane("f_w", "f_x")
+    chart = layer(heat, marked).properties(width=480, height=340, usermeta=meta)
+    note = f"Cells with fewer than {_FEWEST_SAMPLES} samples are left empty."
+    return Drawing(chart, list_cells(scene) | figures.marked_rows(), note, format_cells(scene))
+
+
+def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Cells of the plane of commands: edges, median slip speed, samples; empty without slip."""
+    slip = scene.sound_slip.get(scene.report.main_input)
+    return {} if slip is None else {"command_cells": _count_cells(slip)}
+
+
+def _bound(slip: pl.DataFrame, name: str) -> list[float]:
+    low, high = (float(slip[name].min() or 0.0), float(slip[name].max() or 0.0))  # type: ignore[arg-type]
+    return [
+        -round_up(-low) if low < -_SMALLEST_BOUND else -_SMALLEST_BOUND,
+        round_up(high) if high > _SMALLEST_BOUND else _SMALLEST_BOUND,
+    ]
+
+
+def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
+    """Cells of equal size over the plane of commands: edges, median slip speed, samples."""
+    columns = []
+    for name, short in (("f_x", "x"), ("f_w", "w")):
+        low, high = _bound(slip, name)
+        size = (high - low) / _CELLS
+        number = ((pl.col(name) - low) / size).floor().clip(0, _CELLS - 1)
+        columns += [
+            (low + number * size).alias(f"{short}_low"),
+            (low + (number + 1) * size).alias(f"{short}_high"),
+        ]
+    edges = ["x_low", "x_high", "w_low", "w_high"]
+    return (
+        slip.select(*columns, "modulus")
+        .group_by(edges)
+        .agg(modulus=pl.col("modulus").median(), samples=pl.len())
+        .filter(pl.col("samples") >= _FEWEST_SAMPLES)
+        .sort(edges)
+    )
+
+
+def format_cells(scene: Scene) -> str:
+    """Commands with the most and the least slip."""
+    grid = list_cells(scene).get("command_cells")
+    title = "Median slip speed over ideal speed and ideal yaw rate."
+    if grid is None or grid.is_empty():
+        return title
+    row = grid.row(grid["modulus"].arg_max() or 0, named=True)
+    return (
+        f"{title} It is highest, {row['modulus']:.2f} m/s, near {(row['x_low'] + row['x_high']) / 2:.2f} m/s "
+        f"and {(row['w_low'] + row['w_high']) / 2:.2f} rad/s."
+    )
+
+
+COMMAND_SPACE = Figure(
+    "Over the commands", Section.WHERE, draw_command_space, order=20, live=list_cells, id="command_space"
+)
+
+
+def draw_modulus(scene: Scene) -> Drawing | None:
+    """Draw one line per input; gaps are open, stretches after a change of command shaded."""
+    lines = scene.modulus_lines
+    if lines is None:
+        return None
+    shown = find_range(lines.frame, lines.usual)
+    colour = figures.series_colour(list(scene.slip), INPUT_WORDS)
+    chart = figures.draw_lines(scene, ["modulus"], shown, colour).properties(
+        height=150,
+        title=figures.title_panel("slip speed", "m/s", shown),
+        usermeta=figures.brush_over_time(),
+    )
+    note = figures.format_thinning(lines, rule="first, last, lowest and highest of every bin")
+    rows = {"modulus": lines.frame} | figures.span_rows(scene)
+    return Drawing(chart, rows, f"{figures.format_bands(scene)} {note}".strip(), _format_slip(scene))
+
+
+def _format_slip(scene: Scene) -> str:
+    """Median, maximum and its time for each input."""
+    sentences = []
+    for name, frame in scene.sound_slip.items():
+        row = frame.row(frame["modulus"].arg_max() or 0, named=True)
+        sentences.append(
+            f"{INPUT_WORDS[name]} its median is {format_number(scene.median_modulus(name))} m/s "
+            f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
+        )
+    return "Slip speed over time: " + "; ".join(sentences) + "."
+
+
+MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
+
+_BINS = 600
+
+
+def draw_navigator(scene: Scene) -> Drawing | None:
+    """Draw slip speed over the whole run, and the visible stretch; None for a short run."""
+    slip, span = scene.main_slip, scene.worst_span
+    if slip is None or span is None:
+        return None
+    peaks = thin_to_peaks(slip.select("t", "piece", "modulus"), "modulus", bins=_BINS)
+    x = figures.time_axis(scene)
+    y = encode_column("modulus:Q", scale={"domain": [0.0, scene.modulus_cap], "nice": False}, axis=None)
+    area = Chart.of_rows("navigator").mark("area", color=theme.CROSS, opacity=0.6, clip=True, order=False)
+    window = Chart.of_rows(figures.SHOWN_SPAN).mark("rect", color=theme.MARK, opacity=0.35)
+    chart = layer(area.encode(x=x, y=y), window.encode(x="t_start:Q", x2="t_end:Q")).properties(
+        width=figures.WIDTH, height=44, usermeta={"brush": "zoom", "gutter": 4}
+    )
+    rows = {
+        "navigator": break_lines(peaks, "modulus"),
+        figures.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),
+    }
+    length = span[1] - span[0]
+    note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
+    words = (
+        f"Slip speed {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
+        f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
+        "arrow keys move the stretch."
+    )
+    return Drawing(chart, rows, note, words)
+
+
+NAVIGATOR = Figure("The whole run", Section.WHERE, draw_navigator, order=29, width="full", id="navigator")
+
+
+def draw_distribution(scene: Scene) -> Drawing | None:
+    """Draw the share of time steps below each modulus."""
+    if not scene.sound_slip:
+        return None
+    values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
+    return draw_shares("modulus_shares", values, "slip speed", of=" of a time step")
+
+
+DISTRIBUTION = Figure(
+    "Distribution over time steps", Section.HOW_BAD, draw_distribution, order=20, id="distribution"
+)
+
+
+def draw_window_norms(scene: Scene) -> Drawing | None:
+    """Draw the share of windows below each norm."""
+    norms = _list_norms(scene)
+    if not norms:
+        return None
+    note = "The norm of the published figure: \u221a40 \u00d7 root mean square slip speed over 2 s."
+    return draw_shares("norm_shares", norms, "2 s window norm", note=note)
+
+
+def _list_norms(scene: Scene) -> dict[str, pl.Series]:
+    windows = scene.report.table("windows")
+    if windows is None:
+        return {}
+    if "suspect" in windows.columns:
+        windows = windows.filter(~pl.col("suspect"))
+    by_input = {
+        name: windows.filter(pl.col("input").cast(pl.String) == name)["window_norm"]
+        for name in scene.report.inputs
+    }
+    return {name: norms for name, norms in by_input.items() if not norms.is_empty()}
+
+
+WINDOW_NORMS = Figure(
+    "Distribution over 2 s windows", Section.HOW_BAD, draw_window_norms, order=30, id="window_norms"
+)
+
+_PANELS = {"current": ("current of the drive", "A"), "energy_per_m": ("energy per distance", "J/m")}
+
+
+def draw_power(scene: Scene) -> Drawing | None:
+    """Draw the current of the drive, and below it energy per metre if a voltage was recorded."""
+    table = scene.report.table("power")
+    if table is None or table.is_empty():
+        return None
+    lines = {name: _thin(table, name) for name in _PANELS if not table[name].drop_nulls().is_empty()}
+    if not lines:
+        return None
+    last = list(lines)[-1]
+    chart = stack(
+        *(_draw_power_panel(scene, name, frame, last=name == last) for name, frame in lines.items())
+    )
+    words = [f"{_PANELS[name][0]}: {_format_median(table[name])} {_PANELS[name][1]}" for name in lines]
+    rows = {f"power_{name}": frame for name, frame in lines.items()} | figures.span_rows(scene)
+    note = "Energy per distance is shown above 0.1 m/s; below zero the motors feed the battery."
+    return Drawing(
+        chart.properties(usermeta=figures.brush_over_time()), rows, note, f"Over time: {'; '.join(words)}."
+    )
+
+
+def _format_median(column: pl.Series) -> str:
+    return f"median {format_number(float(np.median(column.drop_nulls().to_numpy())))}"
+
+
+def _thin(table: pl.DataFrame, name: str) -> pl.DataFrame:
+    line = table.select("t", pl.lit(0).alias("piece"), value=pl.col(name)).drop_nulls()
+    return thin_series(line, "value", bins=LINE_BINS).select("t", "piece", "value", series=pl.lit("velocity"))
+
+
+def _draw_power_panel(scene: Scene, name: str, frame: pl.DataFrame, *, last: bool) -> Chart:
+    low, high = usual_ends(frame["value"], exact=True)
+    shown = find_range(frame, (low, high))
+    colour = figures.series_colour(["velocity"], {"velocity": "measured"})
+    x = figures.time_axis(scene) if last else figures.time_axis(scene, title=None)
+    chart = figures.draw_lines(scene, [f"power_{name}"], shown, colour, x)
+    return chart.properties(height=100, title=figures.title_panel(*_PANELS[name], shown))
+
+
+POWER = Figure("Power of the drive", Section.WHERE, draw_power, order=60, width="full", id="power")
+
+_CHANNELS = {"x": ("forward velocity", 0.15), "w": ("yaw rate", 0.15)}
+_BEFORE_S, _AFTER_S, _RATE_HZ = 0.5, 3.0, 20.0
+_FEWEST = 2
+_WORDS = {"command": "command", "velocity": "measured", "model": "model"}
+
+
+def draw_step_response(scene: Scene) -> Drawing | None:
+    """Draw a panel each for speed and yaw rate; None if too few steps are held for long enough."""
+    rows = list_responses(scene)
+    panels = [
+        _draw_response(component, list(rows[f"response_{component}"]["series"].unique(maintain_order=True)))
+        for component in _CHANNELS
+        if f"response_{component}" in rows
+    ]
+    if not panels:
+        return None
+    chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
+    note = "Median over steps of the command that are held for three seconds; 1 is the command."
+    return Drawing(chart, rows, note, _format_step_response(rows))
+
+
+def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
+    """Rows ``t value series`` of each channel with steps; empty without any."""
+    slip = scene.slip.get("command")
+    if slip is None:
+        return {}
+    motion = scene.report.motion
+    tables = {}
+    for component, (_, smallest) in _CHANNELS.items():
+        t, asked = slip["t"].to_numpy(), slip[f"f_{component}"].to_numpy()
+        starts, low, high = find_steps(t, asked, smallest=smallest)
+        if starts.size < _FEWEST:
+            continue
+        lines = {"command": (t, asked), "velocity": (t, slip[f"v_{component}"].to_numpy())}
+        if motion is not None and motion.input == "command":
+            lines["model"] = (motion.velocity["t"].to_numpy(), motion.velocity[f"v_{component}"].to_numpy())
+        since = np.arange(-_BEFORE_S, _AFTER_S, 1.0 / _RATE_HZ)
+        frames = []
+        for series, (times, values) in lines.items():
+            at = np.interp((starts[:, None] + since).ravel(), times, values).reshape(starts.size, -1)
+            middle = np.median((at - low[:, None]) / (high - low)[:, None], axis=0)
+            frames.append(pl.DataFrame({"t": since, "value": middle}).with_columns(series=pl.lit(series)))
+        tables[f"response_{component}"] = pl.concat(frames)
+    return tables
+
+
+def find_steps(t: Floats, asked: Floats, *, smallest: float) -> tuple[Floats, Floats, Floats]:
+    """Find steps of a held command.
+
+    Args:
+        t: times [s], increasing.
+        asked: the command's ideal velocity.
+        smallest: minimum height of a step.
+
+    Returns:
+        Times of the steps [s], and the values before and after them, each of shape (k,); the command is
+        constant for long enough before and after a step.
+    """
+    jumps = np.flatnonzero(np.abs(np.diff(asked)) > smallest)
+    starts, low, high = [], [], []
+    for jump in jumps.tolist():
+        begin, end = np.searchsorted(t, (t[jump] - _BEFORE_S, t[jump + 1] + _AFTER_S - 0.1))
+        whole = t[jump + 1] + _AFTER_S - 0.1 <= t[-1] and t[jump] - _BEFORE_S >= t[0]
+        joined = whole and float(np.diff(t[begin:end]).max(initial=0.0)) < 3.0 / _RATE_HZ
+        before, after = asked[begin : jump + 1], asked[jump + 1 : end]
+        still = joined and np.ptp(before) < 0.1 * smallest and np.ptp(after) < 0.1 * smallest
+        if still:
+            starts.append(float(t[jump + 1]))
+            low.append(float(before[-1]))
+            high.append(float(after[0]))
+    return np.array(starts), np.array(low), np.array(high)
+
+
+def _draw_response(component: str, series: list[str]) -> Chart:
+    last = component == list(_CHANNELS)[-1]
+    look = {"title": "time since the step [s]" if last else None, "labels": last, "grid": False}
+    x = encode_column("t:Q", scale={"domain": [-_BEFORE_S, _AFTER_S], "nice": False}, axis=look)
+    y = make_axis("value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=figures.GUTTER - 10)
+    line = Chart.of_rows(f"response_{component}").mark("line", clip=True, strokeWidth=2)
+    drawn = line.encode(x=x, y=y, color=figures.series_colour(series, _WORDS))
+    title = {"text": f"{_CHANNELS[component][0]}, share of the step [1]"}
+    return layer(drawn).properties(width=480, height=96, title=title)
+
+
+def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
+    """Time at which the measured response reaches 63 % of the step."""
+    sentences = []
+    for name, rows in responses.items():
+        line = rows.filter(pl.col("series") == "velocity")
+        reached = line.filter((pl.col("value") >= 0.632) & (pl.col("t") > 0.0))["t"]  # noqa: PLR2004 - 1 - 1/e
+        when = f"63 % after {reached[0]:.2f} s" if reached.len() else "never 63 %"
+        ends = float(line["value"].tail(10).median() or 0.0)  # type: ignore[arg-type]
+        sentences.append(f"{_CHANNELS[name[-1]][0]}: {when}, {format_share(ends)} in the end")
+    return "Median response to a step of the command. " + "; ".join(sentences) + "."
+
+
+STEP_RESPONSE = Figure(
+    "After a step of the command",
+    Section.WHY,
+    draw_step_response,
+    order=3,
+    live=list_responses,
+    id="step_response",
+)
