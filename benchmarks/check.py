@@ -33,8 +33,7 @@ from draw import draw_riddle
 from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
-from pipeline.estimation import diagnose_runs
-from pipeline.estimation.diagnose import Recording
+from pipeline.estimation import Recording, diagnose_runs
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import Check, compare, find_usual_spread
 from pipeline.job.check_sides import Sides, read_under, unite_effects

@@ -27,7 +27,7 @@ STAGES = {
     "import modules": ("_frozen_importlib._find_and_load",),
     "read the log, its stages, store": ("pipeline.job.analyze.analyze_log",),
     "pages of the results folder": ("pipeline.report.write_page",),
-    "read the tables": ("pipeline.job.run_results.read_recording", "pipeline.run.recording.load_run"),
+    "read the tables": ("pipeline.job.run_results.read_recording", "pipeline.run.load_run"),
     "make runs ready": ("pipeline.estimation.problem.Problem.__init__",),
     "noise of residuals by any input": ("pipeline.estimation.parts.measure_noise",),
     "evidence": (
@@ -37,6 +37,7 @@ STAGES = {
     ),
     "search: extensions": ("pipeline.estimation.selection.Selection.fit_hypotheses",),
     "search: rivals": ("pipeline.estimation.search.list_rivals",),
+    "search: rough fits": ("pipeline.estimation.selection.Selection.approach_each",),
     "search: effects dropped": ("pipeline.estimation.selection.Selection.drop_each",),
     "search: weights anew": ("pipeline.estimation.selection.Selection.reweight",),
     "what could not be seen": ("pipeline.estimation.search.find_unobservable",),
@@ -55,13 +56,13 @@ STAGES = {
     "ladder: which effect is next": ("pipeline.estimation.ladder._predict_losses",),
     "noise floor": ("pipeline.estimation.floor.estimate_floor",),
     "intervals": ("pipeline.estimation.intervals.estimate_intervals",),
-    "intervals by seconds driven": ("pipeline.estimation.learning.narrow_intervals",),
-    "effects that are not named": ("pipeline.estimation.learning.estimate_unnamed",),
+    "intervals by seconds driven": ("pipeline.estimation.error_regions.narrow_intervals",),
+    "effects that are not named": ("pipeline.estimation.estimates.estimate_unnamed",),
     "budget by cause": ("pipeline.estimation.apportion.apportion",),
     "learned term": ("pipeline.estimation.learned_step.learn_beyond",),
     "regions of the error": ("pipeline.estimation.error_regions.map_errors",),
     "other conclusions": ("pipeline.estimation.conclude.summarize",),
-    "other search": ("pipeline.estimation.diagnose.diagnose_runs",),
+    "other search": ("pipeline.estimation.diagnose_runs",),
 }
 HERE = Path(__file__).parents[1]
 REST = "everything else"
@@ -154,11 +155,15 @@ def print_stages(command: list[str]) -> None:
     sys.stderr.write("\n".join([*lines, f"{'all':<36}{whole:>8.2f}", ""]))
 
 
-def measure(command: list[str], checkout: Path) -> float:
-    """User CPU seconds of a command and of all that it starts, run in a checkout."""
+def measure(command: list[str], checkout: Path, folder: str) -> float:
+    """User CPU seconds of a command of a checkout and of all that it starts, run in a folder.
+
+    Results are in the folder, as every version writes them there if it is not told where.
+    """
     own = checkout / ".venv" / "bin" / "python"
     python = str(own) if own.exists() else sys.executable
-    process = subprocess.Popen([python, *command], cwd=checkout, stdout=subprocess.DEVNULL)
+    environment = os.environ | {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""}
+    process = subprocess.Popen([python, *command], cwd=folder, env=environment, stdout=subprocess.DEVNULL)
     _, status, usage = os.wait4(process.pid, 0)
     process.returncode = os.waitstatus_to_exitcode(status)
     if process.returncode not in {0, 3}:
@@ -169,17 +174,17 @@ def measure(command: list[str], checkout: Path) -> float:
 def compare(log: Path, checkouts: list[Path], runs: int) -> None:
     """Print the least user CPU seconds of a diagnosis by each checkout, and where the first one's go."""
     least = dict.fromkeys(checkouts, float("inf"))
-    asked = ["diagnose", str(log), "--json", "--results"]
+    asked = ["diagnose", str(log), "--json"]
     for _ in range(runs):
         for checkout in checkouts:
             with tempfile.TemporaryDirectory() as folder:
-                spent = measure(["-m", "pipeline", *asked, folder], checkout)
+                spent = measure(["-m", "pipeline", *asked], checkout, folder)
                 least[checkout] = min(least[checkout], spent)
     own, *others = least.values()
     beside = "".join(f", {other:.2f} s with the other version: {own / other:.2f} of it" for other in others)
     print(f"{log.name}: {own:.2f} s of user CPU{beside}", flush=True)
     with tempfile.TemporaryDirectory() as folder:
-        measure(["-c", TABLE, str(Path(__file__).parent), *asked, folder], checkouts[0])
+        measure(["-c", TABLE, str(Path(__file__).parent), *asked], checkouts[0], folder)
 
 
 def main() -> None:
@@ -197,7 +202,7 @@ def main() -> None:
         if not logs:
             logs = [Path(folder) / "ten_minutes.mcap"]
             simulate = ["simulate", "husky_tile", "--duration", "600", "--file", str(logs[0])]
-            measure(["-m", "pipeline", *simulate], HERE)
+            measure(["-m", "pipeline", *simulate], HERE, folder)
         for log in logs:
             compare(log, checkouts, asked.runs)
 

@@ -23,10 +23,10 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import SlipError
+from pipeline.estimation.across_runs import fit_with_prior
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import hold_out, score
-from pipeline.estimation.learning import fit_with_prior
 from pipeline.estimation.problem import Problem
 from pipeline.job.compared_runs import read_digest
 from pipeline.job.next_drive import forecast_deployment

@@ -26,8 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 from motion_runs import make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
-from pipeline.estimation import diagnose_runs
-from pipeline.estimation.diagnose import Recording
+from pipeline.estimation import Recording, diagnose_runs
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import RUNS_SHARE, decide_level, fit_fleet, forecast_vehicle
 from pipeline.fleet.levels import draw_run, split_levels

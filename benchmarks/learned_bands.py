@@ -24,9 +24,9 @@ from rivals import LOGS, NAMED, Recording, open_recordings
 from threadpoolctl import threadpool_limits
 
 from pipeline.estimation import Input, Problem
+from pipeline.estimation.across_runs import Coverage, list_ratios, measure_coverage
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import HeldOut, score
-from pipeline.estimation.learned_bands import Coverage, list_ratios, measure_coverage
 from pipeline.estimation.learned_step import ResidualData, fit_own, leave_grounds_out
 from pipeline.estimation.terms import is_term
 from pipeline.models import Model

@@ -19,12 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.core import SlipError
-from pipeline.estimation import Input, Problem, diagnose_runs, fit_model
-from pipeline.estimation.diagnose import load_recording
-from pipeline.estimation.error_regions import format_enough
+from pipeline.estimation import Input, Problem, diagnose_runs, fit_model, load_recording
+from pipeline.estimation.error_regions import Curve, find_goal, format_enough, last_until
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.intervals import narrow_part, sum_blocks
-from pipeline.estimation.learning import Curve, find_goal, last_until
 from pipeline.estimation.parts import Part, count_seconds
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -25,11 +25,10 @@ import numpy as np
 from json_lines import add_row, read_rows
 from plan_game import record
 
-from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation import Input, Problem, fit_model, load_recording
 from pipeline.estimation.acceptance import grow_evidence
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation.error_regions import Curve, find_goal, last_until, narrow_intervals
 from pipeline.estimation.evidence import learn_noise, tile_windows
-from pipeline.estimation.learning import Curve, find_goal, last_until, narrow_intervals
 from pipeline.estimation.parts import count_seconds
 from pipeline.models import Model, find_effect
 from pipeline.plan import LEAD_S, RATE_HZ, choose_limits, parse_area

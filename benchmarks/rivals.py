@@ -32,10 +32,18 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import SlipError, format_share
 from pipeline.core.arrays import Floats
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
-from pipeline.estimation.learned import Learned, Lesson, list_learners, score_learned
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
 from pipeline.estimation.problem import fit_as_it_is
-from pipeline.estimation.rivals import Contest, Rival, hold_contest, time_fit
+from pipeline.estimation.rivals import (
+    Contest,
+    Learned,
+    Lesson,
+    Rival,
+    hold_contest,
+    list_learners,
+    score_learned,
+    time_fit,
+)
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import find_diagnosis

@@ -28,10 +28,10 @@ from scipy.optimize import minimize
 
 from pipeline.core import NORMAL_95, SlipError
 from pipeline.core.arrays import Floats
+from pipeline.estimation.across_runs import fit_part_jointly
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.fit import fit_model
 from pipeline.estimation.folds import score
-from pipeline.estimation.joint_fit import fit_part_jointly
 from pipeline.estimation.parts import WheelPart, average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, list_held

@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).parent / "hidden"))
 from draw import Category, draw_riddle, write_riddle
 
 from pipeline.core import SlipError
-from pipeline.estimation.running_log import list_passing, list_stated, measure_t
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.running_log import list_passing, list_stated, measure_t
 from pipeline.job.watch import measure_cpu
 
 Content = Mapping[str, object]

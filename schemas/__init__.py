@@ -1,7 +1,8 @@
 """The contract of every table: columns, types, units, frames and rules.
 
 A table is a subclass of `Table` with a ``VERSION``, called as the class; it is found by being in this
-folder. Units and frames stand in the columns' metadata and reach the Parquet files from there.
+folder. Tables over many runs stand in this file. Units and frames stand in the columns' metadata and reach
+the Parquet files from there.
 """
 
 import functools
@@ -153,14 +154,16 @@ class Contract:
 @functools.cache
 def list_contracts() -> tuple[Contract, ...]:
     """All contracts of this folder, sorted by name."""
-    contracts = []
-    for module in pkgutil.iter_modules([str(Path(__file__).parent)]):
-        content = vars(importlib.import_module(f"schemas.{module.name}"))
-        contracts += [
-            Contract(table.__name__.lower(), table.VERSION, table)
-            for table in content.values()
-            if isinstance(table, type) and issubclass(table, Table) and "VERSION" in vars(table)
-        ]
+    names = (
+        "schemas",
+        *(f"schemas.{module.name}" for module in pkgutil.iter_modules([str(Path(__file__).parent)])),
+    )
+    contracts = [
+        Contract(table.__name__.lower(), table.VERSION, table)
+        for name in names
+        for table in vars(importlib.import_module(name)).values()
+        if isinstance(table, type) and issubclass(table, Table) and "VERSION" in vars(table)
+    ]
     return tuple(sorted(contracts, key=lambda contract: contract.name))
 
 
@@ -182,3 +185,309 @@ def tabulate(table: str, rows: Iterable[Mapping[str, object]]) -> pl.DataFrame:
     kinds = contract_of(table).schema.create_empty().schema
     own = {name: kind for name, kind in kinds.items() if name not in Table.column_names()}
     return pl.DataFrame(list(rows), schema=own, orient="row")
+
+
+class Datasets(Table):
+    """One row a dataset and input; ``run`` is `*`, ``keys`` names the runs.
+
+    Runs are the unit: a number of a dataset is the median over its runs, however long they are. Columns that
+    `slip compare` alone works out are null until it has run.
+    """
+
+    VERSION: ClassVar[int] = 3
+
+    by = text("columns that define a dataset, for example `dataset` or `vehicle,terrain`")
+    input = source()
+    runs = count("number of runs", 1)
+    samples = count("time steps of all runs")
+    windows = count("2 s windows of all runs", nullable=True)
+    distance = optional("m", "distance driven in all runs")
+    duration = optional("s", "time covered by all runs")
+    length_scale = optional("m", "L that turns yaw rate into speed in the slip speed")
+    median_modulus = optional("m/s", "median over runs of the runs' median slip speed")
+    low = optional("m/s", "lower end of the 95 % interval of the typical median slip speed")
+    high = optional("m/s", "upper end of it")
+    interval = text("what the interval says: over runs, or within this run only; empty without one")
+    median_window_norm = optional("m/s", "median over runs of the runs' median window norm")
+    norm_low = optional("m/s", "lower end of the 95 % interval of the typical window norm")
+    norm_high = optional("m/s", "upper end of it")
+    published_norm = optional("m/s", "median window norm of the published chain")
+    transitory_median_modulus = optional("m/s", "after a change of command")
+    steady_median_modulus = optional("m/s", "away from changes of command")
+    drivetrain_mean_square = optional("m^2/s^2", "of f(command) - f(measured wheels)")
+    ground_mean_square = optional("m^2/s^2", "of f(measured wheels) - v")
+    cross_mean_square = optional("m^2/s^2", "twice the mean product of the two parts")
+    height_rate = optional("m/s", "height variation per second")
+    largest_kinetic_energy = optional("J", "largest 1/2 m v^2 of any run")
+    relative_slip = optional("1", "median slip speed over ideal speed, while it moves")
+    slip_energy = optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
+    lost_energy = optional("1", "slip path over path driven: energy lost per metre and mass, over mu g")
+    unpredictability = optional("m/s", "rms slip that a fitted slip model leaves, held out")
+    relative_unpredictability = optional("1", "unpredictability over rms ideal speed")
+    transitory_slip = optional("m", "slip path a change of command adds to the steady one")
+    keys = text("run/generation of every run counted, separated by spaces")
+
+
+UNITS = ("runs", "blocks")
+
+
+class Comparisons(Table):
+    """One row a pair; ``run``, ``vehicle`` and ``terrain`` are `*`, ``dataset`` names both sides."""
+
+    VERSION: ClassVar[int] = 1
+
+    by = text("columns that define a dataset")
+    input = source()
+    quantity = text("what is compared: median_modulus, or published_norm with --as-published")
+    a = text("one dataset")
+    b = text("the other")
+    runs_a = count("runs of a", 1)
+    runs_b = count("runs of b", 1)
+    shift = number("m/s", "Hodges-Lehmann shift b - a of the units")
+    low = optional("m/s", "lower end of its 95 % interval")
+    high = optional("m/s", "upper end of it")
+    cliffs_delta = bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
+    size = text("Cliff's delta in a word")
+    p = bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
+    p_adjusted = bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
+    smallest_p = bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
+    method = text("test and correction")
+    unit_of_analysis = choice(UNITS, "what is permuted: runs, or blocks of single runs")
+    p_uncorrected = bounded(
+        "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
+    )
+    note = text("remarks on the row; may be empty")
+    keys = text("run/generation of every run counted, separated by spaces")
+
+
+LEVELS = ("vehicle", "terrain", "run", "open")
+
+
+class Fleet(Table):
+    """One row a vehicle and number, ``terrain`` `*`, then one for each terrain.
+
+    ``run`` and ``dataset`` are `*`; ``keys`` names the runs.
+    """
+
+    VERSION: ClassVar[int] = 1
+
+    effect = name("id of the effect")
+    parameter = name("name of the parameter")
+    unit = text("unit of value, low, high and the spreads")
+    level = choice(
+        LEVELS, "level of the number: vehicle, terrain or run; open where the runs do not determine it"
+    )
+    name = text("what the effect is called at that level; all candidates where it is open")
+    because = text("why that level, or which runs would determine it")
+    value = number("1", "common value of the vehicle, or mean of the terrain, in the column `unit`")
+    low = optional("1", "lower end of its 95 % interval")
+    high = optional("1", "upper end of it")
+    spread_terrain = optional("1", "standard deviation between terrains")
+    spread_run = optional("1", "standard deviation between runs of a terrain")
+    chi_square = optional("1", "scatter of runs over what their errors say")
+    p_terrain = optional("1", "p value of equal terrains")
+    runs = count("runs behind the value", 1)
+    named = count("runs whose diagnosis names the effect", nullable=True)
+    keys = text("run/generation of every run counted, separated by spaces")
+
+
+_NAME = r"^[^\x00-\x1f\x7f/\\]{1,120}$"
+
+
+def _text(pattern: str, description: str, *, nullable: bool = False) -> dy.String:
+    """A text that looks like this."""
+    return dy.String(nullable=nullable, regex=pattern, metadata={"description": description})
+
+
+def _feature(
+    unit: str, description: str, low: float = 0.0, high: float = 1e9, *, nullable: bool = True
+) -> dy.Float64:
+    """A number within what can be."""
+    return dy.Float64(
+        nullable=nullable,
+        min=low,
+        max=high,
+        check=lambda value: value.is_finite(),
+        metadata={"unit": unit, "description": description},
+    )
+
+
+class Features(Table):
+    """One row a run and input; ``run`` is the beginning of the log's hash: no name of a file is shared."""
+
+    VERSION: ClassVar[int] = 1
+
+    run = _text(r"^[0-9a-f]{16}$", "first 16 digits of sha256")
+    dataset = _text(_NAME, "runs of one vehicle on one terrain")
+    vehicle = _text(_NAME, "vehicle name")
+    terrain = _text(_NAME, "terrain name")
+    input = _text("^(command|measured)$", "input u: command or measured wheels")
+    sha256 = _text(r"^[0-9a-f]{64}$", "SHA-256 of the log, which counts once")
+    month = _text(r"^(19|20)\d\d-(0[1-9]|1[0-2])$", "month of the run", nullable=True)
+    made_by = _text(r"^[0-9A-Za-z.+_-]{1,40}$", "version of slip")
+    from_results = _text(r"^[0-9A-Za-z_-]{1,80}$", "key of the results: inputs and versions")
+    mass = _feature("kg", "mass as configured", 0.01, 1e6)
+    inertia = _feature("kg m^2", "yaw inertia of a plate of that mass, as wide as the track", 0.0, 1e8)
+    length_scale = _feature("m", "L that turns yaw rate into speed in the slip speed", 1e-3, 100.0)
+    samples = dy.Int64(min=1, max=10**10, metadata={"description": "time steps"})
+    windows = dy.Int64(min=0, max=10**9, nullable=True, metadata={"description": "2 s windows"})
+    distance = _feature("m", "distance driven")
+    duration = _feature("s", "time covered")
+    median_modulus = _feature("m/s", "median slip speed", 0.0, 1e3, nullable=False)
+    median_window_norm = _feature("m/s", "median norm of 2 s windows", 0.0, 1e4)
+    transitory_median_modulus = _feature("m/s", "after a change of command", 0.0, 1e3)
+    steady_median_modulus = _feature("m/s", "away from changes of command", 0.0, 1e3)
+    drivetrain_mean_square = _feature("m^2/s^2", "of f(command) - f(measured wheels)", 0.0, 1e6)
+    ground_mean_square = _feature("m^2/s^2", "of f(measured wheels) - v", 0.0, 1e6)
+    cross_mean_square = _feature("m^2/s^2", "twice the mean product of the two parts", -1e6, 1e6)
+    height_rate = _feature("m/s", "height variation per second", 0.0, 1e3)
+    largest_kinetic_energy = _feature("J", "largest 1/2 m v^2", 0.0, 1e10)
+    relative_slip = _feature("1", "median slip speed over ideal speed, while it moves", 0.0, 1e6)
+    slip_energy = _feature("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", 0.0, 1e12)
+    lost_energy = _feature("1", "slip path over path driven: energy per metre and mass over mu g", 0.0, 1e9)
+    unpredictability = _feature("m/s", "rms slip that a fitted slip model leaves, held out", 0.0, 1e3)
+    relative_unpredictability = _feature("1", "unpredictability over rms ideal speed", 0.0, 1e6)
+    transitory_slip = _feature("m", "slip path a change of command adds to the steady one", -1e6, 1e6)
+
+    @dy.rule()
+    def run_is_the_beginning_of_the_hash(cls) -> pl.Expr:  # noqa: N805 - rules receive the class
+        return pl.col("sha256").str.slice(0, 16) == pl.col("run")
+
+
+STATUSES = (
+    "read", "vendor", "second-hand", "inferred", "measured", "assumed", "estimated", "placeholder",
+    "unconfirmed",
+)  # fmt: skip
+BOUNDS = ("value", "upper", "lower", "uncertain")
+DRIVES = ("skid-steer", "tracked", "ackermann", "other")
+MODELS = ("kinematic", "dynamic", "learned", "dataset", "several")
+FEATURES = {
+    "vehicle": "vehicle",
+    "model": "model",
+    "terrain": "terrain",
+    "mass_kg": "mass",
+    "speed_mps": "speed",
+    "slope_score": "scores",
+    "slope_deg": "slope",
+    "height_variation_mps": "height_variation",
+    "hardness": "hardness",
+    "friction_low": "friction",
+    "temperature_c": "temperature",
+}
+"""Which status column speaks of which value."""
+
+_ENERGY_TOLERANCE = 0.02
+
+
+def _deployment_text(description: str) -> dy.String:
+    return dy.String(nullable=True, metadata={"description": description})
+
+
+def _status(of: str) -> dy.Enum:
+    return dy.Enum(STATUSES, nullable=True, metadata={"description": f"how well {of} is known"})
+
+
+_number = partial(bounded, nullable=True)
+
+
+class Deployments(dy.Schema):
+    """One row a deployment; what is not known is empty, never guessed."""
+
+    key = dy.String(
+        primary_key=True, regex=r"^[A-Za-z0-9][A-Za-z0-9._-]*$", metadata={"description": "unique short name"}
+    )
+    year = dy.Int64(min=1950, max=2100, metadata={"description": "year of publication, or of the drive"})
+    authors = _deployment_text("authors, separated by semicolons")
+    title = _deployment_text("title of the publication")
+    venue = _deployment_text("where it was published, with DOI or arXiv number where there is one")
+    citation_status = _status("the citation")
+    vehicle = _deployment_text("vehicle")
+    vehicle_status = _status("the vehicle")
+    drive = choice(DRIVES, "how it steers")
+    model_type = dy.Enum(MODELS, nullable=True, metadata={"description": "kind of motion model; the marker"})
+    model = _deployment_text("the model in a few words")
+    model_status = _status("the model")
+    model_source = _deployment_text("where the model is described, if not in the publication")
+    terrain = _deployment_text("the most complex terrain driven on")
+    terrain_status = _status("the terrain")
+    terrain_source = _deployment_text("where the terrain is described")
+    surface = _deployment_text("state of the surface: wet, frozen, resurfaced, ...")
+    mass_kg = _number("kg", "mass as driven", 0.01)
+    mass_status = _status("the mass")
+    mass_source = _deployment_text("where the mass is given")
+    speed_mps = _number("m/s", "highest speed driven", 0.0)
+    speed_status = _status("the speed")
+    speed_source = _deployment_text("where the speed is given")
+    kinetic_energy_j = _number("J", "1/2 mass speed^2", 0.0)
+    kinetic_energy_bound = dy.Enum(
+        BOUNDS, nullable=True, metadata={"description": "value, upper or lower bound, or uncertain"}
+    )
+    slope_score = _number("1", "slope: 0 below 2 deg, 1 to 5, 2 to 12, 3 to 20, 4 above", 0.0, 4.0)
+    roughness_score = _number("1", "ISO 8608 class: 0 A-B, 1 C-D, 2 E-F, 3 G-H, 4 obstacles", 0.0, 4.0)
+    sinkage_score = _number(
+        "1", "sinkage / wheel radius: 0 rigid, 1 < 2 %, 2 to 10, 3 to 30, 4 above", 0.0, 4.0
+    )
+    friction_score = _number("1", "peak friction: 0 >= .7, 1 to .5, 2 to .35, 3 to .2, 4 below", 0.0, 4.0)
+    scores_status = _status("the four scores")
+    slope_deg = _number("deg", "steepest slope", -90.0, 90.0)
+    slope_status = _status("the slope")
+    height_variation_mps = _number("m/s", "median height variation per second (Triest et al. 2022)", 0.0)
+    height_variation_status = _status("the height variation")
+    hardness = _deployment_text("hardness of the ground, with its unit")
+    hardness_status = _status("the hardness")
+    friction_low = _number("1", "peak friction coefficient, from", 0.0, 2.0)
+    friction_high = _number("1", "peak friction coefficient, to", 0.0, 2.0)
+    friction_status = _status("the friction")
+    temperature_c = _number("degC", "temperature of air or ground", -90.0, 90.0)
+    temperature_status = _status("the temperature")
+    remarks = _deployment_text("what must be known")
+
+    @dy.rule()
+    def every_value_has_a_status(cls) -> pl.Expr:  # noqa: N805 - dataframely rules receive the class
+        return pl.all_horizontal(
+            pl.col(value).is_null() | pl.col(f"{status}_status").is_not_null()
+            for value, status in FEATURES.items()
+        )
+
+    @dy.rule()
+    def kinetic_energy_is_that_of_mass_and_speed(cls) -> pl.Expr:  # noqa: N805
+        energy = pl.col("kinetic_energy_j")
+        own = 0.5 * pl.col("mass_kg") * pl.col("speed_mps") ** 2
+        return energy.is_null() | ((energy - own).abs() <= _ENERGY_TOLERANCE * own).fill_null(value=False)
+
+    @dy.rule()
+    def kinetic_energy_has_its_bound(cls) -> pl.Expr:  # noqa: N805
+        return pl.col("kinetic_energy_j").is_null() == pl.col("kinetic_energy_bound").is_null()
+
+    @dy.rule()
+    def scores_are_all_there_or_none(cls) -> pl.Expr:  # noqa: N805
+        names = ("slope_score", "roughness_score", "sinkage_score", "friction_score")
+        known = sum((pl.col(name).is_not_null().cast(pl.Int64) for name in names), pl.lit(0))
+        return known.is_in([0, 4])
+
+
+class Cells(Table):
+    """One row a frame, vehicle and cell of the map of what to expect; ``run`` is `*`.
+
+    ``dataset`` and ``terrain`` are `*` where several were driven in a cell.
+    """
+
+    VERSION: ClassVar[int] = 1
+
+    frame = name("in which x and y are: a place on Earth, a map that runs share, or one run's own")
+    input = source()
+    cell = bounded("m", "side of the cell", 0.0)
+    x = number("m", "middle of the cell, east on Earth", frame="map")
+    y = number("m", "middle of the cell, north on Earth", frame="map")
+    latitude = optional("deg", "of the middle; null in a frame that is not on Earth")
+    longitude = optional("deg", "of the middle; null in a frame that is not on Earth")
+    passes = count("crossings of the cell by all runs", 1)
+    runs = count("runs that crossed it", 1)
+    slip = bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
+    slip_low = optional("1", "lower quartile of it over crossings; null of a single one")
+    slip_high = optional("1", "upper quartile")
+    modulus = bounded("m/s", "slip speed, median over crossings", 0.0)
+    energy = optional("J", "kinetic energy of the slip velocity, median; null without a mass")
+    lean = optional("rad", "inclination of the vehicle, median; null where it was not measured")
+    power = optional("W", "drawn from the battery, median; null where the log does not say")
+    keys = text("run/generation of every run counted, separated by spaces")

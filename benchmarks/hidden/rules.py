@@ -17,11 +17,11 @@ from unittest.mock import patch
 
 import numpy as np
 
+from pipeline import estimation
 from pipeline.estimation import (
     acceptance,
     ambiguity,
     conclude,
-    diagnose,
     evidence,
     proposals,
     search,
@@ -253,7 +253,7 @@ RULES: tuple[Rule, ...] = (
     Rule("formula_for_effect", "a formula may take the place of an effect", unexplained, "_replace",
          _give(None), _same_presence),
     Rule("formula", "a formula for what no effect takes", unexplained, "_add", _give(None), _same_presence),
-    Rule("boosting", "what trees can predict is unexplained", diagnose, "boost_residuals", _explain_nothing,
+    Rule("boosting", "what trees can predict is unexplained", estimation, "boost_residuals", _explain_nothing,
          _same_structure),
     Rule("lasting", "motion that lasts is unexplained", residual_structure, "_find_lasting", _give(None),
          _same_presence),
@@ -271,6 +271,6 @@ RULES: tuple[Rule, ...] = (
          conclude, "choose_reaching", _choose_first, _same_choice),
     Rule("useful", "rivals that stay far behind are not fitted to the end", search, "list_rivals",
          _set(search, USEFUL=math.inf, LEAST_GAIN=-math.inf), costly=True),
-    Rule("skewed_clock", "a clock beside a skew must be larger", diagnose, "read_clocks",
+    Rule("skewed_clock", "a clock beside a skew must be larger", estimation, "read_clocks",
          _set(ambiguity, _SKEWED_CLOCK=0.0), _same_clocks),
 )  # fmt: skip

@@ -14,13 +14,13 @@ from pathlib import Path
 
 from draw import Answer  # noqa: TC002 - it runs as a script, too
 
-from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.effect import Late, find_late
 from pipeline.models.model_file import parse_model
-from pipeline.run import HeadingSource, MotionError
+from pipeline.run import MotionError
+from pipeline.run.heading import HeadingSource
 from pipeline.sources import Vehicle
 
 Json = Mapping[str, object]

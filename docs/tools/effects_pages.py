@@ -12,7 +12,7 @@ from pipeline.models import find_effect, list_effects
 from pipeline.models.effect import Place
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from pipeline.api.fitted_model import Fit, Model, effect, tabulate_ladder, tabul
 from pipeline.batch.recordings import list_named
 from pipeline.core import SlipError, format_recorded
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.estimation.context import parse_budget
+from pipeline.estimation import parse_budget
 from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.job import INPUTS, Options

@@ -15,8 +15,9 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import number_in, objects_in
 from pipeline.estimation.comparison import choose_input
-from pipeline.estimation.describe import format_ladder, format_parameters, list_parameters
+from pipeline.estimation.estimates import format_parameters, list_parameters
 from pipeline.estimation.folds import errors_as_json
+from pipeline.estimation.ladder import format_ladder
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
 from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs

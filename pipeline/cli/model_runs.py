@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from pipeline.models.literature import LiteratureModel
     from pipeline.models.model import Model
     from pipeline.models.model_file import ModelFile
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -71,7 +71,7 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
     from pipeline.models import format_model  # noqa: PLC0415
     from pipeline.models.catalogue import list_effects  # noqa: PLC0415 - heavy
     from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
-    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.run import MotionError  # noqa: PLC0415
 
     trust_named(path, wanted=trust_code)
     file = read_model(path)
@@ -98,7 +98,7 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
     """
     from pipeline.models import write_text  # noqa: PLC0415
     from pipeline.models.catalogue import draft_effect  # noqa: PLC0415 - heavy
-    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.run import MotionError  # noqa: PLC0415
 
     text = draft_effect(file)
     if file.exists() and not force:
@@ -245,7 +245,7 @@ def read_seconds(text: str) -> float:
     Raises:
         MotionError: ``bad_duration``.
     """
-    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+    from pipeline.run import MotionError  # noqa: PLC0415 - heavy
 
     match = _SECONDS.fullmatch(text.strip())
     if match is None or not float(match[1]) > 0.0:
@@ -259,7 +259,7 @@ def require_model(path: Path | None) -> Path:
     Raises:
         MotionError: ``no_model``: none was given.
     """
-    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+    from pipeline.run import MotionError  # noqa: PLC0415 - heavy
 
     if path is None:
         hint = "Give one, or use the fleet's prior: --prior fleet."
@@ -273,7 +273,7 @@ def require_models(model: Path | None, other: Path | None) -> None:
     Raises:
         MotionError: ``no_model``.
     """
-    from pipeline.run.recording import MotionError  # noqa: PLC0415 - heavy
+    from pipeline.run import MotionError  # noqa: PLC0415 - heavy
 
     if model is None or other is None:
         hint = "Give two, or compare with others: --against literature."
@@ -300,7 +300,7 @@ def forecast_runs(
         SlipError: there is no fleet; or ``several_terrains``.
     """
     from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
-    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
     terrains = sorted({run.terrain for run in runs})
@@ -336,7 +336,7 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
     Raises:
         SlipError: see `forecast_runs`.
     """
-    from pipeline.estimation.learning import tie_to_prior  # noqa: PLC0415 - heavy
+    from pipeline.estimation.across_runs import tie_to_prior  # noqa: PLC0415 - heavy
 
     forecast = forecast_runs(problem.runs, model.vehicle, problem.source.value, out)
     return tie_to_prior(problem, model, forecast.prior)

@@ -34,11 +34,11 @@ from pipeline.cli.model_runs import (
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from pipeline.estimation.learned_bands import Coverage
+    from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored_fits import ModelFit
     from pipeline.models.model_file import ModelFile
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -98,7 +98,7 @@ def new(
     from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
     from pipeline.models.literature import find_model  # noqa: PLC0415
     from pipeline.models.model_file import ModelFile  # noqa: PLC0415
-    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.sources import resolve_vehicle  # noqa: PLC0415
     from pipeline.sources.configuration import VehicleSection  # noqa: PLC0415
 
@@ -127,7 +127,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
-    from pipeline.estimation.describe import format_parameters, list_parameters  # noqa: PLC0415 - heavy
+    from pipeline.estimation.estimates import format_parameters, list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export import export_model  # noqa: PLC0415
     from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
 
@@ -235,8 +235,8 @@ def compare(  # noqa: D417 - the shared options document themselves
         model: a model file; with --against it may be left out.
         other: another one.
     """
+    from pipeline.estimation.across_runs import describe_coverage  # noqa: PLC0415
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.learned_bands import describe_coverage  # noqa: PLC0415
     from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
 
@@ -381,7 +381,7 @@ def _change(
 
 def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
     from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
-    from pipeline.run.recording import MotionError  # noqa: PLC0415
+    from pipeline.run import MotionError  # noqa: PLC0415
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
     hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
@@ -416,28 +416,33 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 
 def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
-    from pipeline.estimation import describe  # noqa: PLC0415 - heavy
     from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
+    from pipeline.estimation.estimates import (  # noqa: PLC0415 - heavy
+        format_parameters,
+        format_recordings,
+        parameters_as_json,
+    )
+    from pipeline.estimation.ladder import describe_step, format_ladder  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
     lines = [f"{INPUT_WORDS[chosen.source.value]} of {runs} ({chosen.reason})"]
-    lines += describe.format_recordings([comparison.run for comparison in new.problem.comparisons])
+    lines += format_recordings([comparison.run for comparison in new.problem.comparisons])
     if old is not new:
-        lines += ["", "before", *describe.format_ladder(old.ladder, fit.floor), "", "after"]
-    lines += describe.format_ladder(new.ladder, fit.floor)
+        lines += ["", "before", *format_ladder(old.ladder, fit.floor), "", "after"]
+    lines += format_ladder(new.ladder, fit.floor)
     if old is not new:
-        lines += describe.describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
+        lines += describe_step(old.whole, new.whole, format_refusals(refusals) if refusals else "")
     if chosen.warning:
         lines.append(chosen.warning)
-    parameters = describe.parameters_as_json(new.fitted.model, new.estimates)
+    parameters = parameters_as_json(new.fitted.model, new.estimates)
     prior = prior_as_json(new.problem)
-    lines += ["", "parameters", *describe.format_parameters(parameters)]
-    return [*lines, "", "prior", *describe.format_parameters(prior)] if prior else lines
+    lines += ["", "parameters", *format_parameters(parameters)]
+    return [*lines, "", "prior", *format_parameters(prior)] if prior else lines
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.describe import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
+    from pipeline.estimation.ladder import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
     lines = list(format_heads("held-out error of"))
     for name, item in rows:

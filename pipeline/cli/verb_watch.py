@@ -65,7 +65,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
     Args:
         json: print one JSON object a line instead of the screen.
     """
-    from pipeline.job.live_source import parse_address, receive_live  # noqa: PLC0415 - heavy
+    from pipeline.job.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
     from pipeline.job.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
 
     options = build_options(choices)

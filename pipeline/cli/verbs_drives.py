@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from pipeline.models.model_file import ModelFile
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -248,8 +248,7 @@ def _find_vehicle(name: str | None) -> Vehicle:
 
 def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
-    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan.plan_files import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
 
     promised = read_promises(path)

@@ -77,7 +77,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
-    from pipeline.estimation.context import parse_budget  # noqa: PLC0415 - heavy
+    from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models import check_target  # noqa: PLC0415 - heavy
 
     if apply is not None:
@@ -312,8 +312,7 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.estimation.describe import format_effect, list_pages  # noqa: PLC0415 - heavy
-    from pipeline.models.catalogue import find_effect, list_effects  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, format_effect, list_effects, list_pages  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
     pages = list_pages(chosen) if effect is None else [format_effect(chosen[0])]
@@ -322,7 +321,7 @@ def effects(  # noqa: D417 - the arguments document themselves
 
 
 def _as_json(effect: type[Effect]) -> dict[str, object]:
-    from pipeline.estimation.describe import format_effect  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
     return {
         "id": effect.id,

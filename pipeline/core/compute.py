@@ -1,10 +1,11 @@
-"""Parallel work on two cores, a cache of recent results, and release of freed memory."""
+"""Parallel work on two cores, its budget, a cache of recent results, and release of freed memory."""
 
 from __future__ import annotations
 
 import copyreg
 import ctypes
 import io
+import math
 import os
 import pickle
 import signal
@@ -13,9 +14,9 @@ import sys
 import threading
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 import numpy as np
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from multiprocessing.connection import Connection
 
     from numpy.typing import NDArray
+
 
 # Independent computations on two cores, with the same results in the same order as one after the other.
 #
@@ -243,3 +245,45 @@ def return_freed_memory() -> None:
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)
+
+
+_USUAL_S = 60.0
+"""CPU time of a search [s] for `_FOR_S` of driving, and the least."""
+_FOR_S = 600.0
+"""Driving [s] that `_USUAL_S` is for."""
+
+
+@dataclass
+class Budget:
+    """CPU time that a search may take; after it the best answer so far stands.
+
+    Attributes:
+        seconds: of CPU time of this process and of what works beside it.
+        notify: told what was found so far.
+        was_cut: whether a search was ended by it.
+    """
+
+    seconds: float = math.inf
+    notify: Callable[[str], None] | None = None
+    was_cut: bool = False
+    _started: float = field(default_factory=measure_cpu)
+
+    @property
+    def spent_s(self) -> float:
+        """CPU time since it began [s]."""
+        return measure_cpu() - self._started
+
+    def is_spent(self) -> bool:
+        """Whether it is used up: whoever asks ends then."""
+        self.was_cut |= self.spent_s > self.seconds
+        return self.was_cut
+
+    def report(self, title: str, effects: Iterable[str]) -> None:
+        """Report the effects found on a part of the way."""
+        if self.notify is not None:
+            self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
+
+
+def usual_budget(driven_s: float) -> float:
+    """CPU time [s] for a run of so much driving [s]: a minute for ten minutes, and never less."""
+    return max(_USUAL_S, _USUAL_S * driven_s / _FOR_S)

@@ -5,9 +5,21 @@
 what is not observable, and what no effect of the catalogue explains.
 """
 
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core.compute import Budget, both_cores, usual_budget
+from pipeline.estimation import conclude
+from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
-from pipeline.estimation.diagnose import Recording, diagnose_runs
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
+from pipeline.estimation.estimates import NotSignificant, list_not_significant
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
@@ -20,4 +32,213 @@ from pipeline.estimation.problem import (
     predict_at_from,
     predict_from,
 )
+from pipeline.estimation.search import (
+    Detectable,
+    SearchResult,
+    Unobservable,
+    find_unobservable,
+    search_body,
+    search_wheels,
+)
+from pipeline.estimation.selection import Context, DiagnosisError, prepare
 from pipeline.estimation.state import Free, State
+from pipeline.estimation.unexplained import (
+    LEAST_OF_DRIVE,
+    Explainable,
+    boost_residuals,
+    collect_terms,
+    find_places,
+    list_window_signals,
+    measure_asked,
+    search_formula,
+)
+from pipeline.estimation.verdict import FATAL
+from pipeline.models import Effect, Model
+from pipeline.run import MotionRun, load_run
+from pipeline.sources import Vehicle
+
+if TYPE_CHECKING:
+    import polars as pl
+
+
+_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
+"""Seconds in a unit of `--budget`."""
+_DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|)")
+
+
+def parse_budget(text: str) -> float:
+    """CPU time [s] of ``60s``, ``2min`` or a number of seconds.
+
+    Raises:
+        DiagnosisError: ``bad_budget``.
+    """
+    match = _DURATION.fullmatch(text.strip())
+    if match is None or float(match[1]) == 0.0:
+        what, hint = f"{text!r} is not a duration above zero", "Write it like 60s or 5min."
+        raise DiagnosisError("bad_budget", what, where="--budget", hint=hint)
+    return float(match[1]) * _UNITS[match[2]]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One run as processed by the stages.
+
+    Attributes:
+        name: of the run.
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the log
+            lacks may be absent.
+        sha256: of the recording.
+        path: of the log.
+        length_scale_m: of the slip speed [m].
+    """
+
+    name: str
+    tables: Mapping[str, pl.DataFrame] = field(repr=False)
+    sha256: str = ""
+    path: str = ""
+    length_scale_m: float = 1.0
+
+    def list_findings(self) -> list[dict[str, object]]:
+        """Findings of the stages: id, text, where, severity and value."""
+        table = self.tables.get("findings")
+        if table is None or table.is_empty():
+            return []
+        columns = [name for name in ("id", "text", "where", "severity", "value") if name in table.columns]
+        return table.select(columns).to_dicts()
+
+
+def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
+    """The run as arrays."""
+    return load_run(recording.tables, vehicle, name=recording.name, sha256=recording.sha256)
+
+
+@dataclass(frozen=True)
+class Explored:
+    """Results of the search on one path.
+
+    Attributes:
+        search: the search, its final model with formula terms where they fit better.
+        undecided: alternatives to the identified effects.
+        not_significant: effects whose evidence is below the threshold.
+        unobservable: effects that are not observable on this path.
+        detectable: upper bounds of the other effects that were not identified.
+        explainable: predictable part of the residual; None where it was not computed.
+    """
+
+    search: SearchResult
+    undecided: tuple[Undecided, ...]
+    not_significant: tuple[NotSignificant, ...]
+    unobservable: tuple[Unobservable, ...]
+    detectable: tuple[Detectable, ...]
+    explainable: Explainable | None
+
+
+def diagnose_runs(
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    *,
+    inputs: Sequence[str] = ("command", "measured"),
+    model: Model | None = None,
+    budget_s: float | None = None,
+    notify: Callable[[str], None] | None = None,
+) -> Diagnosis:
+    """Identify the physical effects missing from the model of one run, or of several runs of one vehicle.
+
+    Args:
+        recordings: the runs' tables.
+        vehicle: their vehicle.
+        inputs: `command`, `measured` or both; with both, the command leads and the wheels separate the
+            drivetrain from the ground.
+        model: the known model, to which effects are added; the ideal model when None.
+        budget_s: CPU time limit of the search [s]; by default a minute for ten minutes of driving.
+        notify: called with a progress message.
+
+    Returns:
+        One diagnosis per run; runs that were judged together share their effects.
+
+    Raises:
+        DiagnosisError: ``too_short`` or ``no_input``.
+    """
+    fatal = [f for recording in recordings for f in recording.list_findings() if f["id"] in FATAL]
+    leading = "command" if "command" in inputs else "measured"
+    if fatal:
+        return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
+    runs = [load_recording(recording, vehicle) for recording in recordings]
+    known = () if model is None else model.effects
+    chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
+    context = prepare(runs, vehicle, chosen.source)
+    driven = sum(run.duration_s for run in runs)
+    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
+    with both_cores(context.list_shared()):
+        ways, clocks = _explore(context, chosen.source, known, budget)
+        return _conclude(recordings, context, chosen, ways, clocks)
+
+
+def _explore(
+    context: Context, source: Input, known: Sequence[Effect], budget: Budget
+) -> tuple[list[Explored], Clocks]:
+    """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
+    if source is Input.MEASURED or context.has_encoders:
+        body = _explore_body(context, Input.MEASURED, known, budget)
+        ways = [body]
+        if source is Input.COMMAND:
+            ways.append(_explore_wheels(context, known, body.search, budget))
+    else:
+        body = _explore_body(context, Input.COMMAND, known, budget)
+        ways = [body]
+    return ways, read_clocks(context, body.search)
+
+
+def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
+    search = search_body(context, source, known, budget)
+    comparisons = search.selection.part.comparisons
+    places = np.concatenate([find_places(comparison) for comparison in comparisons])
+    final = search_formula(search.selection, search.start, search.final, places)
+    # Where a formula explains the residual, boosting is skipped.
+    features = None if collect_terms(final) else list_window_signals(comparisons)[0]
+    explainable = None if features is None else boost_residuals(search.selection, final, features)
+    search = replace(search, final=final)
+    return _gather(search, explainable)
+
+
+def _explore_wheels(
+    context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
+) -> Explored:
+    search = search_wheels(context, known, body, budget)
+    selection, final = search.selection, search.final
+    remaining = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
+    if not (remaining > LEAST_OF_DRIVE).any():
+        return _gather(search, None)
+    features = list_window_signals(selection.part.comparisons)[0]
+    return _gather(search, boost_residuals(selection, final, features))
+
+
+def _gather(search: SearchResult, explainable: Explainable | None) -> Explored:
+    undecided = find_undecided(search.selection, search.final)
+    unobservable, detectable = find_unobservable(search.selection, search.final)
+    return Explored(
+        search,
+        tuple(undecided),
+        tuple(list_not_significant(search)),
+        tuple(unobservable),
+        tuple(detectable),
+        explainable,
+    )
+
+
+def _conclude(
+    recordings: Sequence[Recording],
+    context: Context,
+    chosen: InputChoice,
+    ways: Sequence[Explored],
+    clocks: Clocks,
+) -> Diagnosis:
+    common: RunDiagnosis = conclude.summarize(
+        context, chosen.source, ways, clocks, recordings[0].length_scale_m
+    )
+    common = replace(common, input_reason=chosen.reason)
+    return Diagnosis(
+        tuple(
+            conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)
+        )
+    )

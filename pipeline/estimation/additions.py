@@ -14,19 +14,17 @@ import numpy as np
 
 from pipeline.core import format_share
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
-from pipeline.estimation.context import Context
-from pipeline.estimation.describe import format_rises
 from pipeline.estimation.evidence import Evidence, learn_noise, tile_windows
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, number_predictions, score
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import CHANCE, LadderStep, list_rises
+from pipeline.estimation.ladder import CHANCE, LadderStep, format_rises, list_rises
 from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.parts import make_weights
-from pipeline.estimation.selection import PRICE
+from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
 from pipeline.models.learned_term import LEARNED
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
-from pipeline.estimation.context import Context, is_late
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import fit_model
@@ -16,12 +15,12 @@ from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.search import SearchResult, list_rivals, suggest_manoeuvre
-from pipeline.estimation.selection import CandidateModel, Selection
+from pipeline.estimation.selection import CandidateModel, Context, Selection
 from pipeline.models import Model, find_effect
 from pipeline.models.catalogue import find_late_effect, list_effects
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.parameter import LEAST_DELAY_S
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle
 
 _AS_GOOD = 0.01
@@ -187,6 +186,8 @@ def _is_extended(selection: Selection, name: str, effect: Effect) -> bool:
     return effect.id in rival.contains or len([p for p in rival.parameters if not p.instead_of]) > numbers
 
 
+_SURE = 4.0
+"""Standard errors from which on a delay of the heading is beyond doubt."""
 _SKEWED_CLOCK = 0.03
 """Smallest reported pose delay [s] where the heading is delayed against the positions."""
 
@@ -218,7 +219,7 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
         late = yaw + heading_delay
         positions.append(late)
         skews.append(heading_delay)
-        certain.append(is_late(run))
+        certain.append(_is_late(run))
         rows.append(
             {
                 "heading": "gyro" if run.gyro_fit is not None else "pose",
@@ -244,6 +245,13 @@ def read_clocks(context: Context, body: SearchResult) -> Clocks:
             return Clocks(tuple(late_effects), tuple(rows), (pair,))
         late_effects.append(clock)
     return Clocks(tuple(late_effects), tuple(rows))
+
+
+def _is_late(run: MotionRun) -> bool:
+    """Whether the reported heading is late or early against the gyro beyond doubt."""
+    gyro = run.gyro_fit
+    delay = abs(run.alignment.heading_delay_s)
+    return gyro is not None and delay >= LEAST_DELAY_S and delay > _SURE * gyro.delay_error_s
 
 
 def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:

@@ -11,8 +11,8 @@ from pipeline.core.arrays import Complex, Floats, Ints, join_parts, turn_units
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Late, Place, ReportEffect, find_late
 from pipeline.models.model import Forward, Timing, replace_context
+from pipeline.run import MotionError, MotionRun
 from pipeline.run.heading import Grid, HeadingSource, choose_heading, lay_grid
-from pipeline.run.recording import MotionError, MotionRun
 from pipeline.run.signals import Resets, RunContext, Signal, Velocity
 from pipeline.run.windows import WINDOW_S, find_gaps, find_lead, gather_nodes, join_horizons, join_windows
 from pipeline.sources import Vehicle

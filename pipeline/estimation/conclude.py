@@ -25,30 +25,43 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.context import Context
-from pipeline.estimation.describe import ladder_as_json
-from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
-from pipeline.estimation.error_regions import ABOVE_FLOOR, Growth, find_main_region, map_errors, pick_regions
+from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis
+from pipeline.estimation.error_regions import (
+    ABOVE_FLOOR,
+    Curve,
+    Growth,
+    find_main_region,
+    map_errors,
+    narrow_intervals,
+    pick_regions,
+)
 from pipeline.estimation.estimates import (
     Unless,
     find_doubt,
     find_unless,
     format_stand_in,
+    list_by_run,
     list_estimates,
-    list_values,
     note_brevity,
     note_cut,
     note_grounds,
     note_idle,
-    read_clock,
     restore,
     restore_known,
+    was_aligned,
 )
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, judge_model, note_fit
+from pipeline.estimation.ladder import (
+    Judgement,
+    LadderStep,
+    compare_losses,
+    judge_model,
+    ladder_as_json,
+    note_fit,
+)
 from pipeline.estimation.learned_step import learn_beyond
-from pipeline.estimation.learning import Curve, narrow_intervals
 from pipeline.estimation.parts import BodyPart, Part
+from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, ModelFile, find_effect
@@ -59,7 +72,7 @@ from pipeline.run import MotionError
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
-    from pipeline.estimation.diagnose import Explored, Recording
+    from pipeline.estimation import Explored, Recording
     from pipeline.estimation.state import State
 
 _DRAWS = 400  # resamples of ten-second blocks: a probability near 0.95 has a standard error of 0.01
@@ -274,11 +287,6 @@ def _judge_path(
     return None
 
 
-def _was_aligned(effect: Effect, context: Context) -> bool:
-    """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
-    return effect.late is Late.POSES and context.has_gyro
-
-
 def _name_all(
     effects: Sequence[Effect], context: Context, paths: Sequence[Explored], judgement: Judgement | None
 ) -> tuple[Named, ...]:
@@ -295,7 +303,7 @@ def _name(
 ) -> Named:
     path = _path_of(effect, paths)
     gain, selected, evidence = _measure_gain(effect, path)
-    by_run = _list_by_run(effect, context, judgement)
+    by_run = list_by_run(effect, context, judgement)
     values = by_run[0]
     acting, beside = restore_known(effect.id, values), () if judgement is None else judgement.fitted.model
     return Named(
@@ -306,7 +314,7 @@ def _name(
         confused_with=tuple(
             dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
         ),
-        corrected=_was_aligned(effect, context),
+        corrected=was_aligned(effect, context),
         path=path.search.path,
         selected=selected,
         motion=acting.describe_motion(context.vehicle, beside),
@@ -335,30 +343,6 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
         pairs += [{aligned, item.free.effect} for item in estimates.items if item.trades_with_clock]
     pairs = [pair for pair in pairs if effect.id in pair and pair & clocks and "" not in pair]
     return sorted(set().union(*pairs) - {effect.id})
-
-
-def _list_by_run(
-    effect: Effect, context: Context, judgement: Judgement | None
-) -> tuple[Mapping[str, Value], ...]:
-    """Values of an effect: by run where each run has its own clock, else once."""
-    if _was_aligned(effect, context):
-        delays = [run.alignment.heading_delay_s for run in context.runs]
-        beyond = effect.delay - float(np.mean(delays))
-        return tuple(
-            read_clock(effect.of_delay(beyond + delay), run)
-            for delay, run in zip(delays, context.runs, strict=True)
-        )
-    if judgement is None or effect.id not in judgement.fitted.model:
-        return (list_values(effect, None),)
-    acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
-    by_run = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
-    if effect.late is Late.POSES:
-        # Where only some runs have a gyro, the delay that it corrected is part of the clock.
-        by_run = [
-            {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
-            for numbers, run in zip(by_run, context.runs, strict=False)
-        ]
-    return tuple(by_run)
 
 
 def _find_idle(

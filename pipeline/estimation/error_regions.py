@@ -1,8 +1,9 @@
-"""Regions with excess error of a model, and whether the log is long enough, as text."""
+"""Regions with excess error of a model, intervals by driving time, and whether the log is long enough."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -10,21 +11,17 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import finite_or_none, format_share
-from pipeline.core.arrays import Flags, Floats
-from pipeline.estimation.learning import (
-    INTERVAL_SHARE,
-    Curve,
-    extrapolate,
-    find_goal,
-    last_until,
-    pick_points,
-)
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.estimation.fit import Fitted
+from pipeline.estimation.intervals import narrow_part
 from pipeline.estimation.parts import LAG_S, Part
+from pipeline.models.catalogue import find_effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from pipeline.estimation.diagnosis import Json, Named
+
 
 CHANNELS = ("x", "y", "w")
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
@@ -264,6 +261,10 @@ _WHOLE = 1.005
 _NO_NARROWER = 0.1
 # Longest suggested driving, as a multiple of the time driven.
 _TOO_LONG = 10.0
+INTERVAL_SHARE = 0.05
+"""Target half-width of a 95 % interval as a share of the parameter's size."""
+_POINTS = 60
+"""Maximum number of points of a curve in a figure."""
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
 _LEAST_SHOWN = 0.25
@@ -423,3 +424,68 @@ def format_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[
         f"{error} {verbs.get((low, high), 'depends on')} {signal}: "
         f"{high[1]:+.3g} {unit} at {high[0]:.3g}, {low[1]:+.3g} {unit} at {low[0]:.3g}"
     )
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values by the seconds of driving, both of shape (k,)."""
+
+    seconds: Floats
+    values: Floats
+
+
+def pick_points(count: int) -> Ints:
+    """Indices of the points of a curve that are reported: at most sixty, including the first and the last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _POINTS)).round().astype(np.int64))
+
+
+def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
+    """Half-widths of the 95 % intervals of all smooth parameters of effects, by label ``effect.name``.
+
+    See `narrow_part`; parameters of single runs are excluded.
+    """
+    curves: dict[str, Curve] = {}
+    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+        if not fit.free:
+            continue
+        seconds, halves = narrow_part(part, fit)
+        curves |= {
+            number.label: Curve(seconds, halves[:, index])
+            for index, number in enumerate(fit.free)
+            if number.effect and number.run is None and number.is_smooth
+        }
+    return curves
+
+
+def find_goal(effect: str, name: str, value: float) -> float:
+    """Target half-width for a parameter: a share of its size, or of its typical size if that is larger."""
+    parameter = find_effect(effect)().parameter(name)
+    neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+    return INTERVAL_SHARE * max(abs(value), abs(parameter.typical - neutral))
+
+
+def last_until(curve: Curve, goal: float) -> float:
+    """Seconds after which a curve stays at or below a goal; infinite if it ends above it."""
+    above = np.flatnonzero(~(curve.values <= goal))
+    if above.size == 0:
+        return float(curve.seconds[0])
+    if above[-1] == curve.seconds.size - 1:
+        return math.inf
+    return float(curve.seconds[above[-1] + 1])
+
+
+def extrapolate(curve: Curve, goal: float) -> float:
+    """Seconds of such driving after which a width would reach a goal; infinite if it never would.
+
+    The square of a width is the sum of a part that falls with the driving time, and of a constant: more
+    driving does not reduce the clock errors. Both are fitted to the later half of the curve.
+    """
+    seconds, squares = curve.seconds, curve.values**2
+    later = np.isfinite(squares) & (seconds >= 0.5 * seconds[-1])
+    if later.sum() < 2:  # noqa: PLR2004 - two numbers are read from it
+        return float(seconds[-1] * squares[-1] / goal**2)
+    slope, stays = np.polyfit(1.0 / seconds[later], squares[later], 1)
+    # The extrapolation begins at the last width, even if the fit deviates from it.
+    falls = float(np.clip(slope / seconds[-1], 0.0, squares[-1]))
+    stays = float(squares[-1]) - falls
+    return math.inf if stays >= goal**2 else float(seconds[-1]) * falls / (goal**2 - stays)

@@ -1,34 +1,37 @@
-"""Values of effects with intervals (identified, not significant, all), and findings about them."""
+"""Values of effects with intervals (identified, not significant, all), as JSON and text, and findings."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import NORMAL_95
+from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
+from pipeline.core.arrays import Ints
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
-from pipeline.estimation.context import Context
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
-from pipeline.estimation.fit import fit_model
-from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
+from pipeline.estimation.intervals import NOTHING as NOT_FITTED
+from pipeline.estimation.intervals import Estimate, Estimates, estimate_intervals, estimate_part, join_blocks
 from pipeline.estimation.ladder import Judgement
-from pipeline.estimation.learning import estimate_unnamed
-from pipeline.estimation.parts import count_seconds
+from pipeline.estimation.parts import Part, count_seconds
 from pipeline.estimation.search import SearchResult
+from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
 from pipeline.estimation.verdict import BREVITY, SEARCH_CUT
-from pipeline.models import Effect, Model, find_effect
-from pipeline.models.catalogue import list_effects
-from pipeline.models.parameter import Parameter, cut_interval, is_of_one_run, stands_at_bound
+from pipeline.models.catalogue import find_effect, list_effects
+from pipeline.models.effect import Effect, Late
+from pipeline.models.model import Model
+from pipeline.models.model_file import ModelFile
+from pipeline.models.parameter import UNDETERMINED, Parameter, cut_interval, is_of_one_run, stands_at_bound
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
-    from pipeline.estimation.context import Budget
+    from pipeline.core.compute import Budget
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
@@ -326,3 +329,171 @@ def note_idle(effect: Effect) -> Mapping[str, Json]:
     """A finding about an effect that does not improve the prediction."""
     text = f"{effect.id} reduces the error over half a second, but not the error over two seconds"
     return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}
+
+
+def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
+    """Estimates of effects that a fitted model lacks, each added to it alone.
+
+    Excluded are effects that the model has, that do not act on its input, or whose parameters derivatives
+    cannot optimize, and parameters that are not observable or undetermined within their bounds.
+
+    Args:
+        fitted: a converged fit.
+        candidates: effects at neutral values.
+    """
+    estimates: list[Estimate] = []
+    labels = [join_blocks(part, fit) for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True)]
+    for effect in candidates:
+        if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
+            continue
+        for part, fit, label in zip(fitted.problem.parts, fitted.fits, labels, strict=True):
+            if part.owns(effect):
+                estimates += _estimate_added(part, fit, label, effect)
+                break
+    return tuple(estimates)
+
+
+def _estimate_added(part: Part, fit: PartFit, label: Ints, effect: Effect) -> list[Estimate]:
+    added = fit.state.add(effect)
+    new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
+    if not all(number.is_smooth for number in new):
+        return []
+    columns = part.differentiate(added, fit.residual, new)
+    grown = PartFit(
+        added,
+        (*fit.free, *new),
+        fit.residual,
+        np.concatenate((fit.jacobian, columns), axis=2),
+        fit.weights,
+        fit.loss,
+    )
+    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
+    made = {item.free: item for item in estimate_part(part, grown, step, label).items}
+    if not all(made[number].observable for number in new):
+        return []
+    return [replace(made[number], at_bound=False) for number in new if math.isfinite(made[number].low)]
+
+
+def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:
+    """Every parameter by ``effect.name``: value, 95 % interval, unit, and whether it was fitted."""
+    entries: dict[str, dict[str, object]] = {}
+    for effect in model:
+        for parameter in effect.parameters:
+            value = effect.values[parameter.name]
+            entries[f"{effect.id}.{parameter.name}"] = {
+                "value": _round(value),
+                "low": None,
+                "high": None,
+                "unit": parameter.unit,
+                "fitted": False,
+            }
+    for item in estimates.items:
+        if not item.free.effect:
+            continue
+        label = item.free.label
+        entry: dict[str, object] = {
+            **pick_finite(item, "value", "low", "high", digits=JSON_DIGITS),
+            "unit": item.free.unit,
+            "fitted": True,
+            "at_bound": item.at_bound,
+            "observable": item.observable,
+        }
+        if item.free.run is None:
+            entries[label] = entry
+        else:
+            entries.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
+            runs = entries[label]["runs"]
+            if isinstance(runs, list):
+                runs.append({"run": item.free.run, **entry})
+    return entries
+
+
+def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
+    """Every parameter of a model file by ``effect.name``, with the intervals of its last fit."""
+    parameters = parameters_as_json(file.model, NOT_FITTED)
+    for label, (low, high) in file.intervals.items():
+        parameters[label] |= {"low": _round(low), "high": _round(high)}
+    for label in file.per_run:
+        rows = [row for row in file.own_numbers if row.get("parameter") == label]
+        if rows and label in parameters:
+            parameters[label]["runs"] = rows
+    return parameters
+
+
+def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
+    """Pairs of parameters that the data hardly distinguish."""
+    return [
+        {"parameters": [one.label, other.label], "correlation": _round(value)}
+        for one, other, value in estimates.list_correlated()
+    ]
+
+
+def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
+    """Corrections to and exclusions of poses; empty where there are none."""
+    lines = []
+    for run in runs:
+        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
+        if spread > 0.0:
+            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s, corrected with the gyro")
+        if outlier_s > 0.0:
+            lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
+    return lines
+
+
+def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
+    """Parameters with intervals, one per line."""
+    lines = []
+    for label, entry in parameters.items():
+        rows = entry.get("runs")
+        for row in rows if isinstance(rows, list) else [entry]:
+            unit = "" if entry["unit"] == "1" else entry["unit"]
+            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
+            if row.get("low") is not None:
+                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            elif row.get("fitted"):
+                text += UNDETERMINED
+            if row.get("at_bound"):
+                text += "  (at its bound)"
+            if row.get("observable") is False:
+                text += "  (not observable in these runs)"
+            if "run" in row:
+                text += f"  run {row['run']}"
+            lines.append(text.rstrip())
+    return lines
+
+
+def _show(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else "-"
+
+
+def _round(value: float) -> float | None:
+    return finite_or_none(value, JSON_DIGITS)
+
+
+def was_aligned(effect: Effect, context: Context) -> bool:
+    """Whether an effect is a clock offset that the gyro corrected before any model was fitted."""
+    return effect.late is Late.POSES and context.has_gyro
+
+
+def list_by_run(
+    effect: Effect, context: Context, judgement: Judgement | None
+) -> tuple[Mapping[str, Value], ...]:
+    """Values of an effect: by run where each run has its own clock, else once."""
+    if was_aligned(effect, context):
+        delays = [run.alignment.heading_delay_s for run in context.runs]
+        beyond = effect.delay - float(np.mean(delays))
+        return tuple(
+            read_clock(effect.of_delay(beyond + delay), run)
+            for delay, run in zip(delays, context.runs, strict=True)
+        )
+    if judgement is None or effect.id not in judgement.fitted.model:
+        return (list_values(effect, None),)
+    acting = judgement.fitted.state.list_as_it_acts(judgement.fitted.model.effect(effect.id))
+    by_run = [list_values(one, judgement.estimates.choose_run(run)) for run, one in enumerate(acting)]
+    if effect.late is Late.POSES:
+        # Where only some runs have a gyro, the delay that it corrected is part of the clock.
+        by_run = [
+            {name: value.move(run.alignment.heading_delay_s) for name, value in numbers.items()}
+            for numbers, run in zip(by_run, context.runs, strict=False)
+        ]
+    return tuple(by_run)

@@ -1,4 +1,4 @@
-"""The ladder: stepwise addition of a model's effects, scored on held-out data."""
+"""The ladder: stepwise addition of a model's effects, scored on held-out data, as JSON and text."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import pick
+from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick
 from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out
@@ -337,3 +337,109 @@ def _measure_driven(problem: Problem) -> list[dict[str, float]]:
         speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
         driven.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
     return driven
+
+
+_HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
+_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
+
+
+def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
+    """Steps with their errors, the removed share of the removable error, and `rises` where an error rises."""
+    rungs: list[dict[str, object]] = []
+    below = ladder.steps[0].errors
+    for step, share in zip(ladder.steps, ladder.explained_shares(floor), strict=True):
+        rises = list_rises(below, step.errors)
+        rungs.append(
+            {
+                "effects": list(step.effects),
+                **errors_as_json(step.errors),
+                "explained_share": None if share is None else _round(share),
+                **({"rises": list(rises)} if rises else {}),
+            }
+        )
+        below = step.errors
+    return rungs
+
+
+def step_as_json(before: LadderStep, after: LadderStep) -> dict[str, object]:
+    """2 s errors of the whole model before and after a change, and which of them rise."""
+    return {
+        "effects": [list(before.effects), list(after.effects)],
+        "t_mrmse_m": [_round(before.errors.t_mrmse_m), _round(after.errors.t_mrmse_m)],
+        "r_mrmse_rad": [_round(before.errors.r_mrmse_rad), _round(after.errors.r_mrmse_rad)],
+        "rises": list(list_rises(before.errors, after.errors)),
+    }
+
+
+def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
+    """The ladder as a text table."""
+    heads, units = format_heads("held-out error of")
+    lines = [f"{heads}{'removed':>9}", units]
+    for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
+        name = "ideal" if number == 0 else f"+ {_added(ladder.steps[number - 1], step)}"
+        removed = "" if share is None else f"{format_share(share, 0):>9}"
+        lines.append(f"{name:<30}{_columns(step.errors)}{removed}")
+        below = ladder.steps[max(number - 1, 0)].errors
+        rises = format_rises(below, step.errors)
+        lines += [f"  ! {rises}"] if rises else []
+    if floor is not None:
+        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
+    if ladder.idle:
+        verb = "does" if len(ladder.idle) == 1 else "do"
+        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
+    return lines
+
+
+def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
+    """Change of the 2 s errors of the whole model, and the objection to it, if any."""
+    old, new = before.errors, after.errors
+    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
+    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
+    word = "added" if set(after.effects) > set(before.effects) else "changed"
+    line = f"{'all effects, before -> after':<30}{position}   {heading}"
+    note = refusal or format_rises(old, new)
+    return [line, f"  ! {note}: {word} as requested"] if note else [line]
+
+
+def format_rises(
+    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
+) -> str:
+    """Which 2 s errors rise, and by how much: `position error rises by 2.0%`; empty where none does.
+
+    Args:
+        below: errors before, or the step in JSON.
+        errors: errors after.
+        forgiven: fraction by which an error may rise.
+    """
+    phrases: list[str] = []
+    for key in list_rises(below, errors, forgiven):
+        old, new = read_error(below, key), read_error(errors, key)
+        by = f" by {format_share(new / old - 1.0)}" if old else ""
+        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
+    return ", ".join(phrases)
+
+
+def format_measured_errors(name: str, errors: Errors) -> str:
+    """One row of errors."""
+    return f"{name:<30}{_columns(errors)}"
+
+
+def format_heads(name: str) -> tuple[str, str]:
+    """The headers of the error columns, and their units."""
+    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
+    return f"{name:<30}{heads}", f"{'':<30}{units}"
+
+
+def _round(value: float) -> float | None:
+    return finite_or_none(value, JSON_DIGITS)
+
+
+def _added(before: LadderStep, step: LadderStep) -> str:
+    return ", ".join(name for name in step.effects if name not in before.effects)
+
+
+def _columns(errors: Errors) -> str:
+    x, y, turn = errors.velocity_rms
+    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
+    values.append((math.degrees(errors.r_mrmse_rad), 2))
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)

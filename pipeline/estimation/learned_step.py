@@ -18,7 +18,6 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.describe import format_rises
 from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import (
@@ -37,6 +36,7 @@ from pipeline.estimation.ladder import (
     Ladder,
     LadderStep,
     find_share_removed,
+    format_rises,
     list_rises,
     read_error,
 )
@@ -55,11 +55,11 @@ from pipeline.models.learned_term import (
     learned_as_table,
 )
 from pipeline.models.model import Model
-from pipeline.run.recording import MotionRun
+from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
+    from pipeline.estimation.across_runs import Coverage, Ratios
     from pipeline.estimation.diagnosis import Json
-    from pipeline.estimation.learned_bands import Coverage, Ratios
     from pipeline.estimation.rivals import Rival
 
 _INDEPENDENT = 0.25
@@ -90,7 +90,7 @@ class ResidualData:
     @cached_property
     def windows(self) -> tuple[Floats, Floats, Flags]:
         """Inputs (n, p) and residuals (n, 3) of all windows, and whether each lies within one prediction."""
-        from pipeline.estimation.learned import average_features  # noqa: PLC0415 - only where a term is learned
+        from pipeline.estimation.rivals import average_features  # noqa: PLC0415 - only where a term is learned
 
         known, residuals, whole = list[Floats](), list[Floats](), list[Flags]()
         for run, comparison in enumerate(self.problem.comparisons):
@@ -288,7 +288,7 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
     term = data.learn(np.ones(problem.whole.run.size, dtype=bool))
     if not term.inputs:
         return LearnedStep(term, below, below, "no input explains the residual")
-    from pipeline.estimation.learned_bands import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
+    from pipeline.estimation.across_runs import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
 
     above = hold_out(problem, fitted, learn_fold(problem))
     refusal = explain_no_help(below, above, np.concatenate(number_predictions(problem)))
@@ -400,7 +400,7 @@ def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = (
     grounds = sorted({run.terrain for run in problem.runs})
     if len(grounds) < 2:  # noqa: PLR2004 - nothing is left where the only one is left out
         return None
-    from pipeline.estimation.learned_bands import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
+    from pipeline.estimation.across_runs import list_ratios, make_bands  # noqa: PLC0415 - only where a term is learned
 
     ratios: list[Ratios] = []
     refusals: list[str] = []
@@ -439,7 +439,7 @@ def check_bands(
     term = find_learned(model)
     if term is None or term.bands is None:
         return coverages
-    from pipeline.estimation.learned_bands import list_ratios, measure_coverage  # noqa: PLC0415 - only where a term is learned
+    from pipeline.estimation.across_runs import list_ratios, measure_coverage  # noqa: PLC0415 - only where a term is learned
 
     for run in runs:
         there = Problem([run], model.vehicle, source)

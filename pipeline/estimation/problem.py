@@ -21,8 +21,8 @@ from pipeline.models.effect import Effect
 from pipeline.models.learned_term import drop_learned
 from pipeline.models.model import Model, Timing
 from pipeline.models.parameter import EXCEEDED_SHARE, Largest
+from pipeline.run import MotionError, MotionRun
 from pipeline.run.heading import HeadingSource
-from pipeline.run.recording import MotionError, MotionRun
 from pipeline.run.signals import find_fastest_wheel, name_inputs, split_wheels
 from pipeline.run.windows import HORIZON_S, WINDOW_S
 from pipeline.sources import Vehicle

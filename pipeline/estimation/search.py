@@ -12,12 +12,12 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats
+from pipeline.core.compute import Budget
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_innovations, scale_evidence
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.context import Budget, Context
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.proposals import Candidate
-from pipeline.estimation.selection import USEFUL, CandidateModel, Rivals, Selection, open_selection
+from pipeline.estimation.selection import USEFUL, CandidateModel, Context, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
 from pipeline.models.parameter import Quantity

@@ -1,4 +1,4 @@
-"""Selection among models of one part of the path: their fits, losses and evidence."""
+"""Runs made ready for a search, and selection among models of one part: fits, losses and evidence."""
 
 from __future__ import annotations
 
@@ -6,19 +6,138 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from typing import cast
 
+from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
-from pipeline.core.compute import map_parallel
+from pipeline.core.compute import Budget, map_parallel
 from pipeline.estimation.acceptance import HALVES, LEAST_T, Improvement, compare, is_nameable
-from pipeline.estimation.context import Budget
+from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
 from pipeline.estimation.fit import PartFit, fit_part, try_part
 from pipeline.estimation.folds import Fold, hold_out_part, make_folds
 from pipeline.estimation.parts import Part, make_weights
+from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import Candidate
 from pipeline.estimation.state import State, Weights
-from pipeline.models.effect import Effect
+from pipeline.models.catalogue import list_effects
+from pipeline.models.effect import Effect, Place
 from pipeline.models.parameter import Conditions, Largest, is_of_one_run
+from pipeline.run import MotionError, MotionRun
+from pipeline.sources import Vehicle
+
+
+class DiagnosisError(SlipError):
+    """A diagnosis that cannot be made, in one line."""
+
+
+_FEWEST_WINDOWS = 60
+"""Half seconds of driving with poses that a diagnosis needs: a quarter of a minute, windows overlapping."""
+_DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
+
+
+@dataclass(frozen=True)
+class Context:
+    """Runs of one vehicle, ready to be asked.
+
+    Attributes:
+        problem: the runs on the leading input.
+    """
+
+    problem: Problem
+
+    @property
+    def runs(self) -> tuple[MotionRun, ...]:
+        """The recordings."""
+        return self.problem.runs
+
+    @property
+    def vehicle(self) -> Vehicle:
+        """Geometry."""
+        return self.problem.vehicle
+
+    @property
+    def largest(self) -> Largest:
+        """What relative starts are shares of."""
+        return self.problem.largest
+
+    @property
+    def has_encoders(self) -> bool:
+        """Whether every run has measured wheels."""
+        return all(run.wheels is not None for run in self.runs)
+
+    @property
+    def has_gyro(self) -> bool:
+        """Whether every run has a good gyro as heading and clock."""
+        return all(comparison.has_gyro for comparison in self.problem.comparisons)
+
+    def list_shared(self) -> list[object]:
+        """Large objects that stay as they are throughout."""
+        problems = [self.problem, *([self.problem.behind_wheels] if self.has_encoders else [])]
+        return [
+            *problems,
+            *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
+        ]
+
+    @cached_property
+    def conditions(self) -> Conditions:
+        """What the runs can show; every search looks at measured wheels where there are any."""
+        sampling = self.sampling_s if self.has_encoders else 0.0
+        exceeded = self.problem.exceeded
+        slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
+        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded, slope)
+
+    @property
+    def sampling_s(self) -> float:
+        """Delay that sampled encoders may feign: a little more than half their period."""
+        return 0.6 * max(run.wheel_period_s for run in self.runs)
+
+    def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
+        """Effects that can be told on an input of this vehicle."""
+        hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place not in hidden
+            and not effect.parts
+            and effect().can_show(self.conditions)
+        )
+
+    def list_drivetrain(self) -> tuple[Candidate, ...]:
+        """Effects between command and wheels."""
+        return tuple(
+            cast("Candidate", effect)
+            for effect in list_effects()
+            if self.vehicle.kind in effect.kinds
+            and effect.place in _DRIVETRAIN
+            and effect().can_show(self.conditions)
+        )
+
+
+def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Context:
+    """Make runs ready.
+
+    Raises:
+        DiagnosisError: ``no_input``; ``too_short``, fewer than a quarter of a minute of driving can be
+            compared.
+    """
+    where = ", ".join(run.name for run in runs)
+    try:
+        problem = Problem(runs, vehicle, source)
+    except MotionError as error:
+        if error.code != f"no_{source.value}":
+            raise
+        other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
+        what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
+        raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
+    windows = problem.whole.run.size
+    if windows < _FEWEST_WINDOWS:
+        what = f"only {windows} stretches of half a second have both a live input and valid poses"
+        hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
+        raise DiagnosisError("too_short", what, where=where, hint=hint)
+    return Context(problem)
+
 
 PRICE = 0.5 * LEAST_T**2
 """Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
@@ -272,7 +391,8 @@ class Selection:
             for start in hypothesis.starts:
                 state = start.add_to(state)
             states.append(state)
-        fitted = self.enter_each(states) if useful == math.inf else self.approach_each(base, states, useful)
+        is_rival = useful < math.inf
+        fitted = self.approach_each(base, states, useful) if is_rival else self.enter_each(states)
         if beyond is not None:
             beyond += [model for model in fitted if self._is_beyond(model, base)]
         return [self._simplify(model, base) for model in fitted]

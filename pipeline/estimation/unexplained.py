@@ -38,7 +38,7 @@ from pipeline.run.windows import HORIZON_S, WINDOW_S
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.estimation.diagnose import Explored
+    from pipeline.estimation import Explored
 
 _MOST_TERMS = 3
 """Most terms of a formula: what needs more is no law."""

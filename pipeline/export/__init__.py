@@ -25,7 +25,7 @@ from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import ScalarNode

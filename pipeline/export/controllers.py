@@ -28,7 +28,7 @@ from pipeline.export import (
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"
 _SMOOTHER = "velocity_smoother.ros__parameters"

@@ -20,8 +20,8 @@ from pipeline.models.learned_term import ResidualTerm, learned_as_table
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
-from pipeline.run.recording import MotionError
-from pipeline.run.traction import find_limits, trace_traction
+from pipeline.run import MotionError
+from pipeline.run.signals import find_limits, trace_traction
 
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
 

@@ -22,7 +22,7 @@ from typing import Literal
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
 from pipeline.models.parameter import TwinRole
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
 CREEP_S = 0.01

@@ -10,14 +10,14 @@ import polars as pl
 from pipeline.core import naming_os_errors
 from pipeline.core.untrusted import format_csv, unquote_formulas
 from pipeline.fleet import ComparisonError, Measure
-from schemas.pooled_tables import Deployments
+from schemas import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.
 #
 #     C = 10 [1 - (1 - .5 S/4)(1 - .5 R/4)(1 - .7 H/4)(1 - .6 F/4)]
 #
 # with four scores from 0 to 4: slope S, roughness R (classes of ISO 8608), sinkage over wheel radius H, peak
-# friction F. The limits of the scores are in `schemas.pooled_tables`. The weights were chosen to reproduce
+# friction F. The limits of the scores are in `schemas`. The weights were chosen to reproduce
 # the order of Samson et al. 2024: they are a convention, not evidence. With weights varied by 30 % the median
 # Kendall tau to that order is 0.93.
 
@@ -304,7 +304,7 @@ def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
     keys = ", ".join(failure.invalid()["key"].fill_null("?").unique().sort())
     broken = [f"{keys} break {'; '.join(sorted(failure.counts()))}"]
     if lost or len(failure):
-        hint = "Correct them; every value needs a status; schemas/pooled_tables.py says what columns mean"
+        hint = "Correct them; every value needs a status; schemas/__init__.py says what columns mean"
         raise _refuse(f"rows break the schema: {'; '.join((lost or broken)[:5])}", where, hint)
     return valid
 

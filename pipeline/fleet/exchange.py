@@ -28,8 +28,7 @@ from pipeline.core import arrays, naming_os_errors
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
 from pipeline.fleet import ComparisonError
 from pipeline.stages.slip_stage import PUBLISHED_SAMPLES, WINDOW_S
-from schemas import contract_of
-from schemas.pooled_tables import Features
+from schemas import Features, contract_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -30,7 +30,7 @@ from pipeline.report.motion_view import read_model_text
 if TYPE_CHECKING:
     from pipeline.job.keys import Owner
     from pipeline.models.effect import Effect
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
     from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1

@@ -37,7 +37,7 @@ from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, r
 from pipeline.report import Picture
 from pipeline.stages.slip_stage import WINDOW_S
 from pipeline.store import Store
-from schemas.pooled_tables import Features
+from schemas import Features
 
 _FEWEST = 2
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from pipeline.core import SlipError
 from pipeline.estimation import Recording, RunDiagnosis
+from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.joint_fit import fit_part_jointly, split_normals
 from pipeline.estimation.parts import Part, WheelPart
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
@@ -37,7 +37,7 @@ from pipeline.store import Manifest
 if TYPE_CHECKING:
     from pipeline.core.arrays import Floats
     from pipeline.estimation.fit import PartFit
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
     from pipeline.store import Store
 
 MOST_JOINED = 24
@@ -281,8 +281,7 @@ def study(
     Raises:
         SlipError: nothing can be estimated, or a run has no commands.
     """
-    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnose import load_recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy

@@ -29,7 +29,7 @@ from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import load_motion_run, load_vehicle
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
 

@@ -14,17 +14,11 @@ from pipeline.core import NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows, jackknife_deviation, student_quantile
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.comparison import InputChoice, choose_input
-from pipeline.estimation.describe import (
-    correlations_as_json,
-    ladder_as_json,
-    parameters_as_json,
-    step_as_json,
-)
+from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.intervals import Estimate, estimate_part
-from pipeline.estimation.ladder import Judgement, judge_model, note_fit
-from pipeline.estimation.learned import judge_learned, list_learners
+from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, note_fit, step_as_json
 from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
@@ -33,7 +27,9 @@ from pipeline.estimation.rivals import (
     format_contest,
     hold_contest,
     judge_fit,
+    judge_learned,
     judge_rival,
+    list_learners,
     time_fit,
 )
 from pipeline.fleet.changes import RunNumbers, Side

@@ -27,7 +27,7 @@ from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import read_model_text
-from pipeline.run.recording import MotionError, MotionRun
+from pipeline.run import MotionError, MotionRun
 from pipeline.run.signals import Resets, Rolling, RunContext, Velocity, Wheels
 
 if TYPE_CHECKING:

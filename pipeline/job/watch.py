@@ -368,7 +368,7 @@ class Watch:
 
     def _collect(self, scratch: Path) -> bool:
         """Collect the result of a finished diagnosis."""
-        from pipeline.estimation.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
+        from pipeline.job.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
 
         running = self._diagnosing
         if running is None or running.process.poll() is None:

@@ -15,7 +15,7 @@ from pipeline.core.compute import return_freed_memory
 from pipeline.job import STAGES, JobError, Options
 from pipeline.job.keys import EXTRACTED, TABLES, LogSetup
 from pipeline.logs import LogData, Loss, read_topics
-from pipeline.run.recording import Alignment, read_alignment
+from pipeline.run import Alignment, read_alignment
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velocity
 from pipeline.stages.align import align_tables

@@ -31,9 +31,8 @@ from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import LEARNED, find_learned, learned_as_table
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import FORMAT, ModelFile, read_model
-from pipeline.run.recording import MotionError
-from pipeline.sources import Vehicle, find_preset
-from pipeline.sources.loading import FLEET_FILE, RUN_FILE, is_model
+from pipeline.run import MotionError
+from pipeline.sources import FLEET_FILE, RUN_FILE, Vehicle, find_preset, is_model
 from pipeline.store.files import replace_file
 
 _GEOMETRY = (

@@ -10,15 +10,17 @@ import re
 import stat
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
 from pipeline.core import guess_names
-from pipeline.models.effect import Effect, Late, find_late
+from pipeline.models.effect import Effect, Late, Parameter, Search, find_late
+from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm
-from pipeline.run.recording import MotionError
+from pipeline.models.parameter import is_of_one_run
+from pipeline.run import MotionError
 
 # The user's own Python code is read once, and run only if exactly this content is trusted.
 #
@@ -252,3 +254,71 @@ def _effects_of(module: ModuleType) -> list[EffectClass]:
         and not inspect.isabstract(value)
         and value.__module__ == module.__name__
     ]
+
+
+def format_effect(effect: type[Effect] | Effect) -> str:
+    """An effect's page: docstring, parameters, required excitation, and easily confused effects."""
+    if isinstance(effect, FormulaEffect):
+        page = effect.describe()
+    else:
+        module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
+        page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
+        # A paragraph is one line; the display wraps it.
+        page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
+    lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
+    lines.append(f"vehicles      {', '.join(effect.kinds)}")
+    for parameter in effect.parameters:
+        low, high = parameter.bounds
+        how = " (searched on a grid)" if parameter.search is Search.GRID else ""
+        lines.append(
+            f"parameter     {parameter.name} [{parameter.unit}]: {parameter.about}; {low:g} to {high:g}, "
+            f"neutral {parameter.neutral:g}, typical {parameter.typical:g}{how}"
+        )
+        texts = _format_sizes(parameter)
+        if not is_of_one_run(effect.parameters):
+            spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
+            texts.append(
+                f"standard deviation between runs on one ground {spread.size:.2g}{unit}: {spread.source}"
+            )
+        lines += [f"{'':<14}{text}" for text in texts]
+    lines.append(f"observed by   {', '.join(need.value for need in effect.needs)}")
+    if effect.equivalent_to:
+        lines.append(f"same as       {', '.join(effect.equivalent_to)} ({effect.equivalent_when})")
+    if effect.contains:
+        lines.append(f"contains      {', '.join(effect.contains)}")
+    if effect.parts:
+        lines.append(f"searched as   {', '.join(part.effect for part in effect.parts)}")
+    lines += [
+        f"{'' if number else 'by level':<14}{one.level.value}: {one.name}, {one.text}"
+        for number, one in enumerate(effect.readings)
+    ]
+    if effect.confused_with:
+        lines.append(f"similar to    {', '.join(effect.confused_with)}")
+    return "\n".join(lines)
+
+
+def _format_sizes(parameter: Parameter) -> list[str]:
+    """Detection threshold, exported quantities, observed range and sign of a parameter."""
+    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    lines = []
+    if parameter.least is not None:
+        least = parameter.least
+        lines.append(f"detection threshold {least.size:g}{unit} from neutral: {least.reason}")
+    if parameter.quantities:
+        lines.append(f"exported as {' and '.join(quantity.about for quantity in parameter.quantities)}")
+    if parameter.plausible is not None:
+        range_ = parameter.plausible
+        lines.append(f"observed range {range_.low:g} to {range_.high:g}{unit}: {range_.source}")
+    if parameter.one_sign:
+        lines.append("must be positive: the other sign has no physical meaning")
+    return lines
+
+
+def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
+    """The catalogue: one line per effect."""
+    lines = []
+    for effect in effects:
+        module = inspect.getmodule(effect)
+        title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+        lines.append(f"{effect.id:<24}{effect.place.name.lower():<13}{title.split(': ', 1)[-1]}")
+    return lines

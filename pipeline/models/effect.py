@@ -25,7 +25,7 @@ from pipeline.models.parameter import (
     Spread,  # noqa: F401 - what a file of an effect needs
     TwinRole,
 )
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
 from pipeline.sources import Vehicle
 from pipeline.sources.kinematics import list_kinds

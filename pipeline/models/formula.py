@@ -18,7 +18,7 @@ import numpy as np
 from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Effect, Excitation, Parameter
 from pipeline.models.parameter import PLAIN, Unit, parse_unit
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
 from pipeline.sources import Vehicle
 

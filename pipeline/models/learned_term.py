@@ -14,7 +14,7 @@ from pipeline.core.arrays import Floats
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import Model
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.run.signals import Resets, Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
 

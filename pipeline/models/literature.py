@@ -14,7 +14,7 @@ from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import ACKERMANN, ANY, Effect
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model import Model
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
 _GRAVITY_MPS2 = 9.80665

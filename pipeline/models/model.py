@@ -20,8 +20,8 @@ from pipeline.models.effect import (
     Place,
     ReportEffect,
 )
+from pipeline.run import MotionError
 from pipeline.run.heading import Grid, HeldDrive, MeasuredDrive
-from pipeline.run.recording import MotionError
 from pipeline.run.signals import DriveSeries, Rolling, RunContext, Velocity, Wheels, roll_ideally
 from pipeline.sources import Vehicle
 

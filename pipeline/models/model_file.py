@@ -25,7 +25,7 @@ from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 

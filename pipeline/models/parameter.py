@@ -11,7 +11,7 @@ from fractions import Fraction
 from typing import ClassVar, Literal
 
 from pipeline.core.arrays import Floats
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 
 
 class Level(enum.Enum):

@@ -20,7 +20,7 @@ from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_wit
 from pipeline.plan.plan import SAFETY, ExpectedGain, Impossible, Plan, since_when
 from pipeline.plan.questions import Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal
-from pipeline.run.recording import MotionRun
+from pipeline.run import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
 from pipeline.store.files import replace_file

@@ -16,7 +16,7 @@ from scipy.special import chdtri, stdtrit
 from pipeline.core import NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints
 from pipeline.estimation import Free, Problem
-from pipeline.estimation.learning import find_goal
+from pipeline.estimation.error_regions import find_goal
 from pipeline.models import find_effect, list_effects
 from pipeline.models.parameter import Largest
 from pipeline.plan import PlanError

@@ -11,16 +11,16 @@ import numpy as np
 
 from pipeline.core.arrays import Complex, Floats
 from pipeline.estimation import Comparison, Input, Problem, State, fit_model
+from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.intervals import count_repeats
-from pipeline.estimation.learning import tie_to_prior
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import measure_largest
 from pipeline.estimation.state import Free, pick_columns, weigh_columns
 from pipeline.models import Effect, Model, Place, Timing
 from pipeline.models.parameter import Largest
 from pipeline.plan import Commands, PlanError, is_steered
-from pipeline.run.recording import Alignment, GyroFit, MotionRun, Track
+from pipeline.run import Alignment, GyroFit, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Velocity
 from pipeline.sources import Vehicle
 

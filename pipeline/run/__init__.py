@@ -1,4 +1,428 @@
-"""A run as models, diagnosis and pages read it: inputs, poses, gyro, grid and windows."""
+"""A run as arrays for models, diagnosis and pages: commands, wheels, poses, gyro, stretches to compare."""
 
-from pipeline.run.heading import HeadingSource
-from pipeline.run.recording import MotionError, MotionRun, load_run
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import msgspec
+import numpy as np
+
+from pipeline.core import SlipError, arrays, rigid
+from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
+from pipeline.run.signals import DriveSeries, find_fastest_wheel
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    import polars as pl
+    from numpy.typing import NDArray
+
+    from pipeline.sources import Vehicle
+
+
+class MotionError(SlipError):
+    """Error of a model, an effect, a formula or a fit."""
+
+
+# Conversion of stored tables to a run.
+#
+# Only this module converts stored tables to a run. The stage `align` has corrected the errors of a recording;
+# nothing is corrected here.
+
+_DEAD = 1e-9
+"""Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
+_REPEATED_SHARE = 0.2
+"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
+recordings have none, or 0.49 to 0.80."""
+_ROLLS = 0.3
+"""Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 cm/s of a Warthog."""
+_INPUTS = ("command", "measured")
+
+
+@dataclass(frozen=True)
+class Track:
+    """Poses with new information, in the plane of motion.
+
+    Attributes:
+        times: stamps [s], shape (n,).
+        segment: number of the segment, shape (n,).
+        path: position x + iy [m] in the plane, integrated from body increments, shape (n,).
+        heading: accumulated rotation about the body's own z axis [rad], shape (n,).
+        attitude: roll, pitch, yaw [rad], yaw unwrapped, shape (n, 3).
+        position: x, y in the map [m], shape (n, 2).
+        active: inside an interval with live commands, shape (n,).
+    """
+
+    times: Floats
+    segment: Ints
+    path: Complex
+    heading: Floats
+    attitude: Floats
+    position: Floats
+    active: Flags
+
+
+@dataclass(frozen=True)
+class GyroFit:
+    """Yaw rate = signed_scale * gyro + bias.
+
+    Attributes:
+        signed_scale: negative if the gyro has the opposite sign.
+        bias: [rad/s].
+        yaw_delay_s: delay of the heading of the track relative to the gyro; zero in an aligned recording.
+        delay_error_s: standard error of that delay, from stretches of ten seconds.
+        residual: robust spread of the residual over that of the turning itself.
+        moved_s: delay of the gyro's own stamps: at most half their period, and independent of the clock of
+            the poses.
+    """
+
+    signed_scale: float
+    bias: float
+    yaw_delay_s: float
+    delay_error_s: float
+    residual: float
+    moved_s: float = 0.0
+
+    def turn(self, times: Floats, rate: Floats) -> Floats:
+        """Integrated angle of the gyro [rad] from its rate [rad/s] at times [s], shape (n,)."""
+        return self.signed_scale * arrays.integrate_rate(times, rate) + self.bias * times
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Corrections of the clocks, scales and signs of a recording.
+
+    Attributes:
+        hold_s: time from the last command until the controller stops; None without commands.
+        command_scale: factor by which the recorded command was multiplied.
+        track_multiplier: factor by which the controller multiplies the track width.
+        gyro: fit of the gyro to the poses; None without a good one.
+        heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
+        wheel_delay_s: delay of the encoders relative to the gyro, removed from the wheels.
+        latency_spread_s: standard deviation of the latencies removed from the poses.
+        outlier_s: duration of contradictions of localization and wheels, except bad stretches.
+        recorded_moduli: median slip speed with L = 1 m by input before the corrections [m/s].
+    """
+
+    hold_s: float | None = None
+    command_scale: float = 1.0
+    track_multiplier: float = 1.0
+    gyro: GyroFit | None = None
+    heading_delay_s: float = 0.0
+    wheel_delay_s: float = 0.0
+    latency_spread_s: float = 0.0
+    outlier_s: float = 0.0
+    recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MotionRun:
+    """One run.
+
+    Attributes:
+        name: of the run.
+        sha256: of its recording, empty when unknown.
+        terrain: its terrain.
+        commands: held commands, with stops after the hold time; None without.
+        wheels: measured wheels; None without, or if they never move.
+        gyro: times [s] and yaw rate [rad/s], as recorded; None without.
+        track: the poses.
+        streams: stamps of poses, commands and wheels [s], increasing; a pause is a gap of the recording.
+        step_starts: start times of command steps [s].
+        excluded: times [s] of samples in bad stretches or without a live command.
+        duration_s: length of the run.
+        alignment: corrections of the recording.
+        repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
+            if each is new.
+        is_on_course: whether its heading is the course over ground, so that it never moves sideways.
+    """
+
+    name: str
+    sha256: str
+    terrain: str
+    commands: DriveSeries | None
+    wheels: DriveSeries | None
+    gyro: tuple[Floats, Floats] | None
+    track: Track
+    streams: Floats
+    step_starts: Floats
+    excluded: Floats
+    duration_s: float
+    alignment: Alignment
+    repeats_s: float = 0.0
+    is_on_course: bool = False
+
+    @property
+    def start_s(self) -> float:
+        """Start of its first stream [s]."""
+        return float(self.streams[0])
+
+    @property
+    def gyro_fit(self) -> GyroFit | None:
+        """Fit of the gyro to the poses; None without a good one."""
+        return self.alignment.gyro
+
+    @property
+    def wheel_period_s(self) -> float:
+        """Median period of the wheel measurements [s]; zero without wheels."""
+        return 0.0 if self.wheels is None else float(np.median(np.diff(self.wheels.times)))
+
+    def correct_vehicle(self, vehicle: Vehicle) -> Vehicle:
+        """The vehicle with the track multiplier of the controller in this recording."""
+        return msgspec.structs.replace(vehicle, controller_track_multiplier=self.alignment.track_multiplier)
+
+
+def load_run(
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, *, name: str, sha256: str = ""
+) -> MotionRun:
+    """Make a run from its aligned tables.
+
+    Args:
+        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `findings`, and `slip` (for steps and
+            stretches without a live command); those that the log lacks may be missing or empty.
+        vehicle: geometry.
+        name: of the run.
+        sha256: of the recording.
+
+    Raises:
+        MotionError: ``not_aligned``, the tables are of an earlier version; ``no_poses``, fewer than ten poses
+            carry information.
+    """
+    table = tables.get("alignments")
+    if table is None or table.is_empty():
+        what = "the results were made by an earlier version, before recordings were aligned"
+        raise MotionError("not_aligned", what, where=name, hint="Analyze the log again with --force.")
+    return make_run(tables, vehicle, read_alignment(table), name=name, sha256=sha256)
+
+
+def make_run(
+    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, *, name: str, sha256: str = ""
+) -> MotionRun:
+    """As `load_run`, with an alignment that is not yet stored.
+
+    Raises:
+        MotionError: ``no_poses``.
+    """
+    commands = _read_drive(tables.get("commands"), vehicle)
+    wheels = _read_drive(tables.get("wheels"), vehicle)
+    track = _read_track(tables["poses"], wheels, name)
+    if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
+        wheels = None
+    imu = tables.get("imu")
+    gyro = None
+    if imu is not None and not imu.is_empty():
+        late = 0.0 if alignment.gyro is None else alignment.gyro.moved_s
+        gyro = _distinct(imu["t"].to_numpy() - late, imu["rate_z"].to_numpy())
+    stamps = [tables["poses"]["t"].to_numpy(), *(d.times for d in (commands, wheels) if d is not None)]
+    streams = np.unique(np.concatenate(stamps))
+    if commands is not None and alignment.hold_s is not None:
+        commands = _stop_when_silent(commands, alignment.hold_s)
+    steps, excluded = _read_steps(tables.get("slip"), streams)
+    terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
+    return MotionRun(
+        name=name,
+        sha256=sha256,
+        terrain=str(terrains[0]) if terrains is not None else "unknown",
+        commands=commands,
+        wheels=wheels,
+        gyro=gyro,
+        track=track,
+        streams=streams,
+        step_starts=steps,
+        excluded=excluded,
+        duration_s=float(streams[-1] - streams[0]),
+        alignment=alignment,
+        repeats_s=_measure_repeats(tables["poses"]),
+        is_on_course=_is_on_course(tables.get("findings")),
+    )
+
+
+def _is_on_course(findings: pl.DataFrame | None) -> bool:
+    """See `MotionRun.is_on_course`."""
+    return findings is not None and not findings.is_empty() and "heading_from_course" in findings["id"]
+
+
+def _measure_repeats(poses: pl.DataFrame) -> float:
+    """See `MotionRun.repeats_s`."""
+    held = poses["held"].mean()
+    repeated = isinstance(held, float) and held > _REPEATED_SHARE
+    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
+
+
+def read_alignment(table: pl.DataFrame) -> Alignment:
+    """The only row of table `alignments`."""
+    row = table.row(0, named=True)
+    gyro = None
+    if row["gyro_scale"] is not None:
+        fitted = row["gyro_scale"], row["gyro_bias"]
+        gyro = GyroFit(
+            *fitted, 0.0, row["heading_delay_error"], row["gyro_residual"], row.get("gyro_delay") or 0.0
+        )
+    return Alignment(
+        row["hold_time"],
+        row["command_scale"],
+        row["track_multiplier"],
+        gyro,
+        row["heading_delay"] or 0.0,
+        row["wheel_delay"],
+        row["latency_spread"],
+        row["outlier_time"],
+        {name: row[f"recorded_modulus_{name}"] for name in _INPUTS},
+    )
+
+
+def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
+    """Table `alignments` of one run, without the columns of the run."""
+    from schemas import tabulate  # noqa: PLC0415 - only where tables are written
+
+    row = {
+        "hold_time": alignment.hold_s,
+        "command_scale": alignment.command_scale,
+        "track_multiplier": alignment.track_multiplier,
+        "wheel_delay": alignment.wheel_delay_s,
+        "latency_spread": alignment.latency_spread_s,
+        "outlier_time": alignment.outlier_s,
+        **{f"recorded_modulus_{name}": alignment.recorded_moduli.get(name) for name in _INPUTS},
+    }
+    fit = alignment.gyro
+    if fit is not None and np.isfinite(fit.delay_error_s):
+        row |= {
+            "gyro_scale": fit.signed_scale,
+            "gyro_bias": fit.bias,
+            "heading_delay": alignment.heading_delay_s,
+            "heading_delay_error": fit.delay_error_s,
+            "gyro_residual": fit.residual,
+            "gyro_delay": fit.moved_s,
+        }
+    return tabulate("alignments", [row])
+
+
+def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
+    parts: list[Track] = []
+    turned = np.zeros(0, dtype=np.int64)
+    if wheels is not None:
+        turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
+    for piece in rigid.cut_segments(poses):
+        times, held = piece["t"], piece["held"]
+        fresh = rigid.select_fresh_poses(times, held)
+        if wheels is not None:
+            fresh = fresh[~_waits_in_motion(times, held, wheels.times, turned)[fresh]]
+        fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
+        if fresh.size > 1:
+            fresh_columns = {column: values[fresh] for column, values in piece.items()}
+            parts.append(_unroll(fresh_columns, parts[-1] if parts else None))
+    if sum(part.times.size for part in parts) < 10:  # noqa: PLR2004 - fewer say nothing
+        hint = "Check the pose topic with `slip inspect`."
+        raise MotionError("no_poses", "fewer than ten poses carry information", where=name, hint=hint)
+    return Track(
+        *(np.concatenate([getattr(part, field) for part in parts]) for field in Track.__dataclass_fields__)
+    )
+
+
+def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
+    """Short repeats of a pose while wheels turn: a localization that waits.
+
+    Args:
+        times: stamps of a segment's poses [s], shape (n,).
+        held: whether each pose repeats the previous one, shape (n,).
+        wheel_times: stamps of measured wheels [s], shape (m,).
+        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
+    """
+    waits = np.zeros(times.size, dtype=bool)
+    first, end = np.array(rigid.find_runs(held), dtype=np.int64).reshape(-1, 2).T
+    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
+    mostly = 2 * (turned[high] - turned[low]) > high - low
+    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= rigid.LONGEST_WAIT_S), end - first)
+    return waits
+
+
+def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
+    """Poses of one segment in the plane of motion; headings continue from the previous segment.
+
+    Headings are shifted by full turns, so that consecutive segments differ by less than one.
+    """
+    position, quaternion = piece["position"], piece["quaternion"]
+    roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
+    if before is not None:
+        yaw = yaw + 2.0 * np.pi * np.round((before.heading[-1] - yaw[0]) / (2.0 * np.pi))
+    _, turn = rigid.measure_increments(position, quaternion)
+    middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
+    moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
+    heading = yaw[0] + np.concatenate(([0.0], np.cumsum(turn[:, 2])))
+    along = (moved[:, 0] + 1j * moved[:, 1]) * np.exp(0.5j * (heading[:-1] + heading[1:]))
+    path = position[0, 0] + 1j * position[0, 1] + np.concatenate(([0.0], np.cumsum(along)))
+    return Track(
+        times=piece["t"] - piece["latency"] if "latency" in piece else piece["t"],
+        segment=piece["segment"].astype(np.int64),
+        path=path,
+        heading=heading,
+        attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
+        position=position[:, :2],
+        active=piece["active"],
+    )
+
+
+def read_wheel_times(table: pl.DataFrame) -> Floats:
+    """Times of the rows of a table [s]: its stamps minus their delay, if known."""
+    times = table["t"].to_numpy()
+    return times - table["latency"].to_numpy() if "latency" in table.columns else times
+
+
+def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+    if table is None or table.is_empty():
+        return None
+    times = read_wheel_times(table)
+    aligned = "left_aligned" in table.columns
+
+    def read(name: str) -> Floats:
+        return table[f"{name}_aligned" if aligned else name].to_numpy()
+
+    if vehicle.kinematics.has_inputs("speed", "steering"):
+        axle = read("speed") / vehicle.wheel_radius_m
+        left, right, steering = axle, axle, table["steering"].to_numpy()
+    else:
+        left, right, steering = read("left"), read("right"), np.zeros(times.size)
+    sideways = read("sideways") if vehicle.kinematics.has_inputs("sideways") else None
+    mask = np.isfinite(left) & np.isfinite(right) & np.isfinite(steering)
+    mask &= np.concatenate((np.diff(times) > 0.0, [True]))
+    if sideways is not None:
+        mask &= np.isfinite(sideways)
+        sideways = sideways[mask]
+    if mask.sum() < 2:  # noqa: PLR2004 - one value is no series
+        return None
+    return DriveSeries(times[mask], left[mask], right[mask], steering[mask], sideways)
+
+
+def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
+    mask = np.concatenate(([True], np.diff(times) > 0.0)) & np.isfinite(values)
+    return times[mask], values[mask]
+
+
+def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
+    times = commands.times
+    silent = np.flatnonzero(np.diff(times, append=np.inf) > hold_s)
+    at = silent + 1
+    stopped = np.insert(times, at, times[silent] + hold_s)
+    return commands.change(stopped, lambda signal: np.insert(signal, at, 0.0))
+
+
+def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:
+    """Starts of steps and times of excluded samples, of the whole recording."""
+    if slip is None or slip.is_empty():
+        return np.zeros(0), np.zeros(0)
+    leading = "command" if (slip["input"] == "command").any() else "measured"
+    rows = slip.filter(slip["input"] == leading).sort("t")
+    step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
+    starts = times[np.concatenate(([True], np.diff(step) != 0))]
+    excluded = [slip.filter(slip["suspect"])["t"].to_numpy()]
+    # Motion without a live command has no rows: such stretches are not scored either. Commands before the
+    # first one are unknown.
+    known = np.concatenate(
+        ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
+    )
+    holes = np.flatnonzero(np.diff(known) > 0.2 + ROUNDING_S)
+    for hole in holes.tolist():
+        excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - ROUNDING_S, 0.05))  # noqa: PERF401
+    excluded.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
+    return starts, np.unique(np.concatenate(excluded))

@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.core import arrays
 from pipeline.core.arrays import ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.machine_code import compiled
-from pipeline.run.recording import GyroFit, MotionRun, Track
+from pipeline.run import GyroFit, MotionRun, Track
 from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from pipeline.core import NORMAL_95, arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.run.heading import fit_gyro
-from pipeline.run.recording import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
 from pipeline.run.signals import STILL_MPS
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
-from pipeline.run.recording import read_wheel_times
+from pipeline.run import read_wheel_times
 from pipeline.run.signals import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.stages import Finding
 

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, format_share
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
+from pipeline.run import MotionRun
 from pipeline.run.heading import align_heading, has_excluded, mark_excluded
-from pipeline.run.recording import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
-from pipeline.run.recording import read_wheel_times
+from pipeline.run import read_wheel_times
 from pipeline.run.signals import STILL_MPS
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError

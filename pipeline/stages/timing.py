@@ -9,8 +9,8 @@ import numpy as np
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, robust_spread, solve_tridiagonal
 from pipeline.core.rigid import LONGEST_WAIT_S
 from pipeline.models.parameter import LEAST_DELAY_S
+from pipeline.run import GyroFit, MotionRun, Track
 from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
-from pipeline.run.recording import GyroFit, MotionRun, Track
 from pipeline.stages import SURE
 
 # Rates of the recorder's clock and of the stamps' clock: a map between them from topics that have both.

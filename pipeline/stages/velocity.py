@@ -18,10 +18,9 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats
+from pipeline.run import Alignment, GyroFit
 from pipeline.run.heading import SPAN_S
-from pipeline.run.recording import Alignment, GyroFit
-from pipeline.run.signals import ANSWERS_S
-from pipeline.run.traction import Limits, find_limits, trace_traction
+from pipeline.run.signals import ANSWERS_S, Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
 from pipeline.stages.incidents import LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain

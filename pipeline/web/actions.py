@@ -27,13 +27,13 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.apportion import SlipBudget, apportion
-from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, Ladder, LadderStep
 from pipeline.estimation.learned_step import fit_and_hold_out, hold_out_model
 from pipeline.estimation.problem import predict_at_from
+from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run, load_vehicle

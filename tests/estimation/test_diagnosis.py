@@ -25,7 +25,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

@@ -8,9 +8,17 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.estimation import Comparison, Errors, Input, Problem, RunDiagnosis, diagnose_runs, fit_model
+from pipeline.estimation import (
+    Comparison,
+    Errors,
+    Input,
+    Problem,
+    RunDiagnosis,
+    diagnose_runs,
+    fit_model,
+    load_recording,
+)
 from pipeline.estimation.acceptance import find_implausible
-from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.verdict import FORMULA
 from pipeline.job import Options

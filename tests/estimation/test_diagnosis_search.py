@@ -7,13 +7,12 @@ from typing import TYPE_CHECKING, cast
 
 import pytest
 
-from pipeline.estimation import Input, Problem, ambiguity, fit_model
+from pipeline.core.compute import Budget
+from pipeline.estimation import Input, Problem, ambiguity, fit_model, load_recording
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
-from pipeline.estimation.context import Budget, prepare
-from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
-from pipeline.estimation.selection import CandidateModel, Selection, open_selection
+from pipeline.estimation.selection import CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.state import State
     from pipeline.models import Effect
-    from pipeline.run.recording import MotionRun
+    from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
 
 _LAGS = {"drive_lag": 0.45, "steering_lag": 0.38}

@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 
-from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs
+from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.ambiguity import find_undecided
-from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model
 from pipeline.job import Options

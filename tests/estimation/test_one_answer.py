@@ -12,12 +12,11 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
-from pipeline.estimation import Input, Problem, carry_over, diagnose_runs
-from pipeline.estimation.describe import ladder_as_json, parameters_as_json
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.ladder import judge_model, ladder_as_json
 from pipeline.estimation.terms import is_term
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.acceptance import find_exceeded, find_implausible, is_nameable
-from pipeline.estimation.describe import format_parameters
 from pipeline.estimation.diagnosis import Value
+from pipeline.estimation.estimates import format_parameters
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 

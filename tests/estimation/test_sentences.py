@@ -14,7 +14,7 @@ from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression
 from pipeline.models.parameter import parse_unit
 from pipeline.report.sections_why import format_row
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.sources import find_preset
 
 

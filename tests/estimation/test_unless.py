@@ -7,8 +7,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.estimation import Diagnosis, Input, Problem, acceptance, diagnose_runs, fit_model
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation import (
+    Diagnosis,
+    Input,
+    Problem,
+    acceptance,
+    diagnose_runs,
+    fit_model,
+    load_recording,
+)
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model, note_fit
 from pipeline.export import export_model

@@ -25,7 +25,7 @@ from pipeline.fleet.deployments import (
 from pipeline.job.over_runs import draw_up_map, write_map
 from pipeline.report.map_page import Box, arrange_labels
 from pipeline.store import Store
-from schemas.pooled_tables import FEATURES
+from schemas import FEATURES
 
 ENTRY = """
 key = "Ours2026"

@@ -12,7 +12,7 @@ from comparison_store import Run, write_run
 from plan_game import record
 
 from pipeline.cli import main
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation import load_recording
 from pipeline.job.next_drive import UNDECIDED, ask, expect
 from pipeline.models import find_effect
 from pipeline.plan import choose_limits

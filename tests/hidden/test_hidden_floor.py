@@ -10,8 +10,7 @@ import pytest
 from draw import draw_riddle, write_riddle
 from truth import build_true
 
-from pipeline.estimation import Input, Problem, fit_model, hold_out
-from pipeline.estimation.diagnose import load_recording
+from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
 from pipeline.estimation.floor import split_differences
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -33,7 +33,7 @@ from verbs import run_verb
 
 from pipeline.job import JobError
 from pipeline.job.live_receiver import LiveReceiver
-from pipeline.job.live_source import LiveLog, name_folder, parse_address, receive_live
+from pipeline.job.running_log import LiveLog, name_folder, parse_address, receive_live
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import LISTING
 from pipeline.logs.live_recording import (

@@ -17,8 +17,8 @@ from mcap.writer import Writer
 from verbs import run_verb
 
 from pipeline.cli.verb_watch import format_watch
-from pipeline.estimation.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job import Options
+from pipeline.job.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import GrowingLog

@@ -13,8 +13,8 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
+from pipeline.estimation.estimates import estimate_unnamed
 from pipeline.estimation.ladder import Judgement, judge_model
-from pipeline.estimation.learning import estimate_unnamed
 from pipeline.models import Model, find_effect
 
 TRUE = {"effective_track": {"k": 1.6}, "lateral_skid": {"c": 0.08}}

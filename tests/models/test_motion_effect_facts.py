@@ -9,9 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.estimation.describe import format_effect
 from pipeline.models import Effect, list_effects
-from pipeline.models.catalogue import find_late_effect
+from pipeline.models.catalogue import find_late_effect, format_effect
 from pipeline.models.effect import Late
 from pipeline.models.parameter import Conditions, Largest, TwinRole, is_of_one_run
 

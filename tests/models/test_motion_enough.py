@@ -10,10 +10,16 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Named, Problem, Value, estimate_intervals, fit_model
 from pipeline.estimation.acceptance import compare, grow_evidence
-from pipeline.estimation.error_regions import Growth, format_enough
+from pipeline.estimation.error_regions import (
+    Curve,
+    Growth,
+    extrapolate,
+    format_enough,
+    last_until,
+    narrow_intervals,
+)
 from pipeline.estimation.evidence import learn_noise, tile_windows
 from pipeline.estimation.intervals import estimate_part, narrow_part, sum_blocks
-from pipeline.estimation.learning import Curve, extrapolate, last_until, narrow_intervals
 from pipeline.models import Model, find_effect
 from pipeline.run.windows import cut_run, find_driven
 

@@ -11,7 +11,7 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.cli import main
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, score
-from pipeline.estimation.learning import fit_with_prior, tie_to_prior
+from pipeline.estimation.across_runs import fit_with_prior, tie_to_prior
 from pipeline.estimation.state import Prior
 from pipeline.job.prediction import weigh_runs
 from pipeline.models import Model, find_effect, read_model

@@ -23,7 +23,8 @@ from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
 from pipeline.estimation.ladder import judge_model
 from pipeline.models import Model, Timing, find_effect
-from pipeline.run import HeadingSource, MotionError
+from pipeline.run import MotionError
+from pipeline.run.heading import HeadingSource
 from pipeline.simulate import Disturbance, Encoders, Imu, PoseSensor
 
 HUSKY = vehicle_of("husky_a200")

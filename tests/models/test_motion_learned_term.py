@@ -15,8 +15,8 @@ from verbs import run_verb
 
 import pipeline as slip
 from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
+from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
 from pipeline.estimation.ladder import judge_model
-from pipeline.estimation.learned_bands import Ratios, make_bands, measure_coverage
 from pipeline.estimation.learned_step import (
     ResidualData,
     add_term,

@@ -15,9 +15,19 @@ from verbs import run_verb
 import pipeline as slip
 from pipeline.core import SlipError
 from pipeline.estimation import Comparison, Errors, HeldOut, Input, Problem, fit_model, hold_out
-from pipeline.estimation.learned import Lesson, judge_learned, list_learners, make_features, score_learned
 from pipeline.estimation.parts import WheelPart
-from pipeline.estimation.rivals import Contest, Rival, compare_errors, hold_contest, judge_rival
+from pipeline.estimation.rivals import (
+    Contest,
+    Lesson,
+    Rival,
+    compare_errors,
+    hold_contest,
+    judge_learned,
+    judge_rival,
+    list_learners,
+    make_features,
+    score_learned,
+)
 from pipeline.estimation.state import NO_PRIOR, Prior, State
 from pipeline.models import Model, Timing, find_effect
 from pipeline.models.literature import find_model

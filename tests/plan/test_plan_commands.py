@@ -48,7 +48,7 @@ from pipeline.plan.plan_files import (
 from pipeline.plan.questions import ask_presence
 from pipeline.plan.rehearsal import Rehearsal, assume
 from pipeline.report.drive_pages import preview_plan
-from pipeline.run.recording import MotionError
+from pipeline.run import MotionError
 from pipeline.simulate import find_vehicle, simulate_case
 from pipeline.simulate.programs import read_played
 from pipeline.sources import Vehicle, find_preset, list_presets

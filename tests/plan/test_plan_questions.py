@@ -13,9 +13,8 @@ import pytest
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
-from pipeline.estimation import Named, RunDiagnosis, Value
+from pipeline.estimation import Named, RunDiagnosis, Value, load_recording
 from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.diagnose import load_recording
 from pipeline.estimation.search import Unobservable
 from pipeline.models import find_effect
 from pipeline.plan.plan import ExpectedGain

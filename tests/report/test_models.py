@@ -9,8 +9,8 @@ from report_synthesis import make_report
 
 from pipeline.core.untrusted import objects_in
 from pipeline.estimation import Comparison, Input, Problem, State
-from pipeline.estimation.describe import format_rises
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
+from pipeline.estimation.ladder import format_rises
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
 from pipeline.report.figures.model_figures import list_ladder_steps, list_parts
 from pipeline.report.figures.residual_figures import choose_signal

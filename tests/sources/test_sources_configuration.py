@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.sources import Configuration, ConfigurationError, load_configuration
+from pipeline.sources import Configuration, ConfigurationError, load_configuration, merge
 from pipeline.sources.configuration import VehicleSection, resolve_vehicle
-from pipeline.sources.loading import merge
 
 Write = Callable[[str, str], Path]
 

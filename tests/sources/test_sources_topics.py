@@ -14,9 +14,9 @@ from pipeline.sources import (
     Sources,
     Vehicle,
     choose_sources,
+    convert,
     find_preset,
 )
-from pipeline.sources.loading import convert
 
 JOINTS = "sensor_msgs/msg/JointState"
 FLOAT = "std_msgs/msg/Float64"

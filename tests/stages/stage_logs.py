@@ -22,8 +22,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.sources import Configuration, DriveForm, Sources, choose_sources, resolve_vehicle
-from pipeline.sources.loading import convert
+from pipeline.sources import Configuration, DriveForm, Sources, choose_sources, convert, resolve_vehicle
 from pipeline.stages.align import Aligned, align_tables
 from pipeline.stages.checks import run_checks
 from pipeline.stages.extract import Extracted, extract_tables

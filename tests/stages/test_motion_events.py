@@ -13,7 +13,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, ModelFile
 from pipeline.models.catalogue import find_effect
-from pipeline.run.traction import Limits, trace_traction
+from pipeline.run.signals import Limits, trace_traction
 from pipeline.simulate import (
     TRACTION,
     VEHICLES,

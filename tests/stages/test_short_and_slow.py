@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from stage_logs import make_samples
 
-from pipeline.run.recording import Alignment
+from pipeline.run import Alignment
 from pipeline.sources import find_preset
 from pipeline.stages.checks import check_delays, check_motion, check_scale
 from pipeline.stages.clocks import Recorded, align_clocks

@@ -13,8 +13,7 @@ from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core.arrays import usual_hold
 from pipeline.simulate import VEHICLES, Program, Recording
-from pipeline.sources import Vehicle, find_preset
-from pipeline.sources.loading import convert
+from pipeline.sources import Vehicle, convert, find_preset
 from pipeline.stages import StageError
 from pipeline.stages.slip_stage import compute_slip, cut_windows, hold_commands, interpolate_wheels
 

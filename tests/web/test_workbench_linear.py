@@ -9,11 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from pipeline import sources
 from pipeline.core import SlipError
 from pipeline.logs import columns, index, schema
 from pipeline.logs import schema as idl
 from pipeline.models.parameter import parse_unit
-from pipeline.sources import Signal, candidates, loading, read_description
+from pipeline.sources import Signal, candidates, read_description
 from pipeline.stages import drive, pose_choice
 from pipeline.web.session import make_formula
 from pipeline.web.stored_runs import clean_name
@@ -34,8 +35,8 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "file name": ("_", lambda text: index._split_number(Path(text))),
     "indexed field": ("[", columns._INDEXED.match),
     "unit": ("m", lambda text: parse_unit(text, "")),
-    "configuration": ("[", loading._read_header),
-    "complaint": ("at `$", lambda text: loading._find(loading._PLACE, text)),
+    "configuration": ("[", sources._read_header),
+    "complaint": ("at `$", lambda text: sources._find(sources._PLACE, text)),
     "topic": ("/", candidates.LOCALIZED.search),
     "pose frame": ("/", pose_choice._FIXED_FRAME.search),
     "field path": ("[1].", lambda text: Signal.parse(f"/topic.{text}").fields()),

@@ -101,7 +101,7 @@ class ContactFriction(BodyEffect):
         "Contact friction: coefficient {friction:.2g}, time constant {tau:.2g} s, "
         "track {k:.3g} times as wide, gyration {gyration:.2g}"
     )
-    clause = "slides on a friction coefficient of {friction:.2g}"
+    clause = "skids with a friction coefficient of {friction:.2g}"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
     contains = ("effective_track", "body_inertia")

@@ -9,9 +9,8 @@ import polars as pl
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.describe import format_rises
-from pipeline.estimation.error_regions import format_angle, format_length
-from pipeline.estimation.learning import INTERVAL_SHARE, find_goal
+from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal, format_angle, format_length
+from pipeline.estimation.ladder import format_rises
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
 from pipeline.report.figures import Drawing, Figure, Section
 from pipeline.report.scene import (
