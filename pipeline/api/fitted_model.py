@@ -233,7 +233,7 @@ class Fit:
     """A model fitted to runs.
 
     Attributes:
-        model: with the values found.
+        model: with the fitted values.
         errors: held-out errors of all effects together: ``t_mrmse_m`` and ``r_mrmse_rad`` over 2 s, ...
         ladder: those after each effect that helps: ``added t_mrmse_m r_mrmse_rad explained_share``.
     """

@@ -112,7 +112,7 @@ def print_result(
     json: bool,
     quiet: bool = False,
 ) -> int:
-    """Print what a verb found, as one JSON object or as lines for people; the exit code of success."""
+    """Print the result of a verb, as one JSON object or as lines for people; the exit code of success."""
     if json:
         print_json(content)
     elif not quiet:
@@ -188,7 +188,7 @@ def limited_memory(
     Args:
         size: memory limit, for example ``2GB``; None for a share of the machine's.
         name_log: which file is being worked on.
-        conclude: prints what was found before, where JSON was asked for.
+        conclude: prints the results so far, where JSON was asked for.
         hint: what to do then.
 
     Raises:

@@ -187,7 +187,7 @@ def gather_runs(
         vehicle: of the model; None for that of the first run.
         owner: geometry to use where the run's is another one.
         out: results folder.
-        quiet: tell nothing on stderr.
+        quiet: print nothing on stderr.
 
     Returns:
         The vehicle that counts, and the runs.

@@ -309,7 +309,7 @@ _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
 
 @dataclass(frozen=True)
 class Check:
-    """What one look found.
+    """Result of one check.
 
     Attributes:
         name: what was looked at.

@@ -259,7 +259,7 @@ class Budget:
 
     Attributes:
         seconds: of CPU time of this process and of what works beside it.
-        notify: told what was found so far.
+        notify: called with the effects identified so far.
         was_cut: whether a search was ended by it.
     """
 
@@ -279,7 +279,7 @@ class Budget:
         return self.was_cut
 
     def report(self, title: str, effects: Iterable[str]) -> None:
-        """Report the effects found on a part of the way."""
+        """Report the effects identified on a part of the path."""
         if self.notify is not None:
             self.notify(f"{title}: {', '.join(effects) or 'none yet'} ({self.spent_s:.0f} s)")
 

@@ -160,7 +160,7 @@ def explain_refusals(
 ) -> dict[str, str]:
     """Reasons why the additional effects of a larger model do not help, by id; empty where they help.
 
-    The first kind of reason found is reported: impossible or degenerate values, the errors of all additional
+    The first kind of reason is reported: impossible or degenerate values, the errors of all additional
     effects together, an interval that includes the neutral value.
 
     Args:

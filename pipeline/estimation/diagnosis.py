@@ -243,7 +243,7 @@ class Unexplained:
         formula: a formula effect as text of a model file; None where none was found.
         partial: signal that the structure depends on most: name, and mean error by value; empty where it
             depends on no recorded signal.
-        path: on which it was found.
+        path: of the search that identified it.
     """
 
     share: float

@@ -93,7 +93,7 @@ class Context:
         return 0.6 * max(run.wheel_period_s for run in self.runs)
 
     def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
-        """Effects that can be told on an input of this vehicle."""
+        """Effects that can be identified from an input of this vehicle."""
         hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
         return tuple(
             cast("Candidate", effect)
@@ -140,7 +140,7 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
 
 
 PRICE = 0.5 * LEAST_T**2
-"""Chi-square that a number must be worth to compete with a model that has one less: half of what is asked."""
+"""Chi-square of a parameter required to compete with a model that has one less: half of what is asked."""
 _BATCH = 4
 """Extensions that are fitted at once; more only where less than these may be named."""
 _COMPARABLE = 0.5
@@ -212,7 +212,7 @@ class Rivals:
 
 @dataclass
 class Selection:
-    """The competition on one part of the way.
+    """Selection among models of one part of the path.
 
     Attributes:
         part: what is explained.
@@ -407,7 +407,7 @@ class Selection:
     def _keep(
         self, model: CandidateModel, base: CandidateModel, models: dict[tuple[str, ...], CandidateModel]
     ) -> bool:
-        """Put a model among those found, the better one of the same effects; whether it is one to name."""
+        """Add a model, of several with the same effects the better one; whether it may be named."""
         if set(model.ids) <= set(base.ids) or not self.is_sound(model):
             return False
         rival = models.get(model.ids)
@@ -416,7 +416,7 @@ class Selection:
         return True
 
     def _simplify(self, model: CandidateModel, base: CandidateModel) -> CandidateModel:
-        """An extension without what a new effect has taken the place of, or with what is left of it.
+        """An extension without effects that a new one makes superfluous, or with their simpler forms.
 
         Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
         at nothing, and the model with both says less than the one without it. Where nothing new would be left
@@ -461,7 +461,7 @@ def _surplus(hypothesis: Hypothesis) -> float:
 def open_selection(
     part: Part, start: State, candidates: tuple[Candidate, ...], conditions: Conditions, budget: Budget
 ) -> tuple[Selection, CandidateModel]:
-    """The selection of a part of the way, and the model to start from, fitted."""
+    """The selection of a part of the path, and the model to start from, fitted."""
     weights = make_weights(part.find_residuals(start), part)
     # What acts from a moment on is the best of as many moments as the recording has stretches.
     moments = len(set(part.unit.tolist()))

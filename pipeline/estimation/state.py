@@ -121,7 +121,7 @@ class Free:
         bounds: smallest and largest value.
         step: for numerical derivatives.
         unit: SI, `1` for a plain number.
-        search: how it is found.
+        search: how it is estimated.
     """
 
     effect: str
@@ -153,7 +153,7 @@ class State:
     """A model with its values, run by run.
 
     Attributes:
-        effects: with the values that runs share, in the order of a command's way.
+        effects: with the values that runs share, in the order of the command path.
         timing: delays of each run.
         own: values that belong to one run: by run number, then ``(effect, name)``.
     """

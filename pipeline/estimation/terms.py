@@ -258,7 +258,7 @@ _FIXED: Mapping[str, Parameter] = {
     "u": Parameter("u", "m/s", (0.01, 1.0), 0.1, "speed below which it fades", 0.1),
     "s": Parameter("s", "rad/s", (0.05, 3.0), 0.5, "yaw rate at which it saturates", 0.5),
 }
-"""Shapes that are found by trial, with their bounds."""
+"""Shapes that are searched by trial, with their bounds."""
 # What the catalogue says already, by channel and shape: not unexplained.
 _KNOWN = frozenset(
     {

@@ -45,7 +45,7 @@ _MOST_TERMS = 3
 _BETTER = 0.04
 """Share of the loss by which a formula must be better than an effect whose place it takes."""
 _EXPLAINABLE = 0.1
-"""Share of a channel that trees must predict of unseen stretches to be told."""
+"""Share of a channel that trees must predict of unseen stretches to be reported."""
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
 """Moments before now [s] whose inputs trees may use."""
 # What drives remember of their commands: changes within a moment, hard ones, reversals; and how long.
@@ -53,7 +53,7 @@ _MOMENT_S = 0.5
 _HARD = 0.25
 """Share of the largest change from which on a change of command is hard."""
 _LONGEST_S = 10.0
-"""Longest time since an event that is told apart [s]."""
+"""Longest time since an event that is distinguished [s]."""
 LEAST_OF_DRIVE = 0.03
 """Of the motion that was asked for: stamps and steps of encoders come to 0.013 on logs that lack nothing."""
 _FOLDS = 4
@@ -306,11 +306,11 @@ def find_places(comparison: Comparison) -> Floats:
 _BINS = 8
 """Bins of a dependence that is put in words."""
 _PART = 0.3
-"""Share of the largest channel from which on another is told, too."""
+"""Share of the largest channel from which on another is reported, too."""
 # What lasts is structure where it is much of the residual, and of the motion that was asked for.
 _LEAST_SHARE = 0.5
 _LEAST_OF_MOTION = 0.05
-"""Share of the motion below which structure is not told."""
+"""Share of the motion below which structure is not reported."""
 _LEAST_REPEAT = 0.28
 """Correlation of a residual with itself a window later from which on it lasts."""
 _FEWEST_WINDOWS = 200

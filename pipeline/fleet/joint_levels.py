@@ -144,7 +144,7 @@ def draw_joint_run(
 
 
 def find_odd(values: Floats, errors: Floats, groups: Sequence[str], known: Flags) -> list[int]:
-    """Indices of the runs that are outliers of their group, found one after the other."""
+    """Indices of the runs that are outliers of their group, identified one after the other."""
     remaining = np.flatnonzero(known).tolist()
     odd: list[int] = []
     while remaining:

@@ -343,7 +343,7 @@ def list_cases() -> tuple[Case, ...]:
 
 
 def list_effects() -> tuple[EffectSpec, ...]:
-    """Every effect that can be asked for, in the order of a command's way."""
+    """Every effect that can be asked for, in the order of the command path."""
     return tuple(CATALOGUE.values())
 
 
