@@ -150,7 +150,7 @@ _BETTER = 0.005
 place, see `Selection.sum_losses`."""
 USEFUL = 1.1
 """Loss of a rival over that of the model above which it is not fitted to the end: exchanges that are accepted
-on the recordings have 0.9 at most, and with 1.3 a search takes a third more predictions."""
+on the recordings have 0.9 at most."""
 _PAIRS = 2
 """Pairs that are fitted: the most promising ones."""
 
@@ -260,6 +260,8 @@ class Selection:
     ) -> list[CandidateModel]:
         """Fit states that differ little from a model, and only the useful ones to the end.
 
+        A new parameter that needs a grid, which a rough fit does not search, is always fitted to the end.
+
         Args:
             base: the model, whose derivatives are used for the first steps.
             states: it with other effects or values.
@@ -267,7 +269,12 @@ class Selection:
         """
         tried = map_parallel(partial(try_part, self.part, self.weights, base=base.fit), states)
         models = [CandidateModel(self.part, fit, self.folds, is_rough=True) for fit in tried]
-        near = [index for index, fit in enumerate(tried) if fit.loss <= useful]
+        grids = len(base.fit.free) - len(base.fit.smooth)
+        near = [
+            index
+            for index, fit in enumerate(tried)
+            if fit.loss <= useful or len(fit.free) - len(fit.smooth) > grids
+        ]
         fitted = self.enter_each([tried[index].state for index in near], useful)
         for index, model in zip(near, fitted, strict=True):
             models[index] = model

@@ -12,7 +12,7 @@ from pipeline.estimation import Input, Problem, ambiguity, fit_model, load_recor
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
-from pipeline.estimation.selection import CandidateModel, Selection, open_selection, prepare
+from pipeline.estimation.selection import USEFUL, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -31,6 +31,7 @@ from pipeline.simulate import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pipeline.estimation.fit import PartFit
     from pipeline.estimation.state import State
     from pipeline.models import Effect
     from pipeline.run import MotionRun
@@ -246,6 +247,74 @@ def test_an_extension_of_which_nothing_new_is_left_is_not_fitted_again(
     monkeypatch.setattr(selection, "enter", refitted.append)
     assert selection.fit_hypotheses(ideal, evidence) == []
     assert refitted == []
+
+
+def test_rivals_far_from_a_model_are_fitted_roughly_and_near_ones_to_the_end(tmp_path: Path) -> None:
+    """A shifted centre of rotation does not stand for the track, and is no more than nothing beside it."""
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    track, centre = _give("effective_track", 1.6), _give("icr_offset", 0.1)
+    found = selection.enter(ideal.state.add(track))
+    states = [ideal.state.add(centre), ideal.state.add(_give("effective_track", 1.4), centre)]
+    predictions, find_residuals = list[object](), selection.part.find_residuals
+
+    def count(state: State) -> object:
+        predictions.append(state)
+        return find_residuals(state)
+
+    selection.part.find_residuals = count  # type: ignore[method-assign,assignment]
+    far, near = selection.approach_each(found, states, 1.1 * selection.loss(found))
+    approached = len(predictions)
+    assert (far.is_rough, near.is_rough) == (True, False)
+    assert selection.loss(far) > 1.1 * selection.loss(found)
+    assert selection.loss(near) < 1.01 * selection.loss(found)
+    values = [model.state.find("effective_track").values["k"] for model in (near, found)]  # type: ignore[union-attr]
+    assert values == pytest.approx([1.6, 1.6], rel=0.02)
+    selection.approach_each(found, states, 0.0)
+    assert len(predictions) - approached < approached
+
+
+def test_rivals_are_fitted_once_for_a_model_and_again_under_new_weights_where_they_come_near(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    found = selection.reweight(selection.enter(ideal.state.add(_give("effective_track", 1.6))))
+    rivals = list_rivals(selection, found, ("effective_track",))
+    assert rivals
+    assert list_rivals(selection, found, ("effective_track",)) is rivals
+    asked = list[object]()
+    enter_each = selection.enter_each
+
+    def note(starts: list[PartFit], *given: float) -> list[CandidateModel]:
+        asked.extend(starts)
+        return enter_each(starts, *given)
+
+    found = selection.reweight(found)
+    near = [one for one in rivals if selection.loss(one) < USEFUL * selection.loss(found)]
+    monkeypatch.setattr(selection, "enter_each", note)
+    again = list_rivals(selection, found, ("effective_track",))
+    assert {one.ids for one in again} == {one.ids for one in rivals}
+    assert len(asked) == len(near)
+    assert all(one is other.fit for one, other in zip(asked, near, strict=True))
+
+
+def test_an_effect_with_clear_evidence_is_kept_without_a_fit_of_the_model_without_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    clear = selection.enter(ideal.state.add(_give("effective_track", 1.6)))
+    dropped = list[object]()
+    drop_each = selection.drop_each
+
+    def note(current: CandidateModel, groups: list[list[str]]) -> list[CandidateModel]:
+        dropped.extend(groups)
+        return drop_each(current, groups)
+
+    monkeypatch.setattr(selection, "drop_each", note)
+    assert prune(selection, clear) is clear
+    assert dropped == []
+    useless = selection.enter(clear.state.add(_give("icr_offset", 0.01)))
+    assert prune(selection, useless).ids == ("effective_track",)
+    assert dropped == [["icr_offset"]]
 
 
 def test_a_restart_that_promises_no_better_model_ends_early(
