@@ -61,9 +61,7 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
         by_name: dict[str, CandidateModel] = {}
         for candidate in list_rivals(selection, final, (effect.id,)):
             new = [name for name in candidate.ids if name not in final.ids]
-            if len(new) != 1:
-                continue
-            if not _is_as_good(selection, final, candidate):
+            if len(new) != 1 or not _is_as_good(selection, final, candidate):
                 continue
             rival = selection.enter(candidate.state) if candidate.is_rough else candidate
             if _does_the_same(selection, without, final, rival):

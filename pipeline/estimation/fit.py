@@ -86,6 +86,11 @@ class PartFit:
         """Indices of the free parameters that derivatives can optimize."""
         return [index for index, number in enumerate(self.free) if number.is_smooth]
 
+    @property
+    def without_derivatives(self) -> PartFit:
+        """The fit in the memory of its residuals; a fit that starts from it computes its own derivatives."""
+        return replace(self, jacobian=make_columns(0, len(self.free)), is_fresh=False)
+
 
 @dataclass(frozen=True)
 class Fitted:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -323,7 +323,9 @@ def _fit_rivals(
     least = _RIVALS * max(own, default=math.inf)
     # A rival must also reduce the loss by the minimum for naming.
     useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
-    return selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
+    models = selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
+    # A search keeps hundreds of rough fits, and a fit that goes on from one begins with its own derivatives.
+    return [replace(one, fit=one.fit.without_derivatives) if one.is_rough else one for one in models]
 
 
 def _refit_rivals(
