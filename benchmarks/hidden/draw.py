@@ -59,7 +59,7 @@ DIFFERENTIAL = (
 CAR = ("steering_offset", "steering_gain", "steering_lag", "understeer")
 MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
-    "turn_servo", "speed_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
+    "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""

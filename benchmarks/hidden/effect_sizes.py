@@ -14,7 +14,8 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
     size = share * float(draw.uniform(0.8, 1.2))
     speed = vehicle.max_speed_mps * scenario.program.speed_scale
     turn = vehicle.max_turn_radps * scenario.program.turn_scale
-    wheel = (speed + 0.5 * vehicle.track_width_m * turn) / vehicle.wheel_radius_m
+    rim = speed + 0.5 * vehicle.track_width_m * turn
+    wheel = rim / vehicle.wheel_radius_m
     small = min(speed, 1.0)
     sizes: dict[str, dict[str, float]] = {
         "wheel_radius": {"k": 1.0 + sign * 0.09 * size},
@@ -58,14 +59,14 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "understeer": {"K": 0.035 * size},
         "steering_play": {"g": 0.05 * size},
         "reversal_pause": {"d": 0.4 * size},
-        "turn_servo": {
-            "tau": 0.6 * size,
-            "reset": 0.3,
-            "scrub": 0.4 * size * turn,
-            "windup": 0.3 * size * turn,
-            "effort": 1.5 * turn,
+        "wheel_servo": {
+            "tau": 0.2 * size,
+            "reset": 0.4,
+            "drag": 0.05 * size * speed,
+            "bound": 0.4 * rim / size,
+            "scrub": 0.4 * size * rim,
+            "creep": 0.07,
         },
-        "speed_servo": {"tau": 0.4 * size, "drag": 0.06 * size, "effort": 1.2 * speed / size},
         "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
         "body_acceleration_limit": {"limit": speed / (2.0 * size)},
         "turn_acceleration_limit": {"limit": turn / (2.0 * size)},

@@ -21,7 +21,7 @@ _CONTACT = frozenset(
     {
         "effective_track", "icr_offset", "lateral_skid", "body_inertia", "turning_resistance", "speed_slip",
         "wheel_radius", "drive_lag", "turn_lag", "acceleration_limit", "difference_gain", "turn_droop",
-        "turn_servo", "speed_track", "contact_friction",
+        "wheel_servo", "speed_track", "contact_friction",
     }
 )  # fmt: skip
 _BUILT_IN = {"payload": {"icr_lateral"}, "small_wheels": {"wheel_asymmetry", "icr_lateral"}}

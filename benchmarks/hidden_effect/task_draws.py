@@ -58,10 +58,10 @@ _PROGRAMS = {
 }
 _CAUSES = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 # What a cause in contact looks like besides, and physics that no name fits: neither counts for or against.
-# The last three: a velocity servo of finite stiffness gives way to the friction of scrubbing wheels.
+# The last two: a velocity servo of finite stiffness gives way to the friction of scrubbing wheels.
 _BY_CONTACT = (
     "slip_in_turns", "slip_with_speed", "outward_skid", "turn_gain_with_speed", "body_inertia", "turn_lag",
-    "wheel_radius_scale", "turn_control_loop", "speed_control_loop", "turn_droop",
+    "wheel_radius_scale", "wheel_control_loop", "turn_droop",
 )  # fmt: skip
 _COMMANDS = {"ackermann": ("ackermann", "/ackermann_cmd")}
 _SLOW_MOTORS_S = 0.5

@@ -88,13 +88,17 @@ def forecast_deployment(
     shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in problem.runs])
     fits: list[tuple[Part, PartFit]] = []
     also: list[str] = []
+    timing = problem.start_state().timing
     for part in problem.parts:
         mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
-        state = problem.start_state(problem.active_effects(Model(geometry, tuple(mine))))
+        active = problem.active_effects(Model(geometry, tuple(mine)))
+        # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
+        state = replace(problem.start_state(active), timing=timing)
         fit = fit_part_jointly(part, state, shares)
         if isinstance(part, WheelPart):
             fit = _add_held(part, fit, held, shares)
             also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
+        timing = fit.state.timing
         fits.append((part, fit))
     if also:
         start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)

@@ -1,7 +1,6 @@
 """Filters on a grid: lags, limits and loops; linear ones are exact for inputs constant in a cell."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
@@ -11,28 +10,6 @@ from pipeline.run.signals import Floats, Resets, Signal
 _INSTANT_S = 1e-9  # time constant below which there is no lag: avoids a division by nearly zero
 _TINY = 1e-290
 """Values below it are set to zero: denormal numbers are slow."""
-_NO_COMMAND = 1e-6
-"""Command [m/s or rad/s] that counts as none: above the rounding of sums, and passed within a cell."""
-
-
-class ServoNumbers(NamedTuple):
-    """Parameters of a speed loop, see `follow_servo`; with neutral values it follows at once.
-
-    Attributes:
-        tau: one over the proportional gain [s].
-        reset: integral over proportional gain [1/s].
-        scrub: friction over proportional gain, in the signal's unit.
-        drag: resistance proportional to the signal, over the proportional gain.
-        effort: largest acceleration of the drive [unit/s].
-        windup: largest integral part over proportional gain, in the signal's unit.
-    """
-
-    tau: float
-    reset: float = 0.0
-    scrub: float = 0.0
-    drag: float = 0.0
-    effort: float = math.inf
-    windup: float = math.inf
 
 
 def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start: Signal) -> Signal:
@@ -196,112 +173,6 @@ def _lag_unevenly(
         else:
             lagged[cell] = asked + gap * share_up
             state = asked + gap * keep_up
-
-
-def follow_servo(
-    signal: Floats,
-    numbers: ServoNumbers,
-    across: Floats,
-    step_s: float,
-    resets: Resets,
-    start: Floats,
-    idle: Floats | None = None,
-) -> Floats:
-    """Response of a speed loop with an integral part and bounded effort to its command against friction.
-
-    tau dy/dt = pull - resistance - drag y,  pull = clip(u - y + z, tau effort),  dz/dt = reset (u - y)
-    while the pull is within its bound, abs(z) <= windup, z = 0 while there is no command,
-    resistance = scrub sign(y) abs(y) / (abs(y) + across); at rest the signal stays there until the pull is
-    larger than the resistance. The integral part z is zero at the start of the run and continues through
-    resets, as it is not measured. A cell in which the pull leaves its bound, the signal changes its sign or a
-    command ends is integrated in parts, so that the output is continuous in every parameter.
-
-    Args:
-        signal: cell means of the command u, shape (n,).
-        numbers: of the loop.
-        across: other motion, in the signal's unit, which lowers the resistance, shape (n,).
-        step_s: width of a cell [s].
-        resets: where the signal is reset.
-        start: the signal there; the command's own value where it is NaN, shape (k,).
-        idle: share of each cell without a command, shape (n,); None for the cells where the command is zero.
-
-    Returns:
-        Cell means of the signal, shape (n,).
-    """
-    states = _set_states(signal, resets, start)
-    served = np.empty(signal.size)
-    if idle is None:
-        idle = (np.abs(signal) < _NO_COMMAND).astype(np.float64)
-    _serve(np.ascontiguousarray(signal), states, across, idle, np.array(numbers), step_s, served)
-    return served
-
-
-@compiled("float64[:], float64[:], float64[:], float64[:], float64[:], float64, float64[:]")
-def _serve(
-    signal: Floats,
-    states: Floats,
-    across: Floats,
-    idle: Floats,
-    numbers: Floats,
-    step_s: float,
-    served: Floats,
-) -> None:
-    """See `follow_servo`; ``states`` as in `_lag`. Forces are in the signal's unit, divided by the gain."""
-    tau, reset, scrub, drag = max(numbers[0], _INSTANT_S), numbers[1], numbers[2], numbers[3]
-    bound, rate = numbers[4] * tau, (1.0 + drag) / tau
-    keep = math.exp(-rate * step_s)
-    share = (1.0 - keep) / (rate * step_s)
-    reached, pushed, windup = 1.0 / (1.0 + drag), step_s / tau, numbers[5]
-    state, integral = signal[0], 0.0
-    for cell in range(signal.size):
-        if not math.isnan(states[cell]):
-            state = states[cell]
-        asked, against = signal[cell], 0.0
-        driven, known = 1.0 - idle[cell], integral
-        integral = driven * known
-        wanted = asked - state + integral
-        pull = min(max(wanted, -bound), bound)
-        if scrub > 0.0:
-            size = abs(state)
-            against = scrub * (size / (size + (across[cell] + _TINY)))
-            if size <= abs(pull) * pushed:
-                # At rest or nearly so, the friction follows from the motion of this cell.
-                # In a branch of its own, so that the division above does not wait for the pull.
-                moving = abs(pull) * pushed + _TINY
-                against = scrub * (moving / (moving + across[cell]))
-                if size == 0.0:
-                    against = min(against, abs(pull))
-            against = math.copysign(against, state if size > 0.0 else pull)
-        goal, free = (asked + integral - against) * reached, step_s
-        if pull == wanted:
-            mean, end = goal * (1.0 - share) + state * share, goal * (1.0 - keep) + state * keep
-        else:
-            free, pace = 0.0, (pull - against - drag * state) / (tau + 0.5 * drag * step_s)
-            end = state + pace * step_s
-            mean = 0.5 * (state + end)
-            release = asked + integral - pull
-            if (release - state) * pace > 0.0 and (release - end) * pace < 0.0:
-                # For the rest of the cell the effort is not bounded.
-                free = step_s - (release - state) / pace
-                faded = 1.0 - math.exp(-rate * free)
-                mean = 0.5 * (state + release) * (step_s - free) + goal * free
-                mean = (mean + (release - goal) * faded / rate) / step_s
-                end = release + (goal - release) * faded
-        if scrub > 0.0 and state * end < 0.0:
-            # For the rest of the cell pull and friction are reversed, or friction holds it at rest.
-            before = state / (state - end)
-            rest = (1.0 - before) * step_s
-            pull = min(max(asked + integral, -bound), bound)
-            moving = abs(pull) * pushed + _TINY
-            push = abs(pull) - scrub * (moving / (moving + across[cell]))
-            end = math.copysign(max(push, 0.0) * rest / (tau + 0.5 * (1.0 + drag) * rest), pull)
-            mean = 0.5 * (state * before + end * (1.0 - before))
-        if reset > 0.0:
-            # A cell with any time without a command clears the earlier integral part.
-            integral = known if driven == 1.0 else 0.0
-            integral = min(max(integral + reset * (asked - mean) * driven * free, -windup), windup)
-        served[cell] = mean
-        state = end if abs(end) > _TINY else 0.0
 
 
 def wait_at_reversal(signal: Floats, wait_s: float, step_s: float, resets: Resets) -> Floats:

@@ -10,6 +10,7 @@ from typing import TypeVar, cast
 
 import numpy as np
 
+from pipeline.core.arrays import Floats
 from pipeline.models.effect import (
     AddedEffect,
     BodyEffect,
@@ -22,7 +23,7 @@ from pipeline.models.effect import (
 )
 from pipeline.run import MotionError
 from pipeline.run.heading import Grid, HeldDrive, MeasuredDrive
-from pipeline.run.signals import DriveSeries, Rolling, RunContext, Velocity, Wheels, roll_ideally
+from pipeline.run.signals import DriveSeries, Resets, Rolling, RunContext, Velocity, Wheels, roll_ideally
 from pipeline.sources import Vehicle
 
 
@@ -198,14 +199,18 @@ class Forward:
         if self._encoders is None:
             return self.context
         if delay_s not in self._known:
-            resets = self.context.wheels
-            at = self.context.times[resets.first] - 0.5 * self.context.step_s
-            seen = self._encoders.interpolate(at, delay_s)
-            resets = replace(resets, start=seen.stack())
-            self._known[delay_s] = replace(self.context, wheels=resets)
+            wheels, spans = (
+                replace(resets, start=self._encoders.interpolate(self._locate(resets), delay_s).stack())
+                for resets in (self.context.wheels, self.context.spans)
+            )
+            self._known[delay_s] = replace(self.context, wheels=wheels, spans=spans)
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
         return self._known[delay_s]
+
+    def _locate(self, resets: Resets) -> Floats:
+        """Times at which states are reset [s], shape (k,)."""
+        return self.context.times[resets.first] - 0.5 * self.context.step_s
 
     def _keep(self, stage: Place, key: object, make: Callable[[], Result]) -> Result:
         cache = self._cache[stage]
@@ -230,10 +235,17 @@ class Forward:
     def _drive(
         self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext
     ) -> tuple[Wheels, tuple[object, ...]]:
-        """Wheel speeds after the drivetrain, and their key; cached per effect, as the next may vary alone."""
-        for effect in effects:
-            key = (*key, effect.key)
-            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, context)
+        """Wheel speeds after the drivetrain, and their key; cached per effect, as the next may vary alone.
+
+        Measured wheels are the state of the last effect with a state. Those before it continue theirs.
+        """
+        last = max((index for index, effect in enumerate(effects) if effect.python_state), default=-1)
+        before = replace(context, wheels=context.spans)
+        for index, effect in enumerate(effects):
+            key = (*key, effect.key, index < last)
+            drive = partial(
+                cast("DriveEffect", effect).drive_wheels, wheels, before if index < last else context
+            )
             wheels = self._keep(Place.DRIVE, key, drive)
         return wheels, key
 

@@ -14,7 +14,7 @@ from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged
 SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; no window fits into a shorter span or bridges a longer gap
-_ALIKE = 1e-6  # [rad/s] between sides with equal commands: above the rounding of sums
+_STILL = 1e-6  # [rad/s] commanded at rest: above the rounding of sums
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags start at the wheel speeds
 
 
@@ -204,7 +204,7 @@ class HeldDrive:
             average(commands.right),
             average(commands.steering) if steers else np.zeros(self._grid.times.size),
             None if commands.sideways is None else average(commands.sideways),
-            average((np.abs(commands.right - commands.left) < _ALIKE).astype(np.float64)),
+            average((np.maximum(np.abs(commands.left), np.abs(commands.right)) < _STILL).astype(np.float64)),
         )
 
 

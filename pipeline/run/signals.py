@@ -74,15 +74,15 @@ class Wheels:
         steering: steering angle [rad], shape (n,).
         sideways: speed of the wheels that moves the vehicle to the left [rad/s], shape (n,); None on one that
             cannot move sideways.
-        straight: share of each cell in which the commands of the sides are equal, shape (n,); None if the
-            commands are not known by their stamps.
+        idle: share of each cell in which no motion is commanded, shape (n,); None if the commands
+            are not known by their stamps.
     """
 
     left: Floats
     right: Floats
     steering: Floats
     sideways: Floats | None = None
-    straight: Floats | None = None
+    idle: Floats | None = None
 
     def stack(self) -> Floats:
         """Columns left, right and sideways [rad/s], shape (n, 3)."""

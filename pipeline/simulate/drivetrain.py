@@ -153,7 +153,7 @@ def drive_wheels(
         axle = turn_wheel(on_left)
         return Drive(step_s, axle, axle, _steer(hold(turn), effects, step_s))
     left, right = map(turn_wheel, _slow_alike(np.array([on_left, on_right]), effects))
-    if effects.is_active("speed_servo") or effects.is_active("turn_servo"):
+    if effects.is_active("wheel_servo"):
         left, right = turn_by_motors(vehicle, left, right, effects, step_s)
     left, right = _couple_sides(left, right, effects, step_s)
     return Drive(step_s, left, right, np.zeros(cell_count))
@@ -314,79 +314,109 @@ def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
     return angle + effects.value("steering_offset", "o")
 
 
-# Motors under a speed controller: proportional and integral gain, bounded effort, friction of the ground.
+# Motors under speed controllers, one a side: proportional and integral gain, bounded force, and the ground.
 #
-# Integrated by Euler's method in steps much shorter than what the controller answers in.
+# The equations are stiff. A step takes the force of a contact over its slip as at its beginning, and all else
+# as at its end: four linear equations, of which those of the rims are eliminated.
 
-_RADIUS_FALL = 0.15
-"""Turning resistance falls to 1 / (1 + 0.15 R / b) at a radius R, with a track width b."""
-
-_STILL_RADPS = 1e-6
-"""Commanded yaw rate [rad/s] that is nothing but rounding."""
+_STEP_S = 5e-4
+"""Longest step of the integration [s]."""
+_SHORTEST_TAU_S = 0.01
+_ROTATING = 0.7
+"""Inertia of the rotating parts over that of the vehicle."""
+_ALL = 1.0 + _ROTATING
+_ASIDE = math.sqrt(0.75)
+"""How far ahead and behind contacts are, over half the track width."""
+_SIGN_MPS = 0.05
+"""Rolling resistance reaches its full size well above this speed."""
+_LEAST_SLIP = 0.01
+"""Slip over scrub well below which the force of a wheel at rest is in proportion to its slip."""
+_STILL_MPS = 1e-6
+"""Commanded speed of a rim that is nothing but rounding."""
 
 
 def turn_by_motors(
     vehicle: Vehicle, left: Floats, right: Floats, effects: Effects, step_s: float
 ) -> tuple[Floats, Floats]:
     """Wheel speeds (left, right) [rad/s] that motors reach of those asked for, each of shape (n,)."""
-    radius, width = vehicle.wheel_radius_m, 2.0 * vehicle.lever_m
-    speed, turn = 0.5 * radius * (left + right), radius * (right - left) / width
-    if effects.is_active("speed_servo"):
-        speed = _push(speed, effects, step_s)
-    if effects.is_active("turn_servo"):
-        turn = _twist(turn, np.abs(speed) / width, effects, step_s)
-    return (speed - 0.5 * width * turn) / radius, (speed + 0.5 * width * turn) / radius
+    count = max(1, math.ceil(step_s / _STEP_S - 1e-9))
+    motors = _Motors(effects, step_s / count)
+    radius, rows = vehicle.wheel_radius_m, []
+    for on_left, on_right in zip((radius * left).tolist(), (radius * right).tolist(), strict=True):
+        left_sum = right_sum = 0.0
+        for _ in range(count):
+            left_sum, right_sum = left_sum + 0.5 * motors.left, right_sum + 0.5 * motors.right
+            motors.step(on_left, on_right)
+            left_sum, right_sum = left_sum + 0.5 * motors.left, right_sum + 0.5 * motors.right
+        rows.append((left_sum, right_sum))
+    reached = np.array(rows).reshape(-1, 2) / (count * radius)
+    return reached[:, 0], reached[:, 1]
 
 
-def _push(asked: Floats, effects: Effects, step_s: float) -> Floats:
-    """Speed [m/s] of a vehicle that a controller without integral part pushes against a drag."""
-    short = step_s / _STEPS
-    gain = 1.0 / max(effects.value("speed_servo", "tau"), short)
-    drag = gain * effects.value("speed_servo", "drag")
-    most, now, out = effects.value("speed_servo", "effort"), 0.0, []
-    for goal in asked.tolist():
-        total = 0.0
-        for _ in range(_STEPS):
-            push = min(max(gain * (goal - now), -most), most)
-            now += short * (push - drag * now)
-            total += now
-        out.append(total / _STEPS)
-    return np.array(out)
+class _Motors:
+    """Motors of both sides, which start from rest, and the vehicle as their load.
 
-
-def _twist(asked: Floats, ahead: Floats, effects: Effects, step_s: float) -> Floats:
-    """Yaw rate of the wheels [rad/s] that a controller twists against the friction of a turn.
-
-    Without a command the controller forgets what it has integrated.
-
-    Args:
-        asked: yaw rate [rad/s], shape (n,).
-        ahead: speed over the track width [1/s], shape (n,).
-        effects: of which one is the controller.
-        step_s: cell width [s].
+    Attributes:
+        left, right: speeds of the rims [m/s].
     """
-    short = step_s / _STEPS
-    gain = 1.0 / max(effects.value("turn_servo", "tau"), short)
-    gain_i = gain * effects.value("turn_servo", "reset")
-    scrub, most = gain * effects.value("turn_servo", "scrub"), effects.value("turn_servo", "effort")
-    full = gain * effects.value("turn_servo", "windup")
-    now = memory = 0.0
-    out = []
-    for goal, speed in zip(asked.tolist(), ahead.tolist(), strict=True):
-        total, is_asked = 0.0, abs(goal) > _STILL_RADPS
-        memory = memory if is_asked else 0.0
-        for _ in range(_STEPS):
-            twist = gain * (goal - now) + memory
-            if is_asked and abs(twist) <= most:
-                memory = min(max(memory + short * gain_i * (goal - now), -full), full)
-            twist = min(max(twist, -most), most)
-            # On the spot all of the friction acts from the first motion on.
-            spot = abs(now) if now else 1e-9
-            friction = scrub / (1.0 + _RADIUS_FALL * speed / spot)
-            if now == 0.0 and abs(twist) <= friction:
-                continue
-            then = now + short * (twist - math.copysign(friction, now or twist))
-            now = 0.0 if then * now < 0.0 and abs(twist) <= friction else then
-            total += now
-        out.append(total / _STEPS)
-    return np.array(out)
+
+    def __init__(self, effects: Effects, step_s: float) -> None:
+        self.left = self.right = 0.0
+        # The vehicle's speed ahead, and that of a side of it around its middle [m/s]; integral parts [m/s].
+        self._ahead = self._around = 0.0
+        self._left_memory = self._right_memory = 0.0
+        self._step_s = step_s
+        self._load = max(effects.value("wheel_servo", "tau"), _SHORTEST_TAU_S) / step_s
+        self._reset, self._drag, self._bound, self._scrub, self._creep = (
+            effects.value("wheel_servo", name) for name in ("reset", "drag", "bound", "scrub", "creep")
+        )
+
+    def step(self, on_left: float, on_right: float) -> None:
+        """One step under the commanded speeds of the rims [m/s]."""
+        if max(abs(on_left), abs(on_right)) < _STILL_MPS:
+            self._left_memory = self._right_memory = 0.0
+            reset = 0.0
+        else:
+            reset = self._step_s * self._reset
+        ahead, around, load = self._ahead, self._around, self._load
+        left_resistance, left_pull, left_error = self._drive(self.left, on_left, self._left_memory)
+        right_resistance, right_pull, right_error = self._drive(self.right, on_right, self._right_memory)
+        left_grip = self._grip(self.left, self.left - ahead + around)
+        right_grip = self._grip(self.right, self.right - ahead - around)
+        left_all, right_all = left_resistance + 2.0 * left_grip, right_resistance + 2.0 * right_grip
+        # The force of the ground is a share of what the pull exceeds the resistance by at the ground's speed.
+        left_share, right_share = left_grip / left_all, right_grip / right_all
+        uneven = right_share * right_resistance - left_share * left_resistance
+        straight = load + left_share * left_resistance + right_share * right_resistance
+        turning = straight + _ASIDE**2 * (left_grip + right_grip)
+        thrust = load * ahead + right_share * right_pull + left_share * left_pull
+        moment = load * around + right_share * right_pull - left_share * left_pull
+        whole = straight * turning - uneven * uneven
+        self._ahead = ahead = (turning * thrust - uneven * moment) / whole
+        self._around = around = (straight * moment - uneven * thrust) / whole
+        self.left = (left_pull + 2.0 * left_grip * (ahead - around)) / left_all
+        self.right = (right_pull + 2.0 * right_grip * (ahead + around)) / right_all
+        self._left_memory += reset * left_error
+        self._right_memory += reset * right_error
+
+    def _drive(self, rim: float, asked: float, memory: float) -> tuple[float, float, float]:
+        """Resistance and pull of a side, and the error that its controller integrates [m/s].
+
+        At the end of the step, speed times resistance is the pull less twice the force of the ground.
+        """
+        inertia, error = _ROTATING * self._load, asked - rim
+        push = error + memory
+        # Half of what changes with the rim's speed is taken at the beginning of the step.
+        braking = 0.5 * _ALL * self._drag / math.hypot(rim, _SIGN_MPS)
+        resistance, pull = inertia + braking, (inertia - braking) * rim
+        if abs(push) < self._bound:
+            return resistance + 0.5 * _ALL, pull + _ALL * (push + 0.5 * rim), error
+        pull += _ALL * math.copysign(self._bound, push)
+        return resistance, pull, error if error * push < 0.0 else 0.0
+
+    def _grip(self, rim: float, slip: float) -> float:
+        """Force of the ground on a side over its slip."""
+        if self._scrub == 0.0:
+            return 0.0
+        sliding = math.hypot(slip, _ASIDE * self._around) / self._scrub
+        return 0.5 / math.hypot(self._creep * rim, sliding, _LEAST_SLIP)

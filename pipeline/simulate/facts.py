@@ -238,10 +238,10 @@ def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> d
 
 
 _NEVER_NEGATIVE = {
-    *("limit", "threshold", "effort", "windup", "reset", "scrub", "drag"),
+    *("limit", "threshold", "bound", "reset", "scrub", "drag", "creep"),
     *("friction", "gyration"),
 }
-_UNBOUNDED = {"limit", "effort", "friction"}
+_UNBOUNDED = {"limit", "bound", "friction"}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
 
 

@@ -206,7 +206,7 @@ def test_on_ice_structure_is_left_in_all_channels(asked: Asked, source: str) -> 
 def test_the_servo_of_the_warthog_explains_its_turning(asked: Asked) -> None:
     run = asked.diagnose("warthog_wheels_asphalt_2024_8_7_11h30s30", "command")
     named = {effect.id: effect for effect in run.effects}
-    assert 0.5 < named["turn_servo"].parameters["tau"].value < 1.5
+    assert 0.7 < named["wheel_servo"].parameters["scrub"].value < 1.6
     # Half-second means of the raw encoders under commands beyond it are 13.0 to 13.5 rad/s.
     assert 12.5 < named["wheel_speed_limit"].parameters["limit"].value < 13.5
     assert run.ladder[-1]["r_mrmse_rad"] < 0.12 * run.ladder[0]["r_mrmse_rad"]  # type: ignore[operator]

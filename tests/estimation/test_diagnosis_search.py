@@ -344,20 +344,20 @@ def test_a_restart_that_promises_no_better_model_ends_early(
 
 def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path: Path) -> None:
     """From no integral part none is found: its derivative with the integral gain is nothing."""
-    true = {"tau": 0.45, "reset": 0.3, "scrub": 1.1, "windup": 1.0, "effort": 4.0}
+    true = {"tau": 0.2, "reset": 0.3, "drag": 0.05, "bound": 1.1, "scrub": 1.2, "creep": 0.07}
     program = Program("smooth", speed_scale=0.3, turn_scale=0.4)
-    scenario = replace(_HUSKY, vehicle=VEHICLES["warthog"], effects={"turn_servo": true}, program=program)
+    scenario = replace(_HUSKY, vehicle=VEHICLES["warthog"], effects={"wheel_servo": true}, program=program)
     run, vehicle = _load(scenario, tmp_path / "warthog")
     context = prepare([run], vehicle, Input.COMMAND)
     part, begin = context.problem.parts[1], context.problem.start_state()
     selection, ideal = open_selection(part, begin, (), context.conditions, Budget())
-    servo = find_effect("turn_servo")(tau=1.0, reset=0.0, scrub=0.2, windup=0.0, effort=3.0)
+    servo = find_effect("wheel_servo")(tau=1.0, reset=0.0, drag=0.0, bound=1.5, scrub=0.1, creep=0.07)
     lag = selection.enter(ideal.state.add(servo))
     begun = restart(selection, lag)
     assert selection.loss(begun) < 0.5 * selection.loss(lag)
     (found,) = begun.state.effects
     assert found.values["reset"] == pytest.approx(0.3, rel=0.15)
-    assert found.values["scrub"] == pytest.approx(1.1, rel=0.15)
+    assert found.values["scrub"] == pytest.approx(1.2, rel=0.15)
 
 
 def test_a_model_that_follows_a_drive_better_and_predicts_worse_is_not_better(tmp_path: Path) -> None:

@@ -128,12 +128,12 @@ def test_clocks_of_several_runs_start_each_at_its_own(skidding: MotionRun) -> No
 
 
 def test_what_starts_as_a_whole_is_charged_for_all_of_its_numbers() -> None:
-    """A servo of five numbers has one column, as a lag of one: it pays for five."""
-    servo = find_effect("turn_servo")(tau=0.5, reset=0.1, scrub=0.5, windup=0.3, effort=2.0)
+    """A servo of six numbers has one column, as a lag of one: it pays for six."""
+    servo = find_effect("wheel_servo")(tau=0.2, reset=0.1, drag=0.05, bound=2.0, scrub=0.5, creep=0.07)
     lag = Start(find_effect("drive_lag")(tau=0.5), (), (7,))
-    assert Hypothesis((Start(servo, (), (3,)),), 1.0).numbers == 5
-    assert Hypothesis((Start(servo.fix("tau", "reset"), (), (3,)), lag), 1.0).numbers == 4
+    assert Hypothesis((Start(servo, (), (3,)),), 1.0).numbers == 6
+    assert Hypothesis((Start(servo.fix("tau", "reset"), (), (3,)), lag), 1.0).numbers == 5
     # A limit that is never reached is fitted to nothing, and clocks of three runs are three.
-    assert Hypothesis((Start(servo.change(effort=np.inf), (), (3,)),), 1.0).numbers == 4
+    assert Hypothesis((Start(servo.change(bound=np.inf), (), (3,)),), 1.0).numbers == 5
     clock = Start(find_effect("clock_offset")(d=0.1), (0.1, 0.2, 0.1), (4, 5, 6))
     assert Hypothesis((clock,), 1.0).numbers == 3

@@ -10,7 +10,8 @@ from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import restore_known
 from pipeline.sources import find_preset
 
-_UNITS = {"tau": "s", "reset": "1/s", "scrub": "rad/s", "windup": "rad/s", "effort": "rad/s^2", "drag": "1"}
+_UNITS = {"tau": "s", "reset": "1/s", "drag": "m/s", "bound": "m/s", "scrub": "m/s", "creep": "s/m"}
+_UNITS |= {"tau_mean": "s", "tau_diff": "s"}
 
 
 def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -> tuple[str, str]:
@@ -28,23 +29,21 @@ def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -
 
 def test_numbers_that_no_driving_determined_are_not_told() -> None:
     """The gentle run on grass said `limit 5 rad/s^2`, the value that the search starts from."""
-    numbers = {"tau": 0.44, "reset": 0.338, "scrub": 1.05, "windup": 1.1, "effort": 5.0}
-    motion, clause = put_in_words("turn_servo", numbers, ("tau", "reset", "scrub"))
-    assert motion == "Turn servo: lag 0.44 s, friction 1.1 rad/s"
-    assert clause == "answers turns 0.44 s late against friction"
-    motion, _ = put_in_words("speed_servo", {"tau": 0.31, "drag": 0.04, "effort": 5.0}, ("tau", "drag"))
-    assert motion == "Speed servo: lag 0.31 s, drag 0.04"
+    numbers = {"tau": 0.17, "reset": 0.338, "drag": 0.08, "bound": 1.3, "scrub": 1.05, "creep": 0.07}
+    motion, clause = put_in_words("wheel_servo", numbers, ("tau", "reset", "scrub"))
+    assert motion == "Wheel servo: lag 0.17 s, reset 0.34/s, scrub 1.1 m/s"
+    assert clause == "answers commands against a friction of 1.1 m/s"
 
 
 def test_what_is_determined_is_told_as_before() -> None:
-    numbers = {"tau": 0.31, "drag": 0.04, "effort": 4.0}
-    motion, _ = put_in_words("speed_servo", numbers, tuple(numbers))
-    assert motion == "Speed servo: lag 0.31 s, limit 4 m/s^2, drag 0.04"
+    numbers = {"tau_mean": 0.31, "tau_diff": 1.2}
+    motion, _ = put_in_words("turn_lag", numbers, tuple(numbers))
+    assert motion == "Turning lag: time constant 1.20 s for turning, 0.31 s for speed"
 
 
 def test_without_any_number_the_name_remains() -> None:
-    numbers = {"tau": 0.31, "drag": 0.04, "effort": 4.0}
-    assert put_in_words("speed_servo", numbers, ()) == ("Speed servo", "shows speed servo")
+    numbers = {"tau": 0.17, "reset": 0.338, "drag": 0.08, "bound": 1.3, "scrub": 1.05, "creep": 0.07}
+    assert put_in_words("wheel_servo", numbers, ()) == ("Wheel servo", "shows wheel servo")
 
 
 @pytest.mark.parametrize("known", [(), ("tau",)])

@@ -108,23 +108,23 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
     numbers = {
         "tau": Value(0.681, 0.587, 0.775, "s"),
         "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
-        "effort": Value(3.03, 2.91, 3.15, "rad/s^2"),
+        "bound": Value(1.03, 0.91, 1.15, "m/s"),
     }
     named = Named(
-        "turn_servo", numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
-        motion="Turn servo: lag 0.68 s",
+        "wheel_servo", numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
+        motion="Wheel servo: lag 0.68 s",
     )  # fmt: skip
     ladder = (
         {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
-        {"effects": ["turn_servo"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
+        {"effects": ["wheel_servo"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
     )
     texts = [text for _, text in list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))]
-    at = texts.index("Turn servo: lag 0.68 s")
+    at = texts.index("Wheel servo: lag 0.68 s")
     assert [text.strip() for text in texts[at + 1 : at + 5]] == [
-        "turn_servo          60 -> 54 cm",
+        "wheel_servo         60 -> 54 cm",
         "tau = 0.681 s [0.587, 0.775]",
         "reset = 0 1/s (at its bound)",
-        "effort = 3.03 rad/s^2 [2.91, 3.15]",
+        "bound = 1.03 m/s [0.91, 1.15]",
     ]
 
 

@@ -231,7 +231,7 @@ def test_every_effect_reads_well_in_a_verdict(kind: type[Any]) -> None:
 
 
 def test_a_verdict_is_never_too_long() -> None:
-    long = ("steering_sensor_offset", "turning_resistance", "speed_servo", "side_lag", "icr_lateral")
+    long = ("steering_sensor_offset", "turning_resistance", "wheel_servo", "side_lag", "icr_lateral")
     effects = {
         name: {p.name: p.typical for p in find_effect(name).parameters if not p.instead_of} for name in long
     }

@@ -121,7 +121,7 @@ def test_of_two_runs_that_hold_different_effects_both_are_expected() -> None:
 def test_numbers_of_the_controller_are_the_vehicles_and_friction_is_the_grounds() -> None:
     servo = [
         draw(
-            dict.fromkeys(("asphalt", "gravel"), value), effect="turn_servo", parameter=name, input="command"
+            dict.fromkeys(("asphalt", "gravel"), value), effect="wheel_servo", parameter=name, input="command"
         )
         for name, value in (("tau", 0.7), ("scrub", 0.8))
     ]

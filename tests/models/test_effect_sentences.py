@@ -54,7 +54,7 @@ def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind
     assert sentence
     assert kind.id not in sentence
     assert "nan" not in sentence
-    # With the five quantities of a servo it still fits into one line of a report.
+    # With the six quantities of a servo it still fits into one line of a report.
     assert len(sentence) < 100
     for parameter in kind.parameters:
         if parameter.instead_of:
@@ -84,6 +84,8 @@ def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
     )
 
 
-def test_a_servo_without_an_integral_part_tells_none() -> None:
-    servo = find_effect("turn_servo")().change(tau=1.0, reset=0.02, scrub=0.2, windup=0.0, effort=3.0)
-    assert servo.describe_motion(HUSKY) == "Turn servo: lag 1.00 s, limit 3 rad/s^2, friction 0.2 rad/s"
+def test_a_servo_without_a_bound_tells_none() -> None:
+    servo = find_effect("wheel_servo")(tau=0.2, reset=0.3, drag=0.08, scrub=1.2, creep=0.07)
+    assert servo.describe_motion(HUSKY) == (
+        "Wheel servo: lag 0.20 s, reset 0.3/s, drag 0.08 m/s, scrub 1.2 m/s, creep 0.07 s/m"
+    )

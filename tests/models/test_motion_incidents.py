@@ -153,7 +153,7 @@ def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
         ),
         {"body_inertia": 0.6, "effective_track": 2.6},
         pytest.param(
-            {"turn_servo": {"tau": 0.6, "reset": 0.3, "scrub": 0.4, "windup": 0.3, "effort": 1.5}},
+            {"wheel_servo": {"tau": 0.3, "reset": 0.3, "bound": 0.6, "scrub": 0.4, "creep": 0.07}},
             marks=pytest.mark.long,
         ),
     ],

@@ -76,11 +76,11 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
     series = run.commands
     columns = [series.times, series.left, series.right, series.steering]
     rows = list(zip(*(column.tolist() for column in columns), strict=True))
-    # Its steps begin and end ramps a step late: at 400 Hz that is within the tolerance.
-    got = run_exported(model, rows, run.duration_s, step_s=0.0025)
+    # Its steps begin and end ramps a step late: at 800 Hz that is within the tolerance.
+    got = run_exported(model, rows, run.duration_s, step_s=0.00125)
     times = comparison.grid.times
     for column, channel, size in ((4, "x", 0.02), (5, "y", 0.02), (6, "w", 0.02)):
-        seen = np.interp(times, got[:, 0] - 0.00125, got[:, column])
+        seen = np.interp(times, got[:, 0] - 0.000625, got[:, column])
         typical = float(np.sqrt(np.mean(getattr(expected, channel) ** 2)))
         assert np.sqrt(np.mean((seen - getattr(expected, channel)) ** 2)) < size * max(typical, 0.1), channel
 

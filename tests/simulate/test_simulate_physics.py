@@ -205,39 +205,6 @@ def test_turn_lag_has_one_time_constant_for_the_mean_and_one_for_the_difference(
     np.testing.assert_allclose(right - left, W0 * 0.55 / 0.165 * (1 - np.exp(-time / 1.2)), atol=2e-5)
 
 
-def test_motors_without_bound_or_friction_lag_as_the_textbook_says() -> None:
-    given = {"speed_servo": {"tau": 0.3, "drag": 0.25}, "turn_servo": {"tau": 1.2}}
-    time, left, right = wheel_response(given, CIRCLE)
-    # Against a drag the loop is faster, and reaches less.
-    mean = V0 / 0.165 / 1.25 * (1 - np.exp(-1.25 * time / 0.3))
-    np.testing.assert_allclose((left + right) / 2, mean, atol=2e-3)
-    np.testing.assert_allclose(right - left, W0 * 0.55 / 0.165 * (1 - np.exp(-time / 1.2)), atol=2e-3)
-
-
-def test_motors_accelerate_no_faster_than_their_effort_allows() -> None:
-    given = {"speed_servo": {"tau": 0.01, "effort": 0.5}, "turn_servo": {"tau": 0.01, "effort": 0.2}}
-    time, left, right = wheel_response(given, CIRCLE)
-    np.testing.assert_allclose((left + right) / 2, np.minimum(0.5 * time, V0) / 0.165, atol=0.02)
-    np.testing.assert_allclose(right - left, np.minimum(0.2 * time, W0) * 0.55 / 0.165, atol=0.02)
-
-
-def test_a_turn_below_the_scrub_begins_when_the_integral_part_has_grown() -> None:
-    given = {"turn_servo": {"tau": 0.1, "reset": 0.2, "scrub": 2.0 * W0, "windup": 9.0}}
-    on_the_spot = replace(CIRCLE, program=replace(CIRCLE.program, speed_scale=0.0))
-    time, left, right = wheel_response(given, on_the_spot)
-    # Stuck, the error is all that is asked: e (1 + reset t) passes the scrub after 1 / reset.
-    assert not (right - left)[time < 4.98].any()
-    assert (right - left)[time > 5.05].min() > 0.0
-
-
-def test_while_driving_the_scrub_of_a_turn_is_less() -> None:
-    given = {"turn_servo": {"tau": 0.1, "scrub": 0.5 * W0}}
-    _, left, right = wheel_response(given, CIRCLE)
-    turn = float((right - left)[-1]) * 0.165 / 0.55
-    radius = V0 / turn
-    assert turn == pytest.approx(W0 - 0.5 * W0 / (1.0 + 0.15 * radius / 0.55), rel=1e-6)
-
-
 def test_each_side_has_a_lag_of_its_own() -> None:
     time, left, right = wheel_response({"side_lag": {"tau_left": 0.9, "tau_right": 0.5}})
     np.testing.assert_allclose(left, V0 / 0.165 * (1 - np.exp(-time / 0.9)), atol=2e-5)

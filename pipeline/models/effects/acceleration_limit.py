@@ -55,7 +55,7 @@ class AccelerationLimit(DriveEffect):
         ramped = wheels.change_each_wheel(
             lambda speed, start: limit_rate(speed, limit, step, resets, start), resets.start
         )
-        return replace(ramped, straight=None)
+        return replace(ramped, idle=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether the wheels reach steps of the command at once."""

@@ -41,7 +41,7 @@ class BodyAccelerationLimit(DriveEffect):
     motion = "Body acceleration limit: {limit:.3g} m/s^2"
     clause = "changes its speed by at most {limit:.2g} m/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE)
-    confused_with = ("acceleration_limit", "speed_servo", "drive_lag")
+    confused_with = ("acceleration_limit", "wheel_servo", "drive_lag")
     same_in_one_motion = ("acceleration_limit",)
     python_state = ("ramped",)
     python = """
@@ -57,7 +57,7 @@ class BodyAccelerationLimit(DriveEffect):
         asked = 0.5 * (wheels.left + wheels.right)
         start = 0.5 * (resets.start[:, 0] + resets.start[:, 1])
         added = limit_rate(asked, limit, context.step_s, resets, start) - asked
-        return replace(wheels, left=wheels.left + added, right=wheels.right + added)
+        return replace(wheels, left=wheels.left + added, right=wheels.right + added, idle=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether the wheels reach steps of the command at once."""

@@ -26,7 +26,7 @@ class DifferenceGain(DriveEffect):
     motion = "Difference gain: the sides reach {percent} of the commanded difference of their speeds"
     clause = "reaches {percent} of the commanded speed difference between its sides"
     needs = (Excitation.TURNING,)
-    confused_with = ("effective_track", "turn_droop", "turn_servo", "body_turn_limit")
+    confused_with = ("effective_track", "turn_droop", "wheel_servo", "body_turn_limit")
     python = """
         lost = (1.0 - {g}) * (right - left) / 2.0
         left, right = left + lost, right - lost"""

@@ -68,7 +68,7 @@ class DriveOvershoot(DriveEffect):
     )
     starts = ({"tau": 0.1, "damping": 0.4}, {"tau": 0.25, "damping": 0.4}, {"tau": 0.6, "damping": 0.4})
     needs = (Excitation.CHANGES,)
-    confused_with = ("drive_lag", "transport_delay", "turn_servo")
+    confused_with = ("drive_lag", "transport_delay", "wheel_servo")
     contains = ("drive_lag",)
     python_state = ("swung",)
     python = """

@@ -39,7 +39,7 @@ class TurnAccelerationLimit(DriveEffect):
     motion = "Turn acceleration limit: {size:.3g} rad/s^2"
     clause = "changes its yaw rate by at most {size:.3g} rad/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING)
-    confused_with = ("acceleration_limit", "turn_servo", "turn_lag")
+    confused_with = ("acceleration_limit", "wheel_servo", "turn_lag")
     same_in_one_motion = ("acceleration_limit",)
     python_state = ("twisted",)
     python = """
@@ -58,7 +58,7 @@ class TurnAccelerationLimit(DriveEffect):
         asked = wheels.right - wheels.left
         start = resets.start[:, 1] - resets.start[:, 0]
         added = 0.5 * (limit_rate(asked, limit, context.step_s, resets, start) - asked)
-        return replace(wheels, left=wheels.left - added, right=wheels.right + added, straight=None)
+        return replace(wheels, left=wheels.left - added, right=wheels.right + added, idle=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether the wheels reach steps of the command at once."""

@@ -1,0 +1,219 @@
+"""Wheel servo: its limiting cases, its steadiness in every number, and that it comes back of a log."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from types import SimpleNamespace
+from typing import cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from motion_runs import simulate, vehicle_of
+
+from pipeline.estimation import Input, Problem, fit_model
+from pipeline.models import Model, find_effect
+from pipeline.models.filters import lag_signal
+from pipeline.models.parameter import Conditions, Largest
+from pipeline.run.heading import Grid, average_held
+from pipeline.run.signals import Resets, RunContext, Wheels
+from pipeline.simulate import VEHICLES, Program
+from pipeline.simulate.drivetrain import turn_by_motors
+from pipeline.simulate.facts import Effects
+
+STEP = 0.02
+HUSKY = VEHICLES["husky"]
+RADIUS, WIDTH = HUSKY.wheel_radius_m, 2.0 * HUSKY.lever_m
+SERVO = {"tau": 0.3, "reset": 0.4, "drag": 0.05, "bound": 0.8, "scrub": 0.6, "creep": 0.07}
+
+
+def make_context(size: int, resets: Resets | None = None) -> RunContext:
+    first = np.array([0])
+    spans = Resets(np.zeros(size, dtype=np.int64), first, first, np.zeros((1, 3)))
+    vehicle = SimpleNamespace(wheel_radius_m=RADIUS)
+    known = SimpleNamespace(vehicle=vehicle, track_m=WIDTH, wheels=resets or spans, spans=spans, step_s=STEP)
+    return cast("RunContext", known)
+
+
+def drive(
+    speed: np.ndarray, turn: np.ndarray, context: RunContext | None = None, **numbers: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Speed [m/s] and yaw rate [rad/s] of the wheels under commanded ones."""
+    left, right = (speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS
+    wheels = Wheels(left, right, np.zeros(speed.size))
+    driven = find_effect("wheel_servo")(**numbers).drive_wheels(wheels, context or make_context(speed.size))
+    return 0.5 * RADIUS * (driven.left + driven.right), RADIUS * (driven.right - driven.left) / WIDTH
+
+
+def draw_steps(seed: int, size: float = 1.0) -> np.ndarray:
+    return np.repeat(np.random.default_rng(seed).uniform(-size, size, 40), 75)
+
+
+def test_without_ground_resistance_and_bound_it_is_a_lag_of_the_rotating_parts() -> None:
+    speed, turn = draw_steps(1), draw_steps(2)
+    resets = make_context(speed.size).spans
+    found = drive(speed, turn, tau=0.7)
+    tau = 0.7 * 0.7 / 1.7
+    for channel, signal in zip(found, (speed, turn), strict=True):
+        assert np.allclose(channel, lag_signal(signal, tau, STEP, resets, np.zeros(1)), atol=3e-3)
+
+
+def test_straight_ahead_on_firm_ground_the_body_makes_it_slower() -> None:
+    speed = np.ones(400)
+    found, turned = drive(speed, np.zeros(400), tau=0.5, scrub=20.0)
+    expected = lag_signal(speed, 0.5, STEP, make_context(400).spans, np.zeros(1))
+    assert np.allclose(found, expected, atol=0.02)
+    assert np.abs(turned).max() < 1e-12
+
+
+def test_its_force_is_bounded() -> None:
+    speed = np.full(300, 2.0)
+    found, _ = drive(speed, np.zeros(300), tau=0.2, bound=0.3, scrub=20.0)
+    assert np.diff(found)[20:50] == pytest.approx(0.3 / 0.2 * STEP, rel=0.02)
+
+
+def test_it_falls_short_by_the_rolling_resistance_until_the_integral_part_makes_up_for_it() -> None:
+    speed, turn = np.full(2000, 1.0), np.zeros(2000)
+    assert drive(speed, turn, tau=0.2, drag=0.1, scrub=5.0)[0][-1] == pytest.approx(0.9, abs=2e-3)
+    assert drive(speed, turn, tau=0.2, drag=0.1, reset=0.5, scrub=5.0)[0][-1] == pytest.approx(1.0, abs=2e-3)
+
+
+def test_a_slow_turn_on_the_spot_begins_late_and_a_fast_one_does_not() -> None:
+    rest = np.zeros(500)
+    slow, fast = (
+        drive(rest, np.full(500, rate), tau=0.2, reset=0.3, scrub=1.0, creep=0.07)[1] / rate
+        for rate in (0.5, 4.0)
+    )
+    after_1s, after_10s = 50, 499
+    assert slow[after_1s] < 0.2
+    assert fast[after_1s] > 0.5
+    assert slow[after_10s] > 2.0 * slow[after_1s]
+
+
+def test_driving_fast_lowers_the_friction_of_a_turn() -> None:
+    turn = np.full(300, 0.5)
+    numbers = {"tau": 0.2, "scrub": 1.0, "creep": 0.07}
+    rest, driving = (drive(np.full(300, speed), turn, **numbers)[1][-1] for speed in (0.0, 2.0))
+    assert rest < 0.5 * driving
+
+
+def test_without_a_command_the_integral_part_is_cleared() -> None:
+    """A turn after a pause begins as late as the first one; after a turn the other way, too."""
+    numbers = {"tau": 0.2, "reset": 0.3, "scrub": 1.0, "creep": 0.07}
+    turn, pause = np.full(300, 0.8), np.zeros(600)
+    asked = np.concatenate((turn, pause, turn, pause, -turn))
+    turned = drive(np.zeros(asked.size), asked, **numbers)[1].reshape(-1, 300)
+    assert np.allclose(turned[3], turned[0], atol=1e-6)
+    assert np.allclose(turned[6], -turned[0], atol=1e-6)
+
+
+def test_a_force_at_its_bound_holds_the_integral_part() -> None:
+    """Else it winds up while the drive gives all that it can, and the speed overshoots."""
+    speed = np.repeat([2.0, 1.0], 150)
+    found, _ = drive(speed, np.zeros(300), tau=0.2, reset=1.0, bound=0.1, scrub=20.0)
+    assert found[:150].max() < 2.0
+    assert found.max() < 2.0
+
+
+def test_a_prediction_begins_with_the_measured_wheels_and_holds_part_of_their_difference() -> None:
+    size, at = 400, 200
+    first = np.array([0, at])
+    number = np.repeat([0, 1], at)
+    start = np.array([[0.0, 0.0, 0.0], [0.8 / RADIUS, 1.2 / RADIUS, 0.0]])
+    context = make_context(size, Resets(number, first, first, start))
+    numbers = {"tau": 0.2, "reset": 0.3, "scrub": 1.0, "creep": 0.07}
+    speed, turn = np.ones(size), np.zeros(size)
+    found, turned = drive(speed, turn, context, **numbers)
+    assert np.allclose(turned[:at], 0.0, atol=1e-9)
+    assert turned[at] == pytest.approx(0.4 / WIDTH, rel=0.2)
+    assert 0.1 * turned[at] < turned[at + 25] < turned[at]
+    assert np.allclose(found, drive(speed, turn, **numbers)[0], atol=0.02)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    tau=st.floats(0.1, 0.6),
+    reset=st.floats(0.0, 0.8),
+    drag=st.floats(0.0, 0.1),
+    bound=st.floats(0.2, 2.0),
+    scrub=st.floats(0.0, 1.5),
+    creep=st.floats(0.02, 0.3),
+)
+@settings(max_examples=20, deadline=None)
+def test_it_agrees_with_motors_that_are_stepped_through(
+    seed: int, tau: float, reset: float, drag: float, bound: float, scrub: float, creep: float
+) -> None:
+    """The generator's motors, written on their own and integrated by short steps."""
+    numbers = {"tau": tau, "reset": reset, "drag": drag, "bound": bound, "scrub": scrub, "creep": creep}
+    speed, turn = draw_steps(seed), draw_steps(seed + 1)
+    left, right = (speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS
+    on_left, on_right = turn_by_motors(HUSKY, left, right, Effects({"wheel_servo": numbers}), STEP)
+    found, turned = drive(speed, turn, **numbers)
+    for ours, theirs in (
+        (found, 0.5 * RADIUS * (on_left + on_right)),
+        (turned, RADIUS * (on_right - on_left) / WIDTH),
+    ):
+        assert float(np.sqrt(np.mean((ours - theirs) ** 2))) < 0.03
+
+
+@pytest.mark.long
+def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -> None:
+    """Turns below the scrub begin seconds late: no lag of a plausible size does that."""
+    hidden = {"tau": 0.2, "reset": 0.35, "drag": 0.06, "bound": 1.1, "scrub": 1.2, "creep": 0.07}
+    run = simulate(
+        {"wheel_servo": hidden},
+        duration_s=240.0,
+        vehicle=VEHICLES["warthog"],
+        program=Program("smooth", speed_scale=0.2, turn_scale=0.25),
+    )
+    problem = Problem([run], vehicle_of("warthog"), Input.COMMAND)
+    servo = fit_model(problem, Model(problem.vehicle, (find_effect("wheel_servo")(),)))
+    lag = fit_model(problem, Model(problem.vehicle, (find_effect("turn_lag")(),)))
+    found = servo.model.effect("wheel_servo").values
+    for name in ("reset", "drag", "scrub", "creep"):
+        assert found[name] == pytest.approx(hidden[name], rel=0.15)
+    error = [float(np.sqrt(np.mean(fitted.residuals[:, 2] ** 2))) for fitted in (servo, lag)]
+    assert error[0] < 0.5 * error[1]
+
+
+@pytest.mark.long
+@given(seed=st.integers(0, 2**31), late=st.floats(0.0, 0.5), name=st.sampled_from(["late", *SERVO]))
+@settings(max_examples=60, deadline=None)
+def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: float, name: str) -> None:
+    """A jump where a cell more or less counts would be a hollow in the loss, in which a fit stops."""
+    draw = np.random.default_rng(seed)
+    times = np.cumsum(np.append(0.0, draw.uniform(0.05, 1.5, 60)))
+    turns = np.append(0.0, draw.uniform(-3.0, 3.0, 60) * (draw.random(60) > 0.3))
+    grid = Grid(
+        STEP, (np.arange(1500) + 0.5) * STEP, np.zeros(1500, dtype=np.int64), np.array([0]),
+        np.array([0.0]), np.array([1500 * STEP]),
+    )  # fmt: skip
+
+    def turn(change: float) -> np.ndarray:
+        numbers = {key: value * (1.0 + (change if key == name else 0.0)) for key, value in SERVO.items()}
+        at = times + late + (change if name == "late" else 0.0)
+        turned, idle = (average_held(at, values, grid) for values in (turns, 1.0 * (turns == 0.0)))
+        side = 0.5 * WIDTH / RADIUS * turned
+        wheels = Wheels(-side, side, np.zeros(1500), idle=idle)
+        driven = find_effect("wheel_servo")(**numbers).drive_wheels(wheels, make_context(1500))
+        return RADIUS * (driven.right - driven.left) / WIDTH
+
+    def measure(steps: np.ndarray) -> list[float]:
+        driven = [turn(step) for step in steps]
+        return [float(np.sqrt(np.mean((after - before) ** 2))) for before, after in pairwise(driven)]
+
+    steps = np.linspace(0.0, STEP, 200)
+    size = measure(steps)
+    most = int(np.argmax(size))
+    # A jump stays as large, however small the step.
+    assert max(measure(np.linspace(steps[most], steps[most + 1], 50))) < 0.2 * max(size) + 1e-6
+
+
+@pytest.mark.parametrize(
+    ("numbers", "is_lag"),
+    [({}, True), ({"scrub": 0.5}, False), ({"drag": 0.1}, False), ({"bound": 0.3}, False)],
+)
+def test_a_loop_that_nothing_loads_or_bounds_is_a_lag(numbers: dict[str, float], *, is_lag: bool) -> None:
+    conditions = Conditions(Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11)))
+    assert find_effect("wheel_servo")(tau=0.3, **numbers).is_degenerate(conditions) is is_lag
