@@ -9,6 +9,7 @@ import polars as pl
 from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet import label_runs, read_day
 from pipeline.job.run_results import DIAGNOSED
+from pipeline.models.catalogue import list_effects
 from pipeline.store import Manifest, Store
 from pipeline.store.parquet_tables import scan_table
 from schemas import contract_of
@@ -50,6 +51,11 @@ class ComparedRuns:
         """Rows of a table of these runs."""
         rows = scan_table(table, root=self.store.root, manifests=list(self.manifests.values()))
         return rows.filter(pl.col("run").is_in(list(self.manifests)))
+
+    def read_estimates(self) -> pl.DataFrame:
+        """Rows of `estimates` of effects in the catalogue: a run may be diagnosed with an earlier one."""
+        effects = [effect.id for effect in list_effects()]
+        return self.scan("estimates").filter(pl.col("effect").cast(pl.String).is_in(effects)).collect()
 
 
 def find_material(

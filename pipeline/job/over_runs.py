@@ -318,7 +318,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
         .sort("order")
     )
     series = follow_quantities(values)
-    estimates = compared.scan("estimates").filter(pl.col("run").is_in(dated["run"].to_list())).collect()
+    estimates = compared.read_estimates().filter(pl.col("run").is_in(dated["run"].to_list()))
     days = dated.select("order", "run", "day")
     parameters = follow_parameters(estimates, days, level=LEVEL / 2)
     latest = find_latest(estimates, days)

@@ -53,7 +53,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
     compared = _find_runs(store)
     if not compared.manifests:
         raise _lack_estimates(compared)
-    model = fit_fleet(compared.scan("estimates").collect())
+    model = fit_fleet(compared.read_estimates())
     notes = (*compared.notes, *model.notes)
     return FleetModel(model.numbers, model.runs, notes), _list_keys(compared)
 
@@ -74,7 +74,7 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
     }
     if not known:
         raise _lack_estimates(compared)
-    return compared.scan("estimates").filter(pl.col("run").is_in(list(known))).collect()
+    return compared.read_estimates().filter(pl.col("run").is_in(list(known)))
 
 
 def _lack_estimates(compared: ComparedRuns) -> JobError:

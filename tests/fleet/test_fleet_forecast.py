@@ -3,19 +3,30 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
+from comparison_store import Run, write_run
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
 from pipeline.fleet import ComparisonError
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
 from pipeline.fleet.joint_levels import RunEvidence
-from pipeline.job.prediction import Expected, Prediction, make_model_file, summarize_prediction
+from pipeline.job.over_runs import follow_trend
+from pipeline.job.prediction import (
+    Expected,
+    Prediction,
+    find_estimates,
+    fit_results,
+    make_model_file,
+    summarize_prediction,
+)
 from pipeline.models.parameter import Level
 from pipeline.sources import find_preset
+from pipeline.store import Store
 
 
 def test_on_known_ground_its_own_runs_count_most() -> None:
@@ -159,3 +170,14 @@ def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:
     # What the fit to all runs found on this terrain is what is expected there.
     fitted = join_evidence(start, evidence, {"lateral_skid.c": 0.18})
     assert [number.value for number in fitted.numbers] == pytest.approx([0.18, 0.05], abs=0.02)
+
+
+def test_estimates_of_an_effect_that_is_no_longer_known_are_left_out(tmp_path: Path) -> None:
+    store = Store(tmp_path / "results")
+    for number in range(3):
+        estimates = [("effective_track", "k", 1.7 + 0.01 * number, 0.01), ("turn_servo", "tau", 0.6, 0.05)]
+        write_run(store, Run(name=f"run{number}", seconds=6.0, sha256=f"{number}" * 64, estimates=estimates))
+    assert find_estimates(store)["effect"].unique().to_list() == ["effective_track"]
+    model, _ = fit_results(store)
+    assert [number.effect for number in model.numbers] == ["effective_track"]
+    follow_trend(store, ("vehicle",), threshold=0.05, limits={})
