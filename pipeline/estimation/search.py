@@ -449,12 +449,12 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         if not one.companions or one.id in first.ids:
             continue
         every, *fewer = _list_companions(one, usual)
-        begun = first.state.add(*every)
+        loaded = first.state.add(*every)
         cases = [usual[name] for name in one.contains if name in usual]
-        tried, simpler = selection.enter_each([begun.add(one.change(**one.starts[0])), begun.add(*cases)])
+        tried, simpler = selection.enter_each([loaded.add(one.change(**one.starts[0])), loaded.add(*cases)])
         if selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
-        starts = [begun.add(one.change(**start)) for start in one.starts[1:]]
+        starts = [loaded.add(one.change(**start)) for start in one.starts[1:]]
         starts += [first.state.add(*some, one.change(**start)) for some in fewer for start in one.starts]
         sound = _make_sound(selection, min([tried, *selection.enter_each(starts)], key=selection.loss))
         if one.id not in sound.ids:

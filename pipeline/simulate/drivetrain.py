@@ -363,7 +363,7 @@ class _Motors:
     def __init__(self, effects: Effects, step_s: float) -> None:
         self.left = self.right = 0.0
         # The vehicle's speed ahead, and that of a side of it around its middle [m/s]; integral parts [m/s].
-        self._ahead = self._around = 0.0
+        self._ahead = self._turning = 0.0
         self._left_memory = self._right_memory = 0.0
         self._step_s = step_s
         self._load = max(effects.value("wheel_servo", "tau"), _SHORTEST_TAU_S) / step_s
@@ -378,11 +378,11 @@ class _Motors:
             reset = 0.0
         else:
             reset = self._step_s * self._reset
-        ahead, around, load = self._ahead, self._around, self._load
+        ahead, turned, load = self._ahead, self._turning, self._load
         left_resistance, left_pull, left_error = self._drive(self.left, on_left, self._left_memory)
         right_resistance, right_pull, right_error = self._drive(self.right, on_right, self._right_memory)
-        left_grip = self._grip(self.left, self.left - ahead + around)
-        right_grip = self._grip(self.right, self.right - ahead - around)
+        left_grip = self._grip(self.left, self.left - ahead + turned)
+        right_grip = self._grip(self.right, self.right - ahead - turned)
         left_all, right_all = left_resistance + 2.0 * left_grip, right_resistance + 2.0 * right_grip
         # The force of the ground is a share of what the pull exceeds the resistance by at the ground's speed.
         left_share, right_share = left_grip / left_all, right_grip / right_all
@@ -390,12 +390,12 @@ class _Motors:
         straight = load + left_share * left_resistance + right_share * right_resistance
         turning = straight + _ASIDE**2 * (left_grip + right_grip)
         thrust = load * ahead + right_share * right_pull + left_share * left_pull
-        moment = load * around + right_share * right_pull - left_share * left_pull
+        moment = load * turned + right_share * right_pull - left_share * left_pull
         whole = straight * turning - uneven * uneven
         self._ahead = ahead = (turning * thrust - uneven * moment) / whole
-        self._around = around = (straight * moment - uneven * thrust) / whole
-        self.left = (left_pull + 2.0 * left_grip * (ahead - around)) / left_all
-        self.right = (right_pull + 2.0 * right_grip * (ahead + around)) / right_all
+        self._turning = turned = (straight * moment - uneven * thrust) / whole
+        self.left = (left_pull + 2.0 * left_grip * (ahead - turned)) / left_all
+        self.right = (right_pull + 2.0 * right_grip * (ahead + turned)) / right_all
         self._left_memory += reset * left_error
         self._right_memory += reset * right_error
 
@@ -418,5 +418,5 @@ class _Motors:
         """Force of the ground on a side over its slip."""
         if self._scrub == 0.0:
             return 0.0
-        sliding = math.hypot(slip, _ASIDE * self._around) / self._scrub
+        sliding = math.hypot(slip, _ASIDE * self._turning) / self._scrub
         return 0.5 / math.hypot(self._creep * rim, sliding, _LEAST_SLIP)

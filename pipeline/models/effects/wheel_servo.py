@@ -40,7 +40,7 @@ from pipeline.sources import Vehicle
 _ROTATING = 0.7
 """Inertia of the rotating parts over that of the vehicle: the loss of nine Warthog runs on five grounds
 together changes by 3 % from 0.3 to 3."""
-_REACH = 0.75
+_LENGTHWISE = 0.75
 """Squared distance of the contacts lengthwise over that across: that of a track 1.75 times as wide."""
 _LEAST_TAU_S = 0.01
 """Smallest time constant [s]: a quarter of a cell at 25 Hz, within which the wheels follow at once."""
@@ -288,10 +288,10 @@ def _roll(
             on_left, on_right = states[cell, 0], states[cell, 1]
             # The body moves along: its slip is not measured.
             ahead += 0.5 * (new_left + new_right)
-            turn += 0.5 * (new_right - new_left) / (aside * (1.0 + _REACH))
+            turn += 0.5 * (new_right - new_left) / (aside * (1.0 + _LENGTHWISE))
             # The integral part balances the friction at the measured difference of the wheels.
-            more = 0.5 * _OBSERVED * gain * (new_right - new_left) * states[cell, 2]
-            push_left, push_right = push_left - more, push_right + more
+            held = 0.5 * _OBSERVED * gain * (new_right - new_left) * states[cell, 2]
+            push_left, push_right = push_left - held, push_right + held
         driven = 1.0 - idle[cell]
         start_left, start_right = (push_left, push_right) if driven == 1.0 else (0.0, 0.0)
         push_left, push_right = driven * push_left, driven * push_right
@@ -299,7 +299,7 @@ def _roll(
         # The state at the middle of the cell, if it changes as in the last one.
         near_left, near_right = on_left + step_left, on_right + step_right
         near_v, near_w = ahead + step_v, turn + step_w
-        across = _REACH * (aside * near_w) ** 2
+        across = _LENGTHWISE * (aside * near_w) ** 2
         grip_left = _grip(near_left, near_left - near_v + aside * near_w, across, numbers)
         grip_right = _grip(near_right, near_right - near_v - aside * near_w, across, numbers)
         held_left = inertia + drag / math.sqrt(near_left * near_left + _SLOW * _SLOW) + grip_left
@@ -375,10 +375,10 @@ def _move(
     """
     firm_left, firm_right = grip_left * (1.0 - part_left), grip_right * (1.0 - part_right)
     straight, mixed = rate + firm_left + firm_right, aside * (firm_right - firm_left)
-    around = aside * aside * (straight + _REACH * (grip_left + grip_right))
+    turning = aside * aside * (straight + _LENGTHWISE * (grip_left + grip_right))
     push = rate * ahead + grip_left * left + grip_right * right
     twist = aside * (aside * rate * turn + grip_right * right - grip_left * left)
-    w = (twist * straight - mixed * push) / (straight * around - mixed * mixed)
+    w = (twist * straight - mixed * push) / (straight * turning - mixed * mixed)
     return (push - mixed * w) / straight, w
 
 
