@@ -13,10 +13,10 @@ the ground gives, the friction coefficient times that of gravity. creep [s/m] is
 over the force that it gives while it is small; at rest wheels slip by 0.01 of it. A slow turn begins only
 when the integral part has grown enough to overcome the friction, so that it seems to have a lag of many
 seconds; driving fast there is less of it, and on ice hardly any. The inertia of rotating parts is 0.7 of that
-of the vehicle (the error of the wheels hardly depends on it between 0.3 and 1.5), the contacts are 0.87 b apart
-lengthwise, and the radius of gyration is a. On a Warthog tau 0.15 to 0.2 s, reset 0.2 to 0.4 1/s, bound 1.1
-m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s elsewhere, and creep 0.06 s/m. Drive and
-turn slowly and quickly, on the spot and while driving.
+of the vehicle (the error of the wheels hardly depends on it between 0.3 and 1.5), the contacts are 0.87 b
+apart lengthwise, and the radius of gyration is a. On a Warthog tau 0.15 to 0.2 s, reset 0.2 to 0.4 1/s, bound
+1.1 m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s elsewhere, and creep 0.06 s/m. Drive
+and turn slowly and quickly, on the spot and while driving.
 
 Source: speed controllers as in ros2_control; anti-windup of Astrom and Murray, Feedback Systems, chapter 10;
 skid-steered contacts of Caracciolo, De Luca and Iannitti, 1999; forces of rolling tyres in proportion to slip
