@@ -463,7 +463,7 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         pruned = prune(selection, selection.reweight(sound))
         if one.id in pruned.ids:
             return pruned
-        selection.weights = weights
+        selection.take_weights(weights)
     return first
 
 

@@ -318,10 +318,14 @@ class Selection:
             shapes=math.prod(self.shapes.get(name, 1) for name in set(after.ids) - set(before.ids)),
         )  # fmt: skip
 
+    def take_weights(self, weights: Weights) -> None:
+        """Judge by other weights; models fitted without some effects under the present ones are forgotten."""
+        self.weights = weights
+        self._dropped.clear()
+
     def reweight(self, model: CandidateModel) -> CandidateModel:
         """Take the weights from a model's own residuals, and fit it anew."""
-        self.weights = make_weights(model.fit.residual, self.part)
-        self._dropped.clear()
+        self.take_weights(make_weights(model.fit.residual, self.part))
         self.budget.report(self.part.title, model.ids)
         return self.enter(model.fit)
 

@@ -11,6 +11,7 @@ from pipeline.core.compute import Budget
 from pipeline.estimation import Input, Problem, ambiguity, fit_model, load_recording
 from pipeline.estimation.ambiguity import Undecided, choose_reaching
 from pipeline.estimation.diagnosis import Value
+from pipeline.estimation.parts import make_weights
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
 from pipeline.estimation.selection import USEFUL, CandidateModel, Selection, open_selection, prepare
 from pipeline.job import Options
@@ -358,6 +359,20 @@ def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path
     (found,) = begun.state.effects
     assert found.values["reset"] == pytest.approx(0.3, rel=0.15)
     assert found.values["scrub"] == pytest.approx(1.2, rel=0.15)
+
+
+def test_a_model_without_an_effect_is_fitted_anew_under_other_weights(tmp_path: Path) -> None:
+    scenario = replace(_HUSKY, effects={"drive_lag": 0.4}, program=Program("drive_steps"))
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, (), context.conditions, Budget())
+    found = selection.enter(ideal.state.add(_give("drive_lag", 0.4)))
+    before = selection.drop(found, ["drive_lag"])
+    assert selection.drop(found, ["drive_lag"]) is before
+    selection.take_weights(make_weights(found.fit.residual, part))
+    after = selection.drop(found, ["drive_lag"])
+    assert after.fit.weights is selection.weights is not before.fit.weights
 
 
 def test_a_model_that_follows_a_drive_better_and_predicts_worse_is_not_better(tmp_path: Path) -> None:
