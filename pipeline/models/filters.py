@@ -28,16 +28,16 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     if tau <= 0.0:
         return signal
     lagged, part = np.empty_like(signal), np.empty(signal.size)
-    _lag(np.ascontiguousarray(signal.real), _set_states(signal.real, resets, start.real), tau, step_s, part)
+    _lag(np.ascontiguousarray(signal.real), set_states(signal.real, resets, start.real), tau, step_s, part)
     lagged.real = part
     if np.iscomplexobj(signal):
-        states = _set_states(signal.imag, resets, start.imag)
+        states = set_states(signal.imag, resets, start.imag)
         _lag(np.ascontiguousarray(signal.imag), states, tau, step_s, part)
         lagged.imag = part
     return lagged
 
 
-def _set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
+def set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
     """States before the cells at which they are reset, NaN elsewhere, shape (n,)."""
     states = np.full(signal.size, np.nan)
     states[resets.first] = signal[resets.first]
@@ -137,7 +137,7 @@ def lag_unevenly(
         start: the state there; the input's own value where it is NaN, shape (k,).
     """
     up, down = taus
-    states, lagged = _set_states(signal, resets, start), np.empty(signal.size)
+    states, lagged = set_states(signal, resets, start), np.empty(signal.size)
     _lag_unevenly(np.ascontiguousarray(signal), states, up, down, step_s, lagged)
     return lagged
 
@@ -238,7 +238,7 @@ def swing_signal(
     """
     if tau <= 0.0:
         return signal
-    states, swung = _set_states(signal, resets, start), np.empty(signal.size)
+    states, swung = set_states(signal, resets, start), np.empty(signal.size)
     _swing(np.ascontiguousarray(signal), states, tau, damping, step_s, swung)
     return swung
 

@@ -170,7 +170,7 @@ class Forward:
         # Derivatives are taken by one parameter after another; their common start state must stay cached.
         self._most = _REMEMBERED_OF_SHORT if grid.times.size < _SHORT else _REMEMBERED
         self._cache: dict[Place, OrderedDict[object, object]] = {stage: OrderedDict() for stage in Place}
-        self._known: OrderedDict[float, RunContext] = OrderedDict()
+        self._known: OrderedDict[float, tuple[RunContext, RunContext]] = OrderedDict()
 
     @cached_property
     def _held(self) -> HeldDrive:
@@ -180,10 +180,10 @@ class Forward:
         """Reported body velocity, predicted from commands."""
         commanded = [e for e in effects if e.place is Place.COMMAND]
         driven = [e for e in effects if e.place is Place.DRIVE]
-        context = self._start_wheels(timing.wheel_delay_s)
+        contexts = self._start_wheels(timing.wheel_delay_s)
         key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in commanded))
         wheels = self._keep(Place.COMMAND, key, lambda: self._hold(commanded, timing.wheel_delay_s))
-        wheels, key = self._drive(wheels, (*key, "|"), driven, context)
+        wheels, key = self._drive(wheels, (*key, "|"), driven, contexts)
         return self._move(wheels, key, effects)
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
@@ -194,16 +194,17 @@ class Forward:
         )
         return self._move(wheels, key, effects)
 
-    def _start_wheels(self, delay_s: float) -> RunContext:
-        """The run with initial wheel speeds from the encoders."""
-        if self._encoders is None:
-            return self.context
+    def _start_wheels(self, delay_s: float) -> tuple[RunContext, RunContext]:
+        """The run with wheel speeds from the encoders where states are reset, and where spans begin only."""
         if delay_s not in self._known:
-            wheels, spans = (
-                replace(resets, start=self._encoders.interpolate(self._locate(resets), delay_s).stack())
-                for resets in (self.context.wheels, self.context.spans)
-            )
-            self._known[delay_s] = replace(self.context, wheels=wheels, spans=spans)
+            context = self.context
+            if self._encoders is not None:
+                wheels, spans = (
+                    replace(resets, start=self._encoders.interpolate(self._locate(resets), delay_s).stack())
+                    for resets in (context.wheels, context.spans)
+                )
+                context = replace(context, wheels=wheels, spans=spans)
+            self._known[delay_s] = (context, replace(context, wheels=context.spans))
             if len(self._known) > _REMEMBERED:
                 self._known.popitem(last=False)
         return self._known[delay_s]
@@ -233,19 +234,21 @@ class Forward:
         return self._held.average_on_grid(commands)
 
     def _drive(
-        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect], context: RunContext
+        self,
+        wheels: Wheels,
+        key: tuple[object, ...],
+        effects: Sequence[Effect],
+        contexts: tuple[RunContext, RunContext],
     ) -> tuple[Wheels, tuple[object, ...]]:
         """Wheel speeds after the drivetrain, and their key; cached per effect, as the next may vary alone.
 
         Measured wheels are the state of the last effect with a state. Those before it continue theirs.
         """
         last = max((index for index, effect in enumerate(effects) if effect.python_state), default=-1)
-        before = replace(context, wheels=context.spans)
         for index, effect in enumerate(effects):
-            key = (*key, effect.key, index < last)
-            drive = partial(
-                cast("DriveEffect", effect).drive_wheels, wheels, before if index < last else context
-            )
+            is_before = index < last
+            key = (*key, effect.key, is_before)
+            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, contexts[is_before])
             wheels = self._keep(Place.DRIVE, key, drive)
         return wheels, key
 

@@ -33,6 +33,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
 from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
+from pipeline.models.filters import set_states
 from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 from pipeline.sources import Vehicle
@@ -225,12 +226,13 @@ class WheelServo(DriveEffect):
             return wheels
         radius, resets = context.vehicle.wheel_radius_m, context.wheels
         left, right = radius * wheels.left, radius * wheels.right
-        states = np.full((left.size, 3), np.nan)
-        states[resets.first] = np.column_stack((left, right, np.zeros_like(left)))[resets.first]
-        known = np.isfinite(resets.start[:, :2]).all(axis=1)
-        states[resets.at[known], :2] = radius * resets.start[known, :2]
-        states[resets.at[known], 2] = 1.0
-        states[context.spans.first, 2] = 0.0
+        start = radius * resets.start
+        is_measured = np.zeros_like(left)
+        is_measured[resets.at] = np.isfinite(start[:, :2]).all(axis=1)
+        is_measured[context.spans.first] = 0.0
+        states = np.column_stack(
+            (set_states(left, resets, start[:, 0]), set_states(right, resets, start[:, 1]), is_measured)
+        )
         idle = wheels.idle
         if idle is None:
             idle = (np.maximum(np.abs(left), np.abs(right)) < _NO_COMMAND).astype(np.float64)
@@ -264,7 +266,7 @@ def _roll(
     step_s: float,
     rolled: Floats,
 ) -> None:
-    """Cell means of the speeds of both sides by the implicit midpoint rule, with the grip of a cell's start.
+    """Cell means of the speeds of both sides by the implicit midpoint rule, with a grip that is extrapolated.
 
     Args:
         left: commanded speed of the left side [m/s], shape (n,).
