@@ -51,7 +51,7 @@ HIDDEN: Mapping[str, Sizes] = {
         "wheel_asymmetry": 0.03,
     },
     "warthog on ice": {
-        "contact_friction": {"friction": 0.1, "tau": 0.05, "k": 1.65, "gyration": 0.9},
+        "contact_friction": {"friction": 0.1, "creep": 0.5, "k": 1.65, "gyration": 0.9},
         "drive_lag": 0.2,
     },
 }

@@ -370,7 +370,10 @@ def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) 
         if not cases or effect.id in selection.given or excluded & {case.id for case in cases}:
             continue
         simpler = selection.enter(current.state.drop([effect.id]).add(*cases))
-        if simpler.numbers >= current.numbers or not selection.is_sound(simpler):
+        if selection.sum_losses(simpler) >= most:
+            continue
+        simpler = _make_sound(selection, simpler)
+        if simpler.numbers >= current.numbers:
             continue
         if selection.sum_losses(simpler) < most and selection.judge(simpler, current).share < 1.0:
             return simpler
@@ -416,7 +419,8 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
     candidates = context.list_candidates(source)
     problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
     selection, first = open_selection(problem.whole, start, candidates, context.conditions, budget)
-    return SearchResult(source.value, selection, first, *search_effects(selection, first))
+    begin = _begin_whole(selection, first) if source is Input.MEASURED else first
+    return SearchResult(source.value, selection, first, *search_effects(selection, begin))
 
 
 def search_wheels(
@@ -448,14 +452,15 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     for one in usual.values():
         if not one.companions or one.id in first.ids:
             continue
-        every, *fewer = _list_companions(one, usual)
+        every, fewer = _list_companions(one, usual)
         loaded = first.state.add(*every)
         cases = [usual[name] for name in one.contains if name in usual]
         tried, simpler = selection.enter_each([loaded.add(one.change(**one.starts[0])), loaded.add(*cases)])
         if selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
         starts = [loaded.add(one.change(**start)) for start in one.starts[1:]]
-        starts += [first.state.add(*some, one.change(**start)) for some in fewer for start in one.starts]
+        if fewer != every:
+            starts += [first.state.add(*fewer, one.change(**start)) for start in one.starts]
         sound = _make_sound(selection, min([tried, *selection.enter_each(starts)], key=selection.loss))
         if one.id not in sound.ids:
             continue
@@ -467,10 +472,10 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     return first
 
 
-def _list_companions(effect: Effect, usual: Mapping[str, Effect]) -> list[list[Effect]]:
+def _list_companions(effect: Effect, usual: Mapping[str, Effect]) -> tuple[list[Effect], list[Effect]]:
     """The companions of an effect, with and without those that clip large commands."""
     every = [usual[name] for name in effect.companions if name in usual]
-    return [every, [one for one in every if not any(p.relative_to for p in one.parameters)]]
+    return every, [one for one in every if not any(p.relative_to for p in one.parameters)]
 
 
 def _make_possible(effect: Effect, conditions: Conditions) -> Effect:

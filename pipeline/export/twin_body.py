@@ -21,7 +21,7 @@ from typing import Literal
 
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
-from pipeline.models.parameter import TwinRole
+from pipeline.models.parameter import GRAVITY_MPS2, TwinRole
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
@@ -144,7 +144,8 @@ def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
 
     Args:
         model: a fitted model.
-        speed_mps: speed at which a car's understeer is matched: creep grows with speed, not with its square.
+        speed_mps: speed at which the creep of sliding wheels and a car's understeer are matched: the former
+            grows with speed in the model, the latter with its square.
 
     Raises:
         MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``.
@@ -227,7 +228,9 @@ class _Builder:
 
     def _find_inertia(self) -> float:
         """Time constant by which the body follows its wheels in the model [s]; zero without one."""
-        return self.sliding.values["tau"] if self.sliding else self._value(TwinRole.CREEP)
+        if self.sliding:
+            return self.sliding.values["creep"] * self.speed_mps / GRAVITY_MPS2
+        return self._value(TwinRole.CREEP)
 
     def _middle(self, centre: tuple[float, float], wheelbase: float) -> float:
         """X of the centre of mass: between the axles of a car, otherwise of the wheels."""

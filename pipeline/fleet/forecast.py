@@ -480,8 +480,9 @@ def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effec
     """Effects of written models that can act on the input.
 
     Drivetrain effects need half of all runs of the vehicle; ground effects half of the runs on this terrain,
-    or of all runs on a new terrain. Effects that start at one moment of a recording are excluded, and clock
-    offsets, which differ in every run.
+    or of all runs on a new terrain. Companions of a chosen effect need one run: gentle drives do not show the
+    limits of a controller. Effects that start at one moment of a recording are excluded, and clock offsets,
+    which differ in every run.
     """
     here = rows.filter(pl.col("terrain") == terrain)
     chosen: list[Effect] = []
@@ -493,4 +494,8 @@ def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effec
         holding = asked.filter("in_model", pl.col("effect") == effect.id)["run"].n_unique()
         if effect.late is not Late.POSES and holding >= _MOST * asked["run"].n_unique():
             chosen.append(effect)
+    held = set(rows.filter("in_model")["effect"])
+    beside = sorted({name for effect in chosen for name in effect.companions if name in held})
+    ids = {effect.id for effect in chosen}
+    chosen += [find_effect(name)() for name in beside if name not in ids]
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

@@ -53,9 +53,10 @@ class ComparedRuns:
         return rows.filter(pl.col("run").is_in(list(self.manifests)))
 
     def read_estimates(self) -> pl.DataFrame:
-        """Rows of `estimates` of effects in the catalogue: a run may be diagnosed with an earlier one."""
-        effects = [effect.id for effect in list_effects()]
-        return self.scan("estimates").filter(pl.col("effect").cast(pl.String).is_in(effects)).collect()
+        """Rows of `estimates` of effects as they are in the catalogue: older runs may have others."""
+        known = [f"{effect.id}.{number.name}" for effect in list_effects() for number in effect.parameters]
+        label = pl.concat_str(pl.col("effect", "parameter").cast(pl.String), separator=".")
+        return self.scan("estimates").filter(label.is_in(known).all().over("run", "effect")).collect()
 
 
 def find_material(

@@ -14,11 +14,10 @@ from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import ACKERMANN, ANY, Effect
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model import Model
+from pipeline.models.parameter import GRAVITY_MPS2
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
-_GRAVITY_MPS2 = 9.80665
-"""Standard gravity (ISO 80000-3)."""
 _STILL_RADPS = 1e-3
 """Added to the difference of wheel speeds [rad/s] before its root is taken, to avoid a zero divisor."""
 
@@ -327,7 +326,7 @@ MODELS: tuple[LiteratureModel, ...] = (
             "c4": Number("1/m", (-20.0, 20.0)),
             "c5": Number("1/m", _SHARE),
             "c6": Number("1", _SHARE),
-            "G": Number("m/s^2", (0.0, 100.0), _GRAVITY_MPS2, is_fixed=True),
+            "G": Number("m/s^2", (0.0, 100.0), GRAVITY_MPS2, is_fixed=True),
         },
     ),
     LiteratureModel(

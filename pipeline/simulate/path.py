@@ -148,17 +148,18 @@ def _slide_on_contacts(
     v0: Floats, w0: Floats, track_m: float, effects: Effects, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
     # Velocities and forces are complex numbers in the body's frame; classical Runge-Kutta steps of 2 ms.
-    bound, tau = (
-        9.80665 * effects.value("contact_friction", "friction"),
-        effects.value("contact_friction", "tau"),
-    )
+    friction, creep = (effects.value("contact_friction", name) for name in ("friction", "creep"))
     aspect = math.sqrt(effects.value("contact_friction", "k") - 1.0)
     contacts = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
     squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
-        slips = [sides[contact.imag < 0.0] - (velocity + 1j * yaw_rate * contact) for contact in contacts]
-        pushes = [0.25 * bound * slip / math.hypot(abs(slip), bound * tau) for slip in slips]
+        speeds = [sides[contact.imag < 0.0] for contact in contacts]
+        slips = [u - velocity - 1j * yaw_rate * contact for u, contact in zip(speeds, contacts, strict=True)]
+        pushes = [
+            0.25 * 9.80665 * friction * slip / math.hypot(abs(slip), friction * creep * abs(u + 0.1j))
+            for u, slip in zip(speeds, slips, strict=True)
+        ]
         torques = [(contact.conjugate() * push).imag for contact, push in zip(contacts, pushes, strict=True)]
         return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / squared
 

@@ -172,10 +172,14 @@ def test_runs_joined_by_their_equations_tell_what_none_of_them_tells() -> None:
     assert [number.value for number in fitted.numbers] == pytest.approx([0.18, 0.05], abs=0.02)
 
 
-def test_estimates_of_an_effect_that_is_no_longer_known_are_left_out(tmp_path: Path) -> None:
+def test_estimates_of_effects_that_the_catalogue_no_longer_has_so_are_left_out(tmp_path: Path) -> None:
+    """An effect that is gone, and one that has another parameter in place of tau."""
     store = Store(tmp_path / "results")
     for number in range(3):
-        estimates = [("effective_track", "k", 1.7 + 0.01 * number, 0.01), ("turn_servo", "tau", 0.6, 0.05)]
+        estimates = [
+            ("effective_track", "k", 1.7 + 0.01 * number, 0.01), ("turn_servo", "tau", 0.6, 0.05),
+            ("contact_friction", "friction", 0.6, 0.05), ("contact_friction", "tau", 0.06, 0.05),
+        ]  # fmt: skip
         write_run(store, Run(name=f"run{number}", seconds=6.0, sha256=f"{number}" * 64, estimates=estimates))
     assert find_estimates(store)["effect"].unique().to_list() == ["effective_track"]
     model, _ = fit_results(store)

@@ -164,7 +164,7 @@ def test_a_body_that_slides_begins_predictions_with_the_velocity_it_was_seen_at(
 
 @pytest.mark.long
 def test_wheels_that_slide_have_the_friction_of_the_model(tmp_path: Path) -> None:
-    ice = {"friction": 0.1, "tau": 0.05, "k": 1.65, "gyration": 0.9}
+    ice = {"friction": 0.1, "creep": 0.5, "k": 1.65, "gyration": 0.9}
     simulate_case(
         None, {"contact_friction": ice}, out=tmp_path / "ice.mcap", duration_s=60.0, vehicle="warthog"
     )

@@ -272,7 +272,7 @@ def test_limits_of_gazebo_are_those_of_the_controller_with_its_own_geometry() ->
 
 @pytest.mark.parametrize("gyration", [0.25, 0.4, 0.95])
 def test_wheels_and_chassis_have_the_moment_of_inertia_of_the_model(gyration: float) -> None:
-    sliding = {"friction": 0.1, "tau": 0.04, "k": 1.55, "gyration": gyration}
+    sliding = {"friction": 0.1, "creep": 0.4, "k": 1.55, "gyration": gyration}
     body = build_twin_body(make(HUSKY, contact_friction=sliding).model)
     x, y = body.centre_m
     turning = weigh_chassis(body)[1][1]
@@ -284,11 +284,11 @@ def test_wheels_and_chassis_have_the_moment_of_inertia_of_the_model(gyration: fl
 
 
 def test_the_file_says_where_skid_makes_friction_uneven() -> None:
-    sliding = {"friction": 0.1, "tau": 0.04, "k": 1.55, "gyration": 0.95}
+    sliding = {"friction": 0.1, "creep": 0.4, "k": 1.55, "gyration": 0.95}
     said = "Lengthwise they slide above"
     assert said not in export_model(make(HUSKY, contact_friction=sliding), "mjcf")
     text = export_model(make(HUSKY, contact_friction=sliding, lateral_skid=0.2), "mjcf")
-    assert f"{said} 0.24" in text
+    assert f"{said} 0.33" in text
     assert "0 s late" not in text
 
 
