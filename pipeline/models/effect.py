@@ -401,9 +401,15 @@ class KinematicEffect(Effect):
 
 
 class BodyEffect(Effect):
-    """Computes the body velocity from the rolling velocity."""
+    """Computes the body velocity from the rolling velocity.
+
+    Attributes:
+        is_kinematic: whether the ratio of yaw rates is part of it, so that effects of the ground act on the
+            motion that it results in.
+    """
 
     place = Place.BODY
+    is_kinematic: ClassVar[bool] = False
 
     @abstractmethod
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:

@@ -258,7 +258,7 @@ class Forward:
         rolling = self._keep(Place.KINEMATICS, key, lambda: self._roll(wheels, rolled))
         body = [e for e in effects if e.place is Place.BODY]
         key = (*key, "|", *(e.key for e in body))
-        moved = self._keep(Place.BODY, key, lambda: self._move_body(rolling, body))
+        moved, rolling = self._keep(Place.BODY, key, lambda: self._move_body(rolling, body))
         velocity = moved
         for effect in effects:
             if effect.place is Place.GROUND:
@@ -286,11 +286,15 @@ class Forward:
             rolling = cast("KinematicEffect", effect).roll(rolling, self.context)
         return rolling
 
-    def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> Velocity:
+    def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> tuple[Velocity, Rolling]:
+        """Body velocity, and v0, w0 that effects of the ground act on."""
+        ground = rolling
         for effect in effects:
             moved = cast("BodyEffect", effect).move_body(rolling, self.context)
             rolling = replace(rolling, v0=moved.x, s0=moved.y, w0=moved.w)
-        return rolling.velocity
+            if cast("BodyEffect", effect).is_kinematic:
+                ground = replace(ground, v0=moved.x, w0=moved.w)
+        return rolling.velocity, ground
 
 
 def replace_context(forward: Forward, context: RunContext) -> Forward:

@@ -69,6 +69,7 @@ def move_body(
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
     if effects.is_active("contact_friction"):
         v_x, v_y, v_w = _slide_on_contacts(v0, w0, vehicle.track_width_m, effects, drive.step_s)
+        v0, w0 = v_x, v_w
     along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
     v_x = (
         v_x

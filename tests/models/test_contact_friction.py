@@ -116,6 +116,15 @@ def test_friction_comes_back_from_every_start(friction: float) -> None:
         assert fitted.model.effect("contact_friction").values["friction"] == pytest.approx(friction, rel=0.1)
 
 
+def test_effects_of_the_ground_act_on_the_motion_of_the_sliding_body() -> None:
+    """With a track that is twice as wide, the yaw rate of the wheels would give half of the skid."""
+    truth = {"friction": 0.6, "creep": 0.4, "k": 2.0, "gyration": 1.1}
+    run = simulate({"contact_friction": truth, "lateral_skid": 0.2}, duration_s=120.0)
+    start = Model(HUSKY, (find_effect("contact_friction")().change(**truth), find_effect("lateral_skid")()))
+    fitted = fit_model(Problem([run], HUSKY, Input.MEASURED), start)
+    assert fitted.model.effect("lateral_skid").values["c"] == pytest.approx(0.2, rel=0.1)
+
+
 def test_a_body_without_turning_inertia_is_exported_and_turns_with_its_wheels() -> None:
     effect = find_effect("contact_friction")().change(**{**ICE, "friction": 0.7, "gyration": 0.0})
     model = ModelFile(Model(HUSKY, (effect,)))

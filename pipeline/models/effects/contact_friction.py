@@ -11,7 +11,7 @@ body follows its wheels with the time constant creep u / g. At rest wheels slip 
 slip little turn the body at 1 / k of the ideal rate, as an effective track k b. gyration [1] is the radius of
 gyration over half the track width b. On a Warthog friction 0.1 on ice and 0.8 to 1.7 on gravel, sand, grass
 and asphalt, creep 0.02 to 0.2 on asphalt and grass and 0.3 on gravel and sand, k 1.65 to 1.9, gyration 0.8 to
-1.6. Change speed while turning, and turn quickly and slowly.
+1.6. Effects of the ground act on this motion. Change speed while turning, and turn quickly and slowly.
 
 Source: Coulomb friction of skid-steered wheels, Caracciolo, De Luca and Iannitti, Trajectory tracking control
 of a four-wheel differentially driven mobile robot, 1999, with a bound that is approached smoothly; forces of
@@ -110,6 +110,7 @@ class ContactFriction(BodyEffect):
     confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
     contains = ("effective_track", "body_inertia")
     companions = ("lateral_skid",)
+    is_kinematic = True
     twin = TwinRole.SLIDING
     python_state = ("body_x", "body_y", "body_w")
     python = """
@@ -130,7 +131,8 @@ class ContactFriction(BodyEffect):
         turn = body_w * step_s
         body_x = ahead * math.cos(turn) + aside * math.sin(turn)
         body_y = aside * math.cos(turn) - ahead * math.sin(turn)
-        v_x, v_y, v_w = ((a + b) / 2.0 for a, b in zip(before, (body_x, body_y, body_w)))"""
+        v_x, v_y, v_w = ((a + b) / 2.0 for a, b in zip(before, (body_x, body_y, body_w)))
+        v0, w0 = v_x, v_w"""
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a wider track: even wheels that skid in the fastest turn make the body no later."""
