@@ -149,10 +149,9 @@ class WheelServo(DriveEffect):
     clause = "answers commands against a friction of {scrub:.2g} m/s"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
-    contains = ("drive_lag", "turn_lag")
+    contains = ("deadband", "drive_lag", "turn_lag")
     companions = (
         "transport_delay",
-        "deadband",
         "body_turn_limit",
         "body_acceleration_limit",
         "turn_acceleration_limit",
