@@ -7,7 +7,8 @@ unchanged recording says, lies within the two intervals together, or where both 
 An answer is the same where the names are, and the numbers within the same measure; it is at the `edge` where
 one of the two has a name for a number that the other one estimates alike and away from nothing, but does not
 name, or where it has a name that the unchanged recording says may act, too, and the numbers that it says come
-with it. `cannot`: the log is said not to tell of it, or only of larger ones.
+with it. A name that is the special case of one that is gone, with its number, is no extra name. `cannot`: the
+log is said not to tell of it, or only of larger ones.
 Exit code 0; the table says what was missed.
 """
 
@@ -177,7 +178,8 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
         return "reported", []
     effects = {label.split(".")[0] for label in injection.numbers}
     along = {label.split(".")[0] for label in injection.along if comes_along(injection, label, before, after)}
-    extra = sorted(after.names - before.mentioned - find_foretold(before, after) - effects - along)
+    expected = before.mentioned | find_foretold(before, after) | find_contained(before, after)
+    extra = sorted(after.names - expected - effects - along)
     if injection.same:
         return _judge_same(before, after, extra), extra
     for effect in effects:
@@ -272,16 +274,45 @@ def comes_along(injection: Injection, label: str, before: Answer, after: Answer)
 
 
 def is_recovered_together(injection: Injection, before: Answer, after: Answer) -> bool:
-    """Whether effects that are one to first order add up to what was injected, each by its own sign."""
-    moves = [change(0.0) for change in injection.numbers.values()]
+    """Whether effects that are one to first order add up to what was injected, each by its own sign.
+
+    Ratios multiply: those of a track and of the track that contact friction contains.
+    """
+    moves = [_add_up(label, change(find_neutral(label))) for label, change in injection.numbers.items()]
     if not all(moves) or not any(after.find_told(label) for label in injection.numbers):
         return False
     sums = []
     for answer in (before, after):
-        numbers = [answer.find_number(label) for label in injection.numbers]
+        known = [(label, *answer.find_number(label)) for label in injection.numbers]
+        numbers = [
+            (_add_up(label, value), _add_up(label, value + half) - _add_up(label, value))
+            for label, value, half in known
+        ]
         value = sum(math.copysign(1.0, move) * one for move, (one, _) in zip(moves, numbers, strict=True))
         sums.append((value, math.hypot(*(half for _, half in numbers))))
     return is_close((sums[0][0] + abs(moves[0]), sums[0][1]), sums[1])
+
+
+def _add_up(label: str, value: float) -> float:
+    """A number that adds up with others and is zero without effect: the logarithm of a ratio."""
+    return math.log(value) if find_neutral(label) == 1.0 else value
+
+
+def find_contained(before: Answer, after: Answer) -> set[str]:
+    """Names that contain one that is gone, or are its special case, with the numbers that both have."""
+    return {
+        name
+        for name in after.names - before.mentioned
+        for gone in before.names - after.mentioned
+        if (gone in find_effect(name).contains or name in find_effect(gone).contains)
+        and (both := [one for one in after.list_labels([name]) if _rename(one, gone) in before.numbers])
+        and all(is_close(before.numbers[_rename(label, gone)], after.numbers[label]) for label in both)
+    }
+
+
+def _rename(label: str, effect: str) -> str:
+    """The number of that name of another effect."""
+    return f"{effect}.{label.split('.')[1]}"
 
 
 def find_neutral(label: str) -> float:

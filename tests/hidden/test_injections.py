@@ -243,3 +243,16 @@ def test_a_name_that_was_foretold_is_no_news() -> None:
             "body_inertia.tau": (tau, 0.02),
         }
         assert judge(track, before, Answer(numbers)) == ("recovered", extra)
+
+
+def test_a_special_case_with_the_same_number_is_no_extra_name() -> None:
+    wider, sliding = {"effective_track.k": (1.72, 0.02)}, {"contact_friction.k": (1.71, 0.02)}
+    plain, noise = Answer({**sliding, "contact_friction.friction": (0.9, 0.2)}), BY_NAME["1 cm of noise"]
+    assert judge(noise, plain, Answer(wider)) == ("missed", [])
+    assert judge(noise, plain, Answer({"effective_track.k": (1.9, 0.02)}))[1] == ["effective_track"]
+    assert judge(noise, plain, Answer({**plain.numbers, **wider}))[1] == ["effective_track"]
+    # Ratios multiply, in whichever of the two they are.
+    track = BY_NAME["track x 1.2"]
+    assert judge(track, plain, Answer({"effective_track.k": (2.05, 0.03)}))[0] == "recovered"
+    assert judge(track, plain, Answer({**sliding, "effective_track.k": (1.2, 0.02)}))[0] == "recovered"
+    assert judge(track, plain, Answer(wider))[0] == "number"
