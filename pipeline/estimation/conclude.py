@@ -25,7 +25,7 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis
+from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Unexplained
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
     Curve,
@@ -167,7 +167,9 @@ def summarize(
         where=tuple(pick_regions(regions, residual, part.noise)),
         timing={"runs": cast("Json", list(clocks.timing))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
-        disturbance=residual_structure.summarize_disturbance(body, unexplained, lead),
+        disturbance=residual_structure.summarize_disturbance(
+            body, lead if lead and not unexplained else _describe_rest(unexplained, _find_room(judgement))
+        ),
         lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
         budgets=tuple(
@@ -190,8 +192,7 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     region = find_main_region(part, search.final.held, places)
     if region is not None:
         return f"the remaining error is not spread evenly: {region.sentence}"
-    floor = 0.0 if judgement is None else judgement.floor.t_mrmse_m
-    room = judgement.whole.errors.t_mrmse_m / floor if judgement and floor > 0.0 else math.nan
+    room = _find_room(judgement)
     near = [one for path in paths for one in path.not_significant]
     nearest = max(near, key=lambda one: one.gain, default=None)
     if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:
@@ -200,6 +201,21 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
         f"the remaining error is {room:.1f} times the noise floor; {nearest.effect.id} would take "
         f"{format_share(nearest.gain)} of the held-out loss away, but is not significant"
     )
+
+
+def _find_room(judgement: Judgement | None) -> float:
+    """The final error in position over the noise floor; NaN if either is unknown."""
+    floor = 0.0 if judgement is None else judgement.floor.t_mrmse_m
+    return judgement.whole.errors.t_mrmse_m / floor if judgement and floor > 0.0 else math.nan
+
+
+def _describe_rest(unexplained: Unexplained | None, room: float) -> str:
+    """Sentence on what is left where nothing points to its cause."""
+    if unexplained is not None:
+        return "Apart from this dependence, the residual is disturbance and localization noise"
+    if room > ABOVE_FLOOR:
+        return f"The remaining error is {room:.1f} times the noise floor, and no recorded signal predicts it"
+    return "The residual does not depend on any recorded signal: disturbance and localization noise"
 
 
 def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence[Named]) -> ModelFile:

@@ -453,8 +453,8 @@ def write_formula(joined: Mapping[str, object]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def summarize_disturbance(body: Explored, unexplained: Unexplained | None, lead: str) -> dict[str, Json]:
-    """What is left of x, y, w, divided by how long it lasts.
+def summarize_disturbance(body: Explored, text: str) -> dict[str, Json]:
+    """What is left of x, y, w, divided by how long it lasts, with a sentence on it.
 
     ``rms`` [m/s, m/s, rad/s]; ``lasting``: the part of it that lasts for seconds; ``pose_noise`` [m, m, rad]:
     error of single poses that would make the rest of neighbouring windows as opposite as it is; and
@@ -462,12 +462,6 @@ def summarize_disturbance(body: Explored, unexplained: Unexplained | None, lead:
     """
     held, makeup = body.search.final.held, _split(body)
     rms = np.sqrt((held**2).mean(axis=0))
-    if unexplained is not None:
-        text = "Apart from this dependence, the residual is disturbance and localization noise"
-    else:
-        text = (
-            lead or "The residual does not depend on any recorded signal: disturbance and localization noise"
-        )
     return {
         "rms": [round(float(value), 6) for value in rms],
         "lasting": [
