@@ -166,8 +166,9 @@ _CLEAR = 2.5
 """Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
 421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
 _WHOLE = 0.9
-"""Largest loss of a whole drive, over that with its controller as a lag, for a search to begin with it: on
-nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs without a controller above 0.98."""
+"""Largest loss with an effect and its companions, over that with its special cases in its place, for a search
+to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs
+without a controller above 0.98."""
 _RIVALS = 0.5
 """Minimum predicted gain of an effect's rivals, as a share of its own predicted gain."""
 
@@ -413,7 +414,7 @@ class SearchResult:
 
 
 def search_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> SearchResult:
-    """Search from an input to the body."""
+    """Search from an input to the body; from measured wheels it begins with contact friction."""
     usable = [e for e in known if source is Input.COMMAND or e.place > Place.DRIVE]
     start = context.problem.start_state(usable)
     candidates = context.list_candidates(source)
@@ -444,9 +445,10 @@ def search_wheels(
 
 
 def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
-    """The model with a controller and its companions, less what is not significant; else the model itself.
+    """The model with an effect and its companions, less what is not significant; else the model itself.
 
-    A speed loop answers ramps of its command: fitted to steps, one without ramps ends in a local minimum.
+    A speed loop answers ramps of its command: fitted to steps, one without ramps ends in a local minimum. So
+    does friction in contact whose search began with a wider track and a skid.
     """
     usual = {one.id: _make_possible(one(), selection.conditions) for one in selection.candidates}
     for one in usual.values():

@@ -97,7 +97,7 @@ class Effect(ABC):
             `is_equivalent` checks in recordings.
         same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
         contains: effects that are special cases of it: it explains whatever they explain.
-        companions: effects of the same controller, with which a search begins at once.
+        companions: effects that usually act beside it, with which a search begins at once.
         parts: parameters of other effects as which it is searched; identified together, they are this effect.
         late: what it delays, if a delay is its only parameter.
         twin: its role in the body of the exported twin; None where that body cannot represent it.
