@@ -494,8 +494,7 @@ def _choose_effects(rows: pl.DataFrame, terrain: str, source: str) -> list[Effec
         holding = asked.filter("in_model", pl.col("effect") == effect.id)["run"].n_unique()
         if effect.late is not Late.POSES and holding >= _MOST * asked["run"].n_unique():
             chosen.append(effect)
-    held = set(rows.filter("in_model")["effect"])
-    beside = sorted({name for effect in chosen for name in effect.companions if name in held})
-    ids = {effect.id for effect in chosen}
-    chosen += [find_effect(name)() for name in beside if name not in ids]
+    held = set(rows.filter("in_model")["effect"]) - {effect.id for effect in chosen}
+    beside = held.intersection(name for effect in chosen for name in effect.companions)
+    chosen += [find_effect(name)() for name in sorted(beside)]
     return [effect for effect in chosen if not any(effect.id in other.contains for other in chosen)]

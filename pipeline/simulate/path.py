@@ -69,7 +69,7 @@ def move_body(
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
     if effects.is_active("contact_friction"):
         v_x, v_y, v_w = _slide_on_contacts(v0, w0, vehicle.track_width_m, effects, drive.step_s)
-        v0, w0 = v_x, v_w
+        ground_input = "inertia"
     along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
     v_x = (
         v_x
@@ -149,26 +149,24 @@ def _slide_on_contacts(
     v0: Floats, w0: Floats, track_m: float, effects: Effects, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
     # Velocities and forces are complex numbers in the body's frame; classical Runge-Kutta steps of 2 ms.
-    friction, creep = (effects.value("contact_friction", name) for name in ("friction", "creep"))
-    aspect = math.sqrt(effects.value("contact_friction", "k") - 1.0)
-    contacts = [0.5 * track_m * complex(aspect * end, side) for end in (1, -1) for side in (1, -1)]
-    squared = (0.5 * track_m * effects.value("contact_friction", "gyration")) ** 2
+    names = ("friction", "creep", "k", "gyration")
+    friction, creep, k, gyration = (effects.value("contact_friction", name) for name in names)
+    ahead = 0.5 * track_m * math.sqrt(k - 1.0)
+    contacts = [complex(ahead * end, 0.5 * track_m * side) for end in (1, -1) for side in (1, -1)]
+
+    def push(contact: complex, velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> complex:
+        slip = (u := sides[contact.imag < 0.0]) - velocity - 1j * yaw_rate * contact
+        return 0.25 * 9.80665 * friction * slip / math.hypot(abs(slip), friction * creep * abs(u + 0.1j))
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
-        speeds = [sides[contact.imag < 0.0] for contact in contacts]
-        slips = [u - velocity - 1j * yaw_rate * contact for u, contact in zip(speeds, contacts, strict=True)]
-        pushes = [
-            0.25 * 9.80665 * friction * slip / math.hypot(abs(slip), friction * creep * abs(u + 0.1j))
-            for u, slip in zip(speeds, slips, strict=True)
-        ]
-        torques = [(contact.conjugate() * push).imag for contact, push in zip(contacts, pushes, strict=True)]
-        return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / squared
+        pushes = [push(one, velocity, yaw_rate, sides) for one in contacts]
+        torques = [(one.conjugate() * force).imag for one, force in zip(contacts, pushes, strict=True)]
+        return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / (0.5 * track_m * gyration) ** 2
 
-    count = max(1, math.ceil(step_s / 2e-3))
-    short = step_s / count
+    short = step_s / (count := max(1, math.ceil(step_s / 2e-3)))
     velocity, yaw_rate, rows = 0j, 0.0, []
-    for along, turn in zip(v0.tolist(), w0.tolist(), strict=True):
-        sides, total, turned = (along - 0.5 * track_m * turn, along + 0.5 * track_m * turn), 0j, 0.0
+    for along, turn in zip(v0.tolist(), (0.5 * track_m * w0).tolist(), strict=True):
+        sides, total, turned = (along - turn, along + turn), 0j, 0.0
         for _ in range(count):
             a, alpha = accelerate(velocity, yaw_rate, sides)
             b, beta = accelerate(velocity + 0.5 * short * a, yaw_rate + 0.5 * short * alpha, sides)
@@ -179,8 +177,8 @@ def _slide_on_contacts(
             yaw_rate += short / 6.0 * (alpha + 2.0 * beta + 2.0 * gamma + delta)
             total, turned = total + 0.5 * (before + velocity), turned + 0.5 * (rate_before + yaw_rate)
         rows.append((total.real / count, total.imag / count, turned / count))
-    moved = np.array(rows).reshape(-1, 3)
-    return moved[:, 0], moved[:, 1], moved[:, 2]
+    v_x, v_y, v_w = np.array(rows).reshape(-1, 3).T
+    return v_x, v_y, v_w
 
 
 def _shake(
