@@ -428,7 +428,7 @@ def test_special_cases_that_were_refused_are_not_tried_again(tmp_path: Path) -> 
     """A wider track alone: contact friction gives way to it, unless it may not be named."""
     scenario = replace(_HUSKY, effects={"effective_track": 1.6, "body_inertia": 0.15})
     selection, ideal = _open(scenario, tmp_path / "husky")
-    whole = find_effect("contact_friction")(friction=5.0, tau=0.15, k=1.6, gyration=0.6)
+    whole = find_effect("contact_friction")(friction=5.0, creep=1.5, k=1.6, gyration=0.6)
     sliding = selection.reweight(selection.enter(ideal.state.add(whole)))
     assert set(simplify(selection, sliding, set()).ids) == {"effective_track", "body_inertia"}
     assert simplify(selection, sliding, {"effective_track"}) is sliding
