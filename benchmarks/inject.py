@@ -278,24 +278,20 @@ def is_recovered_together(injection: Injection, before: Answer, after: Answer) -
 
     Ratios multiply: those of a track and of the track that contact friction contains.
     """
-    moves = [_add_up(label, change(find_neutral(label))) for label, change in injection.numbers.items()]
+    moves = [_add_up(label, change(find_neutral(label)))[0] for label, change in injection.numbers.items()]
     if not all(moves) or not any(after.find_told(label) for label in injection.numbers):
         return False
     sums = []
     for answer in (before, after):
-        known = [(label, *answer.find_number(label)) for label in injection.numbers]
-        numbers = [
-            (_add_up(label, value), _add_up(label, value + half) - _add_up(label, value))
-            for label, value, half in known
-        ]
+        numbers = [_add_up(label, *answer.find_number(label)) for label in injection.numbers]
         value = sum(math.copysign(1.0, move) * one for move, (one, _) in zip(moves, numbers, strict=True))
         sums.append((value, math.hypot(*(half for _, half in numbers))))
     return is_close((sums[0][0] + abs(moves[0]), sums[0][1]), sums[1])
 
 
-def _add_up(label: str, value: float) -> float:
+def _add_up(label: str, value: float, half: float = 0.0) -> Number:
     """A number that adds up with others and is zero without effect: the logarithm of a ratio."""
-    return math.log(value) if find_neutral(label) == 1.0 else value
+    return (math.log(value), math.log1p(half / value)) if find_neutral(label) == 1.0 else (value, half)
 
 
 def find_contained(before: Answer, after: Answer) -> set[str]:

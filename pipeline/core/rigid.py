@@ -17,6 +17,8 @@ if TYPE_CHECKING:
 # Quaternions are (x, y, z, w), unit length, and rotate vectors of the child frame into the parent frame, as
 # in ROS messages. Angles are in radians.
 
+GRAVITY_MPS2 = 9.80665
+"""Standard gravity [m/s^2] (ISO 80000-3)."""
 _TINY = 1e-12
 """Angle [rad] below which the first term of a series is exact to rounding."""
 

@@ -168,7 +168,7 @@ def summarize(
         timing={"runs": cast("Json", list(clocks.timing))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(
-            body, lead if lead and not unexplained else _describe_rest(unexplained, _find_room(judgement))
+            body, _describe_rest(unexplained, lead, _find_room(judgement))
         ),
         lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided, named), judgement),
@@ -209,13 +209,13 @@ def _find_room(judgement: Judgement | None) -> float:
     return judgement.whole.errors.t_mrmse_m / floor if judgement and floor > 0.0 else math.nan
 
 
-def _describe_rest(unexplained: Unexplained | None, room: float) -> str:
-    """Sentence on what is left where nothing points to its cause."""
+def _describe_rest(unexplained: Unexplained | None, lead: str, room: float) -> str:
+    """Sentence on the residual, apart from what is unexplained."""
     if unexplained is not None:
         return "Apart from this dependence, the residual is disturbance and localization noise"
-    if room > ABOVE_FLOOR:
+    if not lead and room > ABOVE_FLOOR:
         return f"The remaining error is {room:.1f} times the noise floor, and no recorded signal predicts it"
-    return "The residual does not depend on any recorded signal: disturbance and localization noise"
+    return lead or "The residual does not depend on any recorded signal: disturbance and localization noise"
 
 
 def _begin(judgement: Judgement, undecided: Sequence[Undecided], named: Sequence[Named]) -> ModelFile:

@@ -454,15 +454,12 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     for one in usual.values():
         if not one.companions or one.id in first.ids:
             continue
-        every, fewer = _list_companions(one, usual)
-        loaded = first.state.add(*every)
+        loaded = [first.state.add(*some) for some in _list_companions(one, usual)]
         cases = [usual[name] for name in one.contains if name in usual]
-        tried, simpler = selection.enter_each([loaded.add(one.change(**one.starts[0])), loaded.add(*cases)])
+        start, *starts = (state.add(one.change(**values)) for state in loaded for values in one.starts)
+        tried, simpler = selection.enter_each([start, loaded[0].add(*cases)])
         if selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
-        starts = [loaded.add(one.change(**start)) for start in one.starts[1:]]
-        if fewer != every:
-            starts += [first.state.add(*fewer, one.change(**start)) for start in one.starts]
         sound = _make_sound(selection, min([tried, *selection.enter_each(starts)], key=selection.loss))
         if one.id not in sound.ids:
             continue
@@ -474,10 +471,11 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     return first
 
 
-def _list_companions(effect: Effect, usual: Mapping[str, Effect]) -> tuple[list[Effect], list[Effect]]:
-    """The companions of an effect, with and without those that clip large commands."""
+def _list_companions(effect: Effect, usual: Mapping[str, Effect]) -> list[list[Effect]]:
+    """The companions of an effect; if some of them clip large commands, also those without them."""
     every = [usual[name] for name in effect.companions if name in usual]
-    return every, [one for one in every if not any(p.relative_to for p in one.parameters)]
+    fewer = [one for one in every if not any(p.relative_to for p in one.parameters)]
+    return [every] if fewer == every else [every, fewer]
 
 
 def _make_possible(effect: Effect, conditions: Conditions) -> Effect:

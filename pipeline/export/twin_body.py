@@ -19,9 +19,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
+from pipeline.core.rigid import GRAVITY_MPS2
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
-from pipeline.models.parameter import GRAVITY_MPS2, TwinRole
+from pipeline.models.parameter import TwinRole
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 

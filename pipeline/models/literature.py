@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from pipeline.core import guess_names
+from pipeline.core.rigid import GRAVITY_MPS2
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import ACKERMANN, ANY, Effect
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model import Model
-from pipeline.models.parameter import GRAVITY_MPS2
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 

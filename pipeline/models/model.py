@@ -289,10 +289,10 @@ class Forward:
     def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> tuple[Velocity, Rolling]:
         """Body velocity, and v0, w0 that effects of the ground act on."""
         ground = rolling
-        for effect in effects:
-            moved = cast("BodyEffect", effect).move_body(rolling, self.context)
+        for effect in cast("Sequence[BodyEffect]", effects):
+            moved = effect.move_body(rolling, self.context)
             rolling = replace(rolling, v0=moved.x, s0=moved.y, w0=moved.w)
-            if cast("BodyEffect", effect).is_kinematic:
+            if effect.is_kinematic:
                 ground = replace(ground, v0=moved.x, w0=moved.w)
         return rolling.velocity, ground
 

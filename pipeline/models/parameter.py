@@ -13,9 +13,6 @@ from typing import ClassVar, Literal
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
-GRAVITY_MPS2 = 9.80665
-"""Standard gravity [m/s^2]."""
-
 
 class Level(enum.Enum):
     """What a parameter of an effect is a property of."""

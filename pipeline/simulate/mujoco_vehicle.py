@@ -13,16 +13,22 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.rigid import invert_quaternions, multiply_quaternions, rotate, rotation_vectors
+from pipeline.core.rigid import (
+    GRAVITY_MPS2,
+    invert_quaternions,
+    multiply_quaternions,
+    rotate,
+    rotation_vectors,
+)
 from pipeline.simulate.drivetrain import Drive, apply_ideal_model
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_effects
 from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
-from pipeline.simulate.path import BodyMotion, Path, tilt_quaternion
+from pipeline.simulate.path import BodyMotion, Path
 from pipeline.simulate.scenario import Scenario
+from pipeline.simulate.surface import tilt_quaternion
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500
-_GRAVITY_MPS2 = 9.80665
 _ALLOWED = (
     "body_speed_limit",
     "body_turn_limit",
@@ -157,7 +163,7 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
 def _write_world(scenario: Scenario, machine: SkidSteer) -> str:
     vehicle = scenario.vehicle
     down = rotate(
-        invert_quaternions(tilt_quaternion(scenario.ground)), np.array([0.0, 0.0, -_GRAVITY_MPS2])
+        invert_quaternions(tilt_quaternion(scenario.ground)), np.array([0.0, 0.0, -GRAVITY_MPS2])
     ).tolist()
     radius = vehicle.wheel_radius_m
     wheels = "".join(_write_wheel(name, vehicle, machine) for name in _WHEELS)

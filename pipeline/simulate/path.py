@@ -7,7 +7,13 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.rigid import multiply_quaternions, quaternions_from_euler, quaternions_from_yaw, rotate
+from pipeline.core.rigid import (
+    GRAVITY_MPS2,
+    multiply_quaternions,
+    quaternions_from_euler,
+    quaternions_from_yaw,
+    rotate,
+)
 from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners
 from pipeline.simulate.facts import Effects, Vehicle
 from pipeline.simulate.programs import (
@@ -18,6 +24,14 @@ from pipeline.simulate.programs import (
     walk_in_plane,
 )
 from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
+from pipeline.simulate.surface import (
+    Surface,
+    Vector,
+    cross,
+    make_surface,
+    slide_onto_plane,
+    tilt_quaternion,
+)
 
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #
@@ -69,8 +83,9 @@ def move_body(
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
     if effects.is_active("contact_friction"):
         v_x, v_y, v_w = _slide_on_contacts(v0, w0, vehicle.track_width_m, effects, drive.step_s)
-        ground_input = "inertia"
-    along, aside, yaw_rate = (v0, s0, w0) if ground_input == "drive" else (v_x, v_y, v_w)
+    # Friction in contact contains the ratio of yaw rates, as the track does.
+    is_drive = ground_input == "drive" and not effects.is_active("contact_friction")
+    along, aside, yaw_rate = (v0, s0, w0) if is_drive else (v_x, v_y, v_w)
     v_x = (
         v_x
         - effects.value("speed_slip", "k") * along * np.abs(along)
@@ -151,21 +166,26 @@ def _slide_on_contacts(
     # Velocities and forces are complex numbers in the body's frame; classical Runge-Kutta steps of 2 ms.
     names = ("friction", "creep", "k", "gyration")
     friction, creep, k, gyration = (effects.value("contact_friction", name) for name in names)
-    ahead = 0.5 * track_m * math.sqrt(k - 1.0)
-    contacts = [complex(ahead * end, 0.5 * track_m * side) for end in (1, -1) for side in (1, -1)]
+    half = 0.5 * track_m
+    ahead, squared = half * math.sqrt(k - 1.0), (half * gyration) ** 2
+    contacts = [complex(ahead * end, half * side) for end in (1, -1) for side in (1, -1)]
 
     def push(contact: complex, velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> complex:
-        slip = (u := sides[contact.imag < 0.0]) - velocity - 1j * yaw_rate * contact
-        return 0.25 * 9.80665 * friction * slip / math.hypot(abs(slip), friction * creep * abs(u + 0.1j))
+        u = sides[contact.imag < 0.0]
+        slip = u - velocity - 1j * yaw_rate * contact
+        # Of a wheel at rest the slip ratio is that at 0.1 m/s.
+        least = friction * creep * math.hypot(u, 0.1)
+        return 0.25 * GRAVITY_MPS2 * friction * slip / math.hypot(abs(slip), least)
 
     def accelerate(velocity: complex, yaw_rate: float, sides: tuple[float, float]) -> tuple[complex, float]:
         pushes = [push(one, velocity, yaw_rate, sides) for one in contacts]
         torques = [(one.conjugate() * force).imag for one, force in zip(contacts, pushes, strict=True)]
-        return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / (0.5 * track_m * gyration) ** 2
+        return sum(pushes) - 1j * yaw_rate * velocity, sum(torques) / squared
 
-    short = step_s / (count := max(1, math.ceil(step_s / 2e-3)))
+    count = max(1, math.ceil(step_s / 2e-3))
+    short = step_s / count
     velocity, yaw_rate, rows = 0j, 0.0, []
-    for along, turn in zip(v0.tolist(), (0.5 * track_m * w0).tolist(), strict=True):
+    for along, turn in zip(v0.tolist(), (half * w0).tolist(), strict=True):
         sides, total, turned = (along - turn, along + turn), 0j, 0.0
         for _ in range(count):
             a, alpha = accelerate(velocity, yaw_rate, sides)
@@ -196,84 +216,6 @@ def _shake(
         )
 
     return draw(disturbance.speed_mps), draw(disturbance.speed_mps), draw(disturbance.turn_radps)
-
-
-Vector = tuple[float, float, float]
-
-_WAVES = 6
-
-
-@dataclass(frozen=True)
-class Surface:
-    """Height h(x, y) = slope_x x + slope_y y + sum of a sin(p x + q y + c).
-
-    Attributes:
-        slope_x, slope_y: gradient of the plane.
-        waves: (a [m], p [1/m], q [1/m], c [rad]) of each wave.
-    """
-
-    slope_x: float
-    slope_y: float
-    waves: tuple[tuple[float, float, float, float], ...]
-
-    def height_at(self, x: float, y: float) -> float:
-        """Height [m] of the ground at a place [m]."""
-        height = self.slope_x * x + self.slope_y * y
-        for size, p, q, phase in self.waves:
-            height += size * math.sin(p * x + q * y + phase)
-        return height
-
-    def normal_at(self, x: float, y: float) -> Vector:
-        """Unit normal of the ground at a place [m], pointing up."""
-        slope_x, slope_y = self.slope_x, self.slope_y
-        for size, p, q, phase in self.waves:
-            change = size * math.cos(p * x + q * y + phase)
-            slope_x += change * p
-            slope_y += change * q
-        scale = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
-        return -slope_x * scale, -slope_y * scale, scale
-
-
-def make_surface(ground: Ground, generator: np.random.Generator) -> Surface:
-    """Draw the hills of a ground; wavelengths spread by a factor of two about the asked one."""
-    up_x, up_y, up_z = rotate(tilt_quaternion(ground), np.array([0.0, 0.0, 1.0])).tolist()
-    waves: list[tuple[float, float, float, float]] = []
-    if ground.hill_m > 0.0:
-        size = ground.hill_m * math.sqrt(2.0 / _WAVES)
-        for direction, stretch, phase in zip(
-            generator.uniform(0.0, math.pi, _WAVES).tolist(),
-            (2.0 ** generator.uniform(-0.5, 0.5, _WAVES)).tolist(),
-            generator.uniform(0.0, 2.0 * math.pi, _WAVES).tolist(),
-            strict=True,
-        ):
-            number = 2.0 * math.pi / (ground.hill_length_m * stretch)
-            waves.append((size, number * math.cos(direction), number * math.sin(direction), phase))
-    return Surface(-up_x / up_z, -up_y / up_z, tuple(waves))
-
-
-def tilt_quaternion(ground: Ground) -> Floats:
-    """Attitude, shape (4,), of the plane that the hills stand on."""
-    tilt: Floats = quaternions_from_euler(
-        np.array([ground.roll_rad]), np.array([ground.pitch_rad]), np.array([0.0])
-    )[0]
-    return tilt
-
-
-def cross(first: Vector, second: Vector) -> Vector:
-    """Cross product of two vectors, in plain floats because it runs at every step."""
-    return (
-        first[1] * second[2] - first[2] * second[1],
-        first[2] * second[0] - first[0] * second[2],
-        first[0] * second[1] - first[1] * second[0],
-    )
-
-
-def slide_onto_plane(vector: Vector, normal: Vector) -> Vector:
-    """The unit vector nearest to ``vector`` that lies in the plane of ``normal``."""
-    lift = vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
-    x, y, z = (vector[i] - lift * normal[i] for i in range(3))
-    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
-    return x * scale, y * scale, z * scale
 
 
 _SLOW_STEP_S = 0.005

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import (
+    GRAVITY_MPS2,
     interpolate_poses,
     multiply_quaternions,
     quaternions_from_vectors,
@@ -21,7 +22,6 @@ from pipeline.simulate.path import Path
 from pipeline.simulate.programs import integrate_cells, make_coloured_noise
 from pipeline.simulate.scenario import Encoders, Imu, PoseSensor
 
-_GRAVITY_MPS2 = 9.80665
 _GYRO_WINDOW_S = 0.01
 _ACCELEROMETER_WINDOW_S = 0.05
 _STEERING_SHARE = 0.01
@@ -139,7 +139,7 @@ def _specific_forces(path: Path, time: Floats, step: float) -> Floats:
     before, after = np.maximum(centre - half, 0), np.minimum(centre + half, last)
     change = (path.velocity[after] - path.velocity[before]) / ((after - before) * step)[:, None]
     v_x, v_y, v_w = path.velocity[centre].T
-    upright = np.broadcast_to(np.array([0.0, 0.0, _GRAVITY_MPS2]), (time.size, 3))
+    upright = np.broadcast_to(np.array([0.0, 0.0, GRAVITY_MPS2]), (time.size, 3))
     forces: Floats = rigid.rotate(
         rigid.invert_quaternions(path.quaternion[_nearest(time, step, path.time_s.size - 1)]), upright
     )

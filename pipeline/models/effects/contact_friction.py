@@ -25,10 +25,11 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
+from pipeline.core.rigid import GRAVITY_MPS2
 from pipeline.models.effect import INF, BodyEffect, Effect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.body_inertia import LEAST_LAG_S
 from pipeline.models.effects.effective_track import EffectiveTrack
-from pipeline.models.parameter import GRAVITY_MPS2, Conditions, Level, Quantity, TwinRole
+from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 _LEAST_CREEP = 1e-3
@@ -120,7 +121,7 @@ class ContactFriction(BodyEffect):
             for ahead in (-reach, reach):
                 slip_x, slip_y = rolled - body_x + aside * body_w, -body_y - ahead * body_w
                 rolling = max({creep}, 1e-3) * math.hypot(rolled, 0.1)
-                share = 2.4516625 / math.hypot(rolling, math.hypot(slip_x, slip_y) / {friction})
+                share = 0.25 * 9.80665 / math.hypot(rolling, math.hypot(slip_x, slip_y) / {friction})
                 push_x, push_y = push_x + share * slip_x, push_y + share * slip_y
                 push_w += (ahead * slip_y - aside * slip_x) * share / (inertia * B * B / 4.0)
                 stiffness += share
