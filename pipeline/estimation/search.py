@@ -165,6 +165,9 @@ _BESIDE = (0.7, 1.4)
 _CLEAR = 2.5
 """Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
 421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
+_EXPECTED = 0.6
+"""Evidence over that required at which a companion of an effect stays in the model, three standard errors: a
+drive with a speed controller has ramps and limits."""
 _WHOLE = 0.9
 """Largest loss with an effect and its companions, over that with its special cases in its place, for a search
 to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs
@@ -348,7 +351,12 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         doubtful = _list_doubtful(selection, current)
         models = selection.drop_each(current, [[name] for name in doubtful])
         judged = [(selection.judge(without, current), without) for without in models]
-        weak = [(one.share, without) for one, without in judged if not one.is_significant]
+        expected = {name for effect in current.state.effects for name in effect.companions}
+        weak = [
+            (one.share, without)
+            for name, (one, without) in zip(doubtful, judged, strict=True)
+            if one.gain < LEAST_GAIN or one.share < (_EXPECTED if name in expected else 1.0)
+        ]
         if not weak:
             return current
         current = selection.reweight(min(weak, key=lambda one: one[0])[1])
@@ -461,11 +469,9 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         if selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
         sound = _make_sound(selection, min([tried, *selection.enter_each(starts)], key=selection.loss))
-        if one.id not in sound.ids:
-            continue
         weights, selection.noise = selection.weights, selection.take_evidence(sound).noise
         pruned = prune(selection, selection.reweight(sound))
-        if one.id in pruned.ids:
+        if not set(pruned.ids) <= set(first.ids):
             return pruned
         selection.take_weights(weights)
     return first

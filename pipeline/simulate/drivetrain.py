@@ -367,8 +367,9 @@ class _Motors:
         self._left_memory = self._right_memory = 0.0
         self._step_s = step_s
         self._load = max(effects.value("wheel_servo", "tau"), _SHORTEST_TAU_S) / step_s
-        self._reset, self._drag, self._bound, self._scrub, self._creep = (
-            effects.value("wheel_servo", name) for name in ("reset", "drag", "bound", "scrub", "creep")
+        names = ("reset", "drag", "bound", "no_load", "scrub", "creep")
+        self._reset, self._drag, self._bound, self._no_load, self._scrub, self._creep = (
+            effects.value("wheel_servo", name) for name in names
         )
 
     def step(self, on_left: float, on_right: float) -> None:
@@ -409,9 +410,12 @@ class _Motors:
         # Half of what changes with the rim's speed is taken at the beginning of the step.
         braking = 0.5 * _ALL * self._drag / math.hypot(rim, _SIGN_MPS)
         resistance, pull = inertia + braking, (inertia - braking) * rim
-        if abs(push) < self._bound:
+        # A motor turns against its supply with what its own speed leaves of the voltage.
+        left_over = 1.0 - math.copysign(1.0, push) * rim / self._no_load
+        most = math.inf if math.isinf(self._bound) else self._bound * max(left_over, 0.0)
+        if abs(push) < most:
             return resistance + 0.5 * _ALL, pull + _ALL * (push + 0.5 * rim), error
-        pull += _ALL * math.copysign(self._bound, push)
+        pull += _ALL * math.copysign(most, push)
         return resistance, pull, error if error * push < 0.0 else 0.0
 
     def _grip(self, rim: float, slip: float) -> float:

@@ -25,7 +25,7 @@ from pipeline.simulate.facts import Effects
 STEP = 0.02
 HUSKY = VEHICLES["husky"]
 RADIUS, WIDTH = HUSKY.wheel_radius_m, 2.0 * HUSKY.lever_m
-SERVO = {"tau": 0.3, "reset": 0.4, "drag": 0.05, "bound": 0.8, "scrub": 0.6, "creep": 0.07}
+SERVO = {"tau": 0.3, "reset": 0.4, "drag": 0.05, "bound": 0.8, "no_load": 4.0, "scrub": 0.6, "creep": 0.07}
 
 
 def make_context(size: int, resets: Resets | None = None) -> RunContext:
@@ -71,6 +71,21 @@ def test_its_force_is_bounded() -> None:
     speed = np.full(300, 2.0)
     found, _ = drive(speed, np.zeros(300), tau=0.2, bound=0.3, scrub=20.0)
     assert np.diff(found)[20:50] == pytest.approx(0.3 / 0.2 * STEP, rel=0.02)
+
+
+def test_at_the_no_load_speed_no_force_is_left() -> None:
+    """Free of resistance it is approached as by a motor with a time constant of no_load tau / bound."""
+    found, _ = drive(np.full(2000, 9.0), np.zeros(2000), tau=0.2, bound=0.3, no_load=3.0, scrub=20.0)
+    expected = lag_signal(np.full(2000, 3.0), 2.0, STEP, make_context(2000).spans, np.zeros(1))
+    assert np.allclose(found, expected, atol=0.02)
+
+
+def test_a_force_that_falls_with_speed_holds_turns_back_more_than_driving_straight() -> None:
+    numbers = {"tau": 0.2, "reset": 0.3, "bound": 1.0, "no_load": 2.0, "scrub": 1.0, "creep": 0.07}
+    rest, rim = np.zeros(1000), np.full(1000, 1.6)
+    straight, turning = drive(rim, rest, **numbers)[0][-1], drive(rest, rim * 2.0 / WIDTH, **numbers)[1][-1]
+    assert straight == pytest.approx(1.6, rel=0.02)
+    assert 0.5 * WIDTH * turning < 0.9 * straight
 
 
 def test_it_falls_short_by_the_rolling_resistance_until_the_integral_part_makes_up_for_it() -> None:
@@ -137,15 +152,17 @@ def test_a_prediction_begins_with_the_measured_wheels_and_holds_part_of_their_di
     reset=st.floats(0.0, 0.8),
     drag=st.floats(0.0, 0.1),
     bound=st.floats(0.2, 2.0),
+    no_load=st.floats(1.0, 10.0) | st.just(np.inf),
     scrub=st.floats(0.0, 1.5),
     creep=st.floats(0.02, 0.3),
 )
 @settings(max_examples=20, deadline=None)
 def test_it_agrees_with_motors_that_are_stepped_through(
-    seed: int, tau: float, reset: float, drag: float, bound: float, scrub: float, creep: float
+    seed: int, tau: float, reset: float, drag: float, bound: float, no_load: float, scrub: float, creep: float
 ) -> None:
     """The generator's motors, written on their own and integrated by short steps."""
-    numbers = {"tau": tau, "reset": reset, "drag": drag, "bound": bound, "scrub": scrub, "creep": creep}
+    numbers = {"tau": tau, "reset": reset, "drag": drag, "bound": bound}
+    numbers |= {"no_load": no_load, "scrub": scrub, "creep": creep}
     speed, turn = draw_steps(seed), draw_steps(seed + 1)
     left, right = (speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS
     on_left, on_right = turn_by_motors(HUSKY, left, right, Effects({"wheel_servo": numbers}), STEP)
@@ -212,7 +229,14 @@ def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: floa
 
 @pytest.mark.parametrize(
     ("numbers", "is_lag"),
-    [({}, True), ({"scrub": 0.5}, False), ({"drag": 0.1}, False), ({"bound": 0.3}, False)],
+    [
+        ({}, True),
+        ({"scrub": 0.5}, False),
+        ({"drag": 0.1}, False),
+        ({"bound": 0.3}, False),
+        ({"bound": 1.5}, True),
+        ({"bound": 1.5, "no_load": 2.0}, False),
+    ],
 )
 def test_a_loop_that_nothing_loads_or_bounds_is_a_lag(numbers: dict[str, float], *, is_lag: bool) -> None:
     conditions = Conditions(Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11)))

@@ -1,26 +1,29 @@
 """Wheel servo: a speed controller on each side drives its wheels against the friction of the ground.
 
     each side at u = r Omega [m/s], commanded u_c, e = u_c - u; the body at v and w, a = b/2
-    0.7 tau du/dt = 1.7 (p - drag sign(u)) - 2 F,  p = clip(e + z, bound),
-    dz/dt = reset e while abs(p) < bound,  z = 0 while no side is commanded,
+    0.7 tau du/dt = 1.7 (p - drag sign(u)) - 2 F,  p = clip(e + z, +-bound - bound u / no_load),
+    dz/dt = reset e while p is not clipped,  z = 0 while no side is commanded,
     s_x = u - (v -+ a w),  s_y = 0.87 a w,  (F, S) = (s_x, s_y) / 2 / sqrt((creep u)^2 + (abs(s) / scrub)^2),
     tau dv/dt = F_l + F_r,  a tau dw/dt = F_r - F_l - 0.87 (S_l + S_r)
 
 tau [s] is the time constant of the speed straight ahead, and reset [1/s] the integral over the proportional
-gain. Over the proportional gain, bound [m/s] is the largest force of the drive, drag [m/s] the rolling
-resistance of a side, and scrub [m/s] the friction of the ground: scrub / tau is the largest acceleration that
-the ground gives, the friction coefficient times that of gravity. creep [s/m] is the slip of a rolling wheel
-over the force that it gives while it is small; at rest wheels slip by 0.01 of it. A slow turn begins only
-when the integral part has grown enough to overcome the friction, so that it seems to have a lag of many
-seconds; driving fast there is less of it, and on ice hardly any. The inertia of rotating parts is 0.7 of that
-of the vehicle (the error of the wheels hardly depends on it between 0.3 and 1.5), the contacts are 0.87 b
-apart lengthwise, and the radius of gyration is a. On a Warthog tau 0.15 to 0.2 s, reset 0.2 to 0.4 1/s, bound
-1.1 m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s elsewhere, and creep 0.06 s/m. Drive
-and turn slowly and quickly, on the spot and while driving.
+gain. Over the proportional gain, bound [m/s] is the largest force of the drive at rest, drag [m/s] the
+rolling resistance of a side, and scrub [m/s] the friction of the ground: scrub / tau is the largest
+acceleration that the ground gives, the friction coefficient times that of gravity. As the torque of a DC
+motor, the largest force falls linearly with speed, to zero at no_load [m/s], so that wheels turn less fast
+against the friction of a turn than straight ahead. creep [s/m] is the slip of a rolling wheel over the force
+that it gives while it is small; at rest wheels slip by 0.01 of it. A slow turn begins only when the integral
+part has grown enough to overcome the friction, so that it seems to have a lag of many seconds; driving fast
+there is less of it, and on ice hardly any. The inertia of rotating parts is 0.7 of that of the vehicle (the
+error of the wheels hardly depends on it between 0.3 and 1.5), the contacts are 0.87 b apart lengthwise, and
+the radius of gyration is a. On a Warthog tau 0.1 to 0.2 s, reset 0.2 to 0.4 1/s, bound 1.1 to 1.7 m/s,
+no_load 5 m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s elsewhere, and creep 0.06 s/m.
+Drive and turn slowly and quickly, on the spot and while driving.
 
 Source: speed controllers as in ros2_control; anti-windup of Astrom and Murray, Feedback Systems, chapter 10;
-skid-steered contacts of Caracciolo, De Luca and Iannitti, 1999; forces of rolling tyres in proportion to slip
-ratio and slip angle, Pacejka, Tire and Vehicle Dynamics, chapter 3; measured on the DRIVE recordings.
+DC motors of Franklin, Powell and Emami-Naeini, Feedback Control of Dynamic Systems, chapter 2; skid-steered
+contacts of Caracciolo, De Luca and Iannitti, 1999; forces of rolling tyres in proportion to slip ratio and
+slip angle, Pacejka, Tire and Vehicle Dynamics, chapter 3; measured on the DRIVE recordings.
 """
 
 import math
@@ -106,10 +109,21 @@ class WheelServo(DriveEffect):
             "m/s",
             (0.01, 20.0),
             INF,
-            "largest force of the drive over the proportional gain",
-            1.1,
+            "largest force of the drive at rest over the proportional gain",
+            1.3,
             search=Search.STARTS,
             step=5e-3,
+            level=Level.VEHICLE,
+        ),
+        Parameter(
+            "no_load",
+            "m/s",
+            (0.1, 100.0),
+            INF,
+            "speed at which the largest force of the drive has fallen to zero",
+            5.0,
+            search=Search.STARTS,
+            step=2e-2,
             level=Level.VEHICLE,
         ),
         Parameter(
@@ -138,13 +152,21 @@ class WheelServo(DriveEffect):
         ),
     )
     starts = (
-        {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "scrub": 1.4, "creep": 0.065},
-        {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "scrub": 0.2, "creep": 0.3},
-        {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "scrub": 0.5, "creep": 0.065},
+        {
+            "tau": 0.17,
+            "reset": 0.37,
+            "drag": 0.08,
+            "bound": 1.3,
+            "no_load": 5.0,
+            "scrub": 1.4,
+            "creep": 0.065,
+        },
+        {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "no_load": 5.0, "scrub": 0.2, "creep": 0.3},
+        {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
     motion = (
-        "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g} m/s, drag {drag:.2g} m/s, "
-        "scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
+        "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g} m/s, "
+        "no-load speed {no_load:.2g} m/s, drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
     )
     clause = "answers commands against a friction of {scrub:.2g} m/s"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
@@ -164,11 +186,12 @@ class WheelServo(DriveEffect):
     python = """
         rate, aside, tau = 2.0 / step_s, B / 2.0, max({tau}, 0.01)
         gain, asked, rolled = 0.85 / tau, (left * R, right * R), (rolled_left, rolled_right)
-        most, widest = gain * {bound}, max({scrub}, 1e-6) / tau
+        widest, slope = max({scrub}, 1e-6) / tau, {bound} / {no_load} if {bound} < math.inf else 0.0
         is_driven = max(abs(left), abs(right)) * R >= 1e-6
         pushes = (push_left, push_right) if is_driven else (0.0, 0.0)
         near = (rolled_left + more_left, rolled_right + more_right)
         near_v, near_w = load_v + more_v, load_w + more_w
+        most = [[gain * max({bound} - way * slope * u, 0.0) for way in (1.0, -1.0)] for u in near]
         grip = [
             0.5 * ({scrub} > 0.0) / math.hypot(
                 {creep} * tau * u, 0.01 * tau,
@@ -182,8 +205,8 @@ class WheelServo(DriveEffect):
                 for u, f, s in zip(near, grip, bound)
             ]
             free = [
-                (0.35 * rate * u + (s * most if s else gain * c + z)) / h
-                for u, c, z, s, h in zip(rolled, asked, pushes, bound, held)
+                (0.35 * rate * u + (s * m[s < 0.0] if s else gain * c + z)) / h
+                for u, c, z, s, h, m in zip(rolled, asked, pushes, bound, held, most)
             ]
             firm = [f * (1.0 - f / h) for f, h in zip(grip, held)]
             a, b, c = rate + sum(firm), aside * (firm[1] - firm[0]), aside ** 2 * (
@@ -197,12 +220,15 @@ class WheelServo(DriveEffect):
                 for u, f, h, way in zip(free, grip, held, (-1.0, 1.0))
             ]
             pull = [gain * (c - u) + z for c, u, z in zip(asked, reached, pushes)]
-            more = [s or (math.copysign(1.0, g) if abs(g) > most else 0.0) for g, s in zip(pull, bound)]
+            more = [
+                s or (math.copysign(1.0, g) if abs(g) > m[g < 0.0] else 0.0)
+                for g, s, m in zip(pull, bound, most)
+            ]
             if more == bound:
                 break
             bound = more
         grown = [{reset} * gain * (c - u) * step_s * is_driven for c, u in zip(asked, reached)]
-        room = [max(most - abs(g), 0.0) for g in pull]
+        room = [max(m[g < 0.0] - abs(g), 0.0) for g, m in zip(pull, most)]
         grown = [max(-d, min(d, n)) if n * g > 0.0 else n for n, d, g in zip(grown, room, pull)]
         push_left, push_right = (z + n for z, n in zip(pushes, grown))
         more_left, more_right = (m - u for m, u in zip(reached, rolled))
@@ -212,13 +238,24 @@ class WheelServo(DriveEffect):
         left, right = reached[0] / R, reached[1] / R"""
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers; a force that is not bounded is omitted."""
-        return super().describe_motion(vehicle, beside).replace(", bound inf m/s", "")
+        """What the vehicle does, with numbers; a bound that is infinite is omitted."""
+        text = super().describe_motion(vehicle, beside)
+        return text.replace(", bound inf m/s", "").replace(", no-load speed inf m/s", "")
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a lag: neither ground nor resistance loads it, and its force is never bounded."""
-        drag, bound, scrub = (self.values[name] for name in ("drag", "bound", "scrub"))
-        return scrub < _LEAST_SCRUB and drag < _LEAST_DRAG and bound >= conditions.largest.speed
+        drag, scrub, speed = self.values["drag"], self.values["scrub"], conditions.largest.speed
+        return (
+            scrub < _LEAST_SCRUB
+            and drag < _LEAST_DRAG
+            and self.values["bound"] - self._slope * speed >= speed
+        )
+
+    @property
+    def _slope(self) -> float:
+        """How fast the largest force falls with speed, over the proportional gain."""
+        bound = self.values["bound"]
+        return bound / self.values["no_load"] if math.isfinite(bound) else 0.0
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
@@ -248,6 +285,7 @@ class WheelServo(DriveEffect):
                 (_REST * tau) ** 2 if scrub > 0.0 else math.inf,
                 (tau / max(scrub, _TINY)) ** 2,
                 0.5 * context.track_m,
+                self._slope * gain,
             )
         )
         rolled = np.empty((2, left.size))
@@ -274,13 +312,14 @@ def _roll(
         states: speeds of both sides set before a cell, NaN elsewhere, and whether they are those at the start
             of a prediction; the first one is set, shape (n, 3).
         idle: share of each cell without a command, shape (n,).
-        numbers: proportional gain [1/s], integral gain [1/s^2], drag [m/s^2], largest push [m/s^2], squared
-            slip over acceleration of rolling wheels [s^4/m^2] and of those at rest [s^2], inverse square of
-            the largest acceleration [s^4/m^2], and half the track width [m].
+        numbers: proportional gain [1/s], integral gain [1/s^2], drag [m/s^2], largest push at rest [m/s^2],
+            squared slip over acceleration of rolling wheels [s^4/m^2] and of those at rest [s^2], inverse
+            square of the largest acceleration [s^4/m^2], half the track width [m], and by how much the
+            largest push falls with speed [1/s].
         step_s: width of a cell [s].
         rolled: the result [m/s], shape (2, n).
     """
-    gain, reset, drag, most, aside = numbers[0], numbers[1], numbers[2], numbers[3], numbers[7]
+    gain, reset, drag, aside = numbers[0], numbers[1], numbers[2], numbers[7]
     rate, inertia = 2.0 / step_s, _ROTATING / step_s
     on_left, on_right, ahead, turn, push_left, push_right = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     step_left, step_right, step_v, step_w = 0.0, 0.0, 0.0, 0.0
@@ -321,16 +360,18 @@ def _roll(
             pull_left = gain * (left[cell] - mean_left) + push_left
             pull_right = gain * (right[cell] - mean_right) + push_right
             was_left, was_right = is_free_left, is_free_right
-            is_free_left = was_left and abs(pull_left) <= most
-            is_free_right = was_right and abs(pull_right) <= most
+            most_left = _find_most(pull_left, near_left, numbers)
+            is_free_left = was_left and abs(pull_left) <= most_left
+            most_right = _find_most(pull_right, near_right, numbers)
+            is_free_right = was_right and abs(pull_right) <= most_right
             if is_free_left == was_left and is_free_right == was_right:
                 break
-            asked_left = asked_left if is_free_left else math.copysign(most, pull_left)
-            asked_right = asked_right if is_free_right else math.copysign(most, pull_right)
+            asked_left = asked_left if is_free_left else math.copysign(most_left, pull_left)
+            asked_right = asked_right if is_free_right else math.copysign(most_right, pull_right)
         rolled[0, cell], rolled[1, cell] = mean_left, mean_right
         grown = reset * step_s * driven
-        push_left = start_left + _hold(grown * (left[cell] - mean_left), pull_left, most)
-        push_right = start_right + _hold(grown * (right[cell] - mean_right), pull_right, most)
+        push_left = start_left + _hold(grown * (left[cell] - mean_left), pull_left, most_left)
+        push_right = start_right + _hold(grown * (right[cell] - mean_right), pull_right, most_right)
         step_left, step_right, step_v, step_w = (
             mean_left - on_left,
             mean_right - on_right,
@@ -382,6 +423,12 @@ def _move(
     twist = aside * (aside * rate * turn + grip_right * right - grip_left * left)
     w = (twist * straight - mixed * push) / (straight * turning - mixed * mixed)
     return (push - mixed * w) / straight, w
+
+
+@compiled()
+def _find_most(pull: float, speed: float, numbers: Floats) -> float:
+    """Largest push of a side [m/s^2] in the direction of a pull, at its speed [m/s]."""
+    return max(numbers[3] - math.copysign(numbers[8] * speed, pull * speed), 0.0)
 
 
 @compiled()
