@@ -241,12 +241,13 @@ _NEVER_NEGATIVE = {
     *("limit", "threshold", "bound", "reset", "scrub", "drag", "creep"),
     *("friction", "gyration"),
 }
-_UNBOUNDED = {"limit", "bound", "friction"}
+_UNBOUNDED = {"limit", "bound", "no_load", "friction"}
+_LEAST = {"no_load": 0.1}
 _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "contact_friction": 1.0}
 
 
 def _check_value(effect: str, name: str, value: float) -> None:
-    low = -_INF
+    low = _LEAST.get(name, -_INF)
     waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
     if name in _NEVER_NEGATIVE or name.startswith("tau") or effect == "steering_play" or waits:
         low = 0.0

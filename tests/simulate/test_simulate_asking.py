@@ -69,6 +69,7 @@ def test_every_effect_of_the_catalogue_can_be_asked_for() -> None:
         ({"effects": {"effective_track": 0.0}}, "bad_value", r"at least 0\.05"),
         ({"effects": {"wheel_servo": {"scrub": -0.1}}}, "bad_value", "at least 0"),
         ({"effects": {"wheel_servo": {"creep": -0.1}}}, "bad_value", "at least 0"),
+        ({"effects": {"wheel_servo": {"no_load": 0.0}}}, "bad_value", "at least 0.1"),
         ({"effects": {"wheel_servo": {"scrub": math.inf}}}, "bad_value", "finite"),
         ({"effects": {"lateral_skid": math.nan}}, "bad_value", "finite"),
         ({"effects": {"understeer": 0.1}}, "wrong_vehicle", "ackermann"),
