@@ -235,7 +235,7 @@ class Effect(ABC):
         return does.replace("base_link", "the reference point") or f"shows {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
-        """A template with its numbers, without the parts between commas with one of `open_numbers`."""
+        """A template with its numbers, less parts between commas with one that is open or infinite."""
         (name_of_first, first), *_ = self.values.items()
         base, slope = self.share_of
         size = abs(first) * self.size_in
@@ -248,10 +248,11 @@ class Effect(ABC):
             "degrees": math.degrees(size),
             "rim": abs(first) * vehicle.wheel_radius_m,
         }
+        unknown = {*self.open_numbers, *(name for name, value in self.values.items() if math.isinf(value))}
         parts = []
         for part in template.split(", "):
             names = [name for _, name, _, _ in Formatter().parse(part) if name]
-            if self.open_numbers.isdisjoint(name if name in self.values else name_of_first for name in names):
+            if unknown.isdisjoint(name if name in self.values else name_of_first for name in names):
                 parts.append(part.format(**words))
         return ", ".join(parts)
 

@@ -27,19 +27,17 @@ slip angle, Pacejka, Tire and Vehicle Dynamics, chapter 3; measured on the DRIVE
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.machine_code import compiled
-from pipeline.models.effect import INF, DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import set_states
 from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
-from pipeline.sources import Vehicle
 
 _ROTATING = 0.7
 """Inertia of the rotating parts over that of the vehicle: the loss of nine Warthog runs on five grounds
@@ -166,7 +164,7 @@ class WheelServo(DriveEffect):
     )
     motion = (
         "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g} m/s, "
-        "no-load speed {no_load:.2g} m/s, drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
+        "no-load {no_load:.2g} m/s, drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
     )
     clause = "answers commands against a friction of {scrub:.2g} m/s"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
@@ -236,11 +234,6 @@ class WheelServo(DriveEffect):
         rolled_left, rolled_right = reached[0] + more_left, reached[1] + more_right
         load_v, load_w = ahead + more_v, turn + more_w
         left, right = reached[0] / R, reached[1] / R"""
-
-    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers; a bound that is infinite is omitted."""
-        text = super().describe_motion(vehicle, beside)
-        return text.replace(", bound inf m/s", "").replace(", no-load speed inf m/s", "")
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a lag: neither ground nor resistance loads it, and its force is never bounded."""
