@@ -15,7 +15,9 @@ from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES, Program
 
 WARTHOG = vehicle_of("warthog")
-HIDDEN = {"tau": 0.2, "reset": 0.3, "drag": 0.06, "bound": 0.9, "scrub": 1.2, "creep": 0.07}
+HIDDEN = {
+    "tau": 0.2, "reset": 0.3, "drag": 0.06, "bound": 1.3, "no_load": 5.0, "scrub": 1.2, "creep": 0.07
+}  # fmt: skip
 
 
 def make_problem() -> Problem:
@@ -34,13 +36,22 @@ def make_problem() -> Problem:
 def test_a_servo_comes_back_from_a_gentle_and_a_fast_run_and_each_says_what_it_knows() -> None:
     problem = make_problem()
     drive = problem.parts[1]
-    begun = find_effect("wheel_servo")(tau=0.25, reset=0.2, drag=0.04, bound=1.3, scrub=1.0, creep=0.1)
+    start = {
+        "tau": 0.25,
+        "reset": 0.2,
+        "drag": 0.04,
+        "bound": 1.6,
+        "no_load": 7.0,
+        "scrub": 1.0,
+        "creep": 0.1,
+    }
+    begun = find_effect("wheel_servo")(**start)
     fit = fit_part_jointly(drive, problem.start_state([begun]))
     (found,) = fit.state.effects
     # As good as from the truth within a thousandth of the error: its derivatives are one-sided.
     true = fit_part_jointly(drive, problem.start_state([find_effect("wheel_servo")(**HIDDEN)]))
     assert fit.loss <= true.loss + 1e-3
-    for name in ("tau", "reset", "scrub", "bound"):
+    for name in ("tau", "reset", "scrub", "bound", "no_load"):
         assert found.values[name] == pytest.approx(HIDDEN[name], rel=0.2), name
     gentle, fast = split_normals(drive, fit)
     assert gentle.labels == fast.labels == tuple(f"wheel_servo.{name}" for name in found.values)
