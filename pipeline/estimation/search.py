@@ -166,8 +166,7 @@ _CLEAR = 2.5
 """Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
 421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
 _EXPECTED = 0.6
-"""Evidence over that required at which a companion of an effect stays in the model, three standard errors: a
-drive with a speed controller has ramps and limits."""
+"""Evidence over that required at which companions of an effect stay: a controller has ramps and limits."""
 _WHOLE = 0.9
 """Largest loss with an effect and its companions, over that with its special cases in its place, for a search
 to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs
@@ -459,9 +458,7 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     does friction in contact whose search began with a wider track and a skid.
     """
     usual = {one.id: _make_possible(one(), selection.conditions) for one in selection.candidates}
-    for one in usual.values():
-        if not one.companions or one.id in first.ids:
-            continue
+    for one in (one for one in usual.values() if one.companions and one.id not in first.ids):
         loaded = [first.state.add(*some) for some in _list_companions(one, usual)]
         cases = [usual[name] for name in one.contains if name in usual]
         start, *starts = (state.add(one.change(**values)) for state in loaded for values in one.starts)

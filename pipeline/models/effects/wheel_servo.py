@@ -421,7 +421,8 @@ def _move(
 @compiled()
 def _find_most(pull: float, speed: float, numbers: Floats) -> float:
     """Largest push of a side [m/s^2] in the direction of a pull, at its speed [m/s]."""
-    return max(numbers[3] - math.copysign(numbers[8] * speed, pull * speed), 0.0)
+    most: float = max(numbers[3] - math.copysign(numbers[8] * speed, pull * speed), 0.0)
+    return most
 
 
 @compiled()
