@@ -204,6 +204,11 @@ def _follow_only(_original: Any, of: selection.Selection, model: Any, best: Any)
     return of.loss(model) < (1.0 - selection._BETTER) * of.loss(best)
 
 
+def _forget_restarts(original: Callable[..., Any], *args: Any, **named: Any) -> Any:
+    """The gain on the whole recording alone."""
+    return original(*args, **{**named, "restarted": None})
+
+
 def _same_matter(one: Any, other: Any) -> bool:
     """Whether what an effect moves makes no difference to its name: nothing known, nothing is refused."""
     return one is None or (other is None and one.is_material)
@@ -222,6 +227,12 @@ RULES: tuple[Rule, ...] = (
          costly=True),
     Rule("uneven_noise", "noise may differ from stretch to stretch", acceptance, "measure_evidence",
          _set(acceptance, _CLUSTER=1), _same_sum),
+    Rule("predicted_gain", "a gain counts in predictions from measured states, too", selection, "compare",
+         _forget_restarts, _same_verdict),
+    Rule("begin_whole", "a search begins with a controller, or contact, and its companions", search,
+         "_begin_whole", _second, _same_ids),
+    Rule("expected", "companions stay at three standard errors", search, "prune", _set(search, _EXPECTED=1.0),
+         costly=True),
     Rule("pairs", "two effects may be added at once", evidence.Evidence, "rank_pairs", _give([]),
          costly=True),
     Rule("exchange", "one effect may take the place of another", search, "exchange", _second, _same_ids),

@@ -165,7 +165,14 @@ class Improvement:
 
 
 def compare(
-    noise: Noise, weights: Weights, before: Floats, after: Floats, *, numbers: int = 1, shapes: int = 1
+    noise: Noise,
+    weights: Weights,
+    before: Floats,
+    after: Floats,
+    *,
+    numbers: int = 1,
+    shapes: int = 1,
+    restarted: tuple[Floats, Floats] | None = None,
 ) -> Improvement:
     """Compare two models, the second of which has more parameters.
 
@@ -179,12 +186,16 @@ def compare(
         after: of the second one.
         numbers: number of additional parameters of the second.
         shapes: number of candidates that the second was selected from; the evidence is reduced accordingly.
+        restarted: residuals of both with states reset to measured ones at each prediction, which the gain
+            counts as well.
     """
     by_stretch = measure_evidence(noise, before, after)
     total = float(by_stretch.sum())
     free = max(numbers - 1, 0) + 2.0 * math.log(shapes)
     stable = total - float(by_stretch.max(initial=0.0))
-    gain = 1.0 - weights.loss(after) / max(weights.loss(before), 1e-300)
+    pairs = ((before, after), *((restarted,) if restarted else ()))
+    old, new = (sum(map(weights.loss, residuals)) for residuals in zip(*pairs, strict=True))
+    gain = 1.0 - new / max(old, 1e-300)
     return Improvement(math.sqrt(max(total - free, 0.0)), math.sqrt(max(stable - free, 0.0)), gain)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import cast
 
@@ -312,12 +312,12 @@ class Selection:
     def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
         """How much better ``after``, which has more numbers, is."""
         noise = self.noise or self.take_evidence(before).noise
-        improvement = compare(
+        return compare(
             noise, self.weights, before.fit.residual, after.fit.residual,
             numbers=after.numbers - before.numbers,
             shapes=math.prod(self.shapes.get(name, 1) for name in set(after.ids) - set(before.ids)),
+            restarted=(before.restarted, after.restarted),
         )  # fmt: skip
-        return replace(improvement, gain=1.0 - self.sum_losses(after) / max(self.sum_losses(before), 1e-300))
 
     def take_weights(self, weights: Weights) -> None:
         """Judge by other weights; models fitted without some effects under the present ones are forgotten."""
