@@ -161,7 +161,11 @@ class Improvement:
     @property
     def is_significant(self) -> bool:
         """Whether the improvement is significant, stable over the run and large enough to matter."""
-        return self.gain >= LEAST_GAIN and self.share >= 1.0
+        return self.reaches(1.0)
+
+    def reaches(self, share: float) -> bool:
+        """Whether it matters, with at least this fraction of the required evidence."""
+        return self.gain >= LEAST_GAIN and self.share >= share
 
 
 def compare(

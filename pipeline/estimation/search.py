@@ -354,7 +354,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         weak = [
             (one.share, without)
             for name, (one, without) in zip(doubtful, judged, strict=True)
-            if one.gain < LEAST_GAIN or one.share < (_EXPECTED if name in expected else 1.0)
+            if not one.reaches(_EXPECTED if name in expected else 1.0)
         ]
         if not weak:
             return current

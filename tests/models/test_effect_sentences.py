@@ -55,7 +55,7 @@ def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind
     assert kind.id not in sentence
     assert "nan" not in sentence
     # With the seven quantities of a servo it still fits into one line of a report.
-    assert len(sentence) < 115
+    assert len(sentence) < 100
     for parameter in kind.parameters:
         if parameter.instead_of:
             continue

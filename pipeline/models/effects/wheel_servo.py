@@ -163,8 +163,8 @@ class WheelServo(DriveEffect):
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
     motion = (
-        "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g} m/s, "
-        "no-load {no_load:.2g} m/s, drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
+        "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g}/{no_load:.2g} m/s, "
+        "drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
     )
     clause = "answers commands against a friction of {scrub:.2g} m/s"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
