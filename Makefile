@@ -22,7 +22,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
 	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
-	log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms reveal rivals samples screenshots serve \
+	log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms pose-ages reveal rivals samples screenshots serve \
 	test \
 	test-long trend twin watch-replay wheel
 
@@ -108,6 +108,9 @@ hidden-effect-score: $(VENV)/.ready-dev ## ANSWERS=dir: score answers to the pub
 
 hidden-effect-baselines: $(VENV)/.ready-dev ## the baselines of the public test on rings/, with their scores [ARGS="--only sparse slip"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/hidden_effect/run_baselines.py $$ARGS
+
+pose-ages: $(VENV)/.ready-dev ## how near the ages of poses are to those of the gyro where it is withheld [ARGS="LOG... --set NAME=VALUE"]
+	@$(BIN)/python benchmarks/pose_ages.py $$ARGS
 
 ablate: $(VENV)/.ready-dev ## ablation: each rule of the diagnosis off in turn, on drawn logs and the recordings [SEED=81000-81038, SCORES=file, ARGS=]
 	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS

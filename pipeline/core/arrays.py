@@ -428,30 +428,39 @@ def _solve_free(design: Floats, target: Floats, free: Flags) -> Floats:
     return solved
 
 
-def solve_tridiagonal(diagonal: Floats, beside: Floats, right: Floats) -> Floats:
-    """Solution of a symmetric positive definite tridiagonal system, shape (n,).
+def solve_banded(matrix: Floats, right: Floats) -> Floats:
+    """Solution of a symmetric positive definite banded system, shape (n,).
 
     Args:
-        diagonal: shape (n,).
-        beside: off-diagonal, shape (n - 1,).
+        matrix: lower diagonals by row: ``matrix[k, i]`` is the element of row i and column i - k, zero where
+            i < k; shape (1 + bandwidth, n).
         right: right-hand side, shape (n,).
 
-    Source: Golub and Van Loan, Matrix Computations, 4.3.6.
+    Source: Golub and Van Loan, Matrix Computations, 4.3.5, as L D L^T.
     """
     solution = right.copy()
-    _solve_tridiagonal(diagonal.copy(), np.ascontiguousarray(beside), solution)
+    _solve_banded(np.ascontiguousarray(matrix.T).copy(), solution)
     return solution
 
 
-@compiled("float64[:], float64[:], float64[:]")
-def _solve_tridiagonal(diagonal: Floats, beside: Floats, solution: Floats) -> None:
-    """`solve_tridiagonal` in place: ``solution`` is the right-hand side; ``diagonal`` is overwritten."""
-    for row in range(1, diagonal.size):
-        share = beside[row - 1] / diagonal[row - 1]
-        diagonal[row] -= share * beside[row - 1]
-        solution[row] -= share * solution[row - 1]
-    for row in range(diagonal.size - 1, -1, -1):
-        # Also the last row is solved in the loop: an empty system has no memory to write to.
-        if row + 1 < diagonal.size:
-            solution[row] -= beside[row] * solution[row + 1]
-        solution[row] /= diagonal[row]
+@compiled("float64[:, :], float64[:]")
+def _solve_banded(matrix: Floats, solution: Floats) -> None:
+    """`solve_banded` in place: ``solution`` is the right-hand side, ``matrix`` is transposed, overwritten."""
+    count, width = matrix.shape[0], matrix.shape[1]
+    for row in range(count):
+        first = max(0, row + 1 - width)
+        for column in range(first, row):
+            total = matrix[row, row - column]
+            for before in range(max(first, column + 1 - width), column):
+                total -= matrix[row, row - before] * matrix[column, column - before]
+            # Times the pivot until the row is complete.
+            matrix[row, row - column] = total
+        for column in range(first, row):
+            factor = matrix[row, row - column] / matrix[column, 0]
+            matrix[row, 0] -= factor * matrix[row, row - column]
+            matrix[row, row - column] = factor
+            solution[row] -= factor * solution[column]
+    for row in range(count - 1, -1, -1):
+        solution[row] /= matrix[row, 0]
+        for below in range(row + 1, min(row + width, count)):
+            solution[row] -= matrix[below, below - row] * solution[below]

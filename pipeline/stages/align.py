@@ -462,7 +462,9 @@ def _report_wheels(late: float) -> list[Finding]:
 def _report_poses(alignment: Alignment) -> list[Finding]:
     findings = []
     if alignment.latency_spread_s > 0.0:
-        text = f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: corrected with the gyro"
+        text = (
+            f"the latency of poses varies by {alignment.latency_spread_s:.2g} s: corrected with gyro and path"
+        )
         findings.append(Finding("pose_latency", "info", text, where="pose", value=alignment.latency_spread_s))
     if alignment.outlier_s > 0.0:
         text = f"{alignment.outlier_s:.3g} s excluded: the localization contradicts the wheels there"

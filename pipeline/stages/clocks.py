@@ -12,7 +12,7 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Ints
+from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.stages import Finding, timing
@@ -42,6 +42,28 @@ _OTHER_RATE = 5e-3
 """Difference in rate that no two real clocks have; simulated time does."""
 _BENT_S = 0.3
 """Deviation [s] larger than network delays: the clock itself stopped, or ran faster."""
+_AT_ONCE = 0.1
+"""Fraction of the period below which two messages were simultaneous."""
+_BUNCHED = 0.25
+"""Fraction of simultaneous messages above which a bridge delays them: with bunches of two it is a half."""
+_PACE_NS = 5e9
+"""Time [ns] over which a sender's rate is measured: 25 times a delay of 0.2 s."""
+_FEWEST_OF_PACE = 100
+"""Least number of messages for the rate: independent ones vary by 10 %, twice `_STEADY`."""
+_USUAL_SHARE = 0.99
+"""Quantile of gaps between messages that are not holes."""
+_STEADY = 0.05
+"""Relative variation of a steady rate: bridge delays of .2 s change 5 s by 2 %, random 10 Hz ones by 14 %."""
+_HELD_UP_SHARE = 0.95
+"""Quantile of delays that is reported: a few are a hole of the network."""
+_LEAST_HELD_UP_S = 0.03
+"""Least delay of a bunch [s], below a command period: two simultaneous messages are not a bunch."""
+_HOLE_PERIODS = 8.0
+"""Usual periods that a hole of a slow topic exceeds: bunches of eight cause gaps of as many."""
+_HOLE_NS = 1_000_000_000
+"""Gap [ns] above which a line is interrupted: bridges delay messages by less."""
+_REACH = 25
+"""Messages on each side for a line: fifty include several bunches of ten."""
 
 
 @dataclass(frozen=True)
@@ -211,17 +233,72 @@ def _spread_bunches(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorde
     for key, times in recorded.items():
         if times.clock is not None or (times.header_time is not None and times.header_time.any()):
             continue
-        log = timing.spread_bunches(times.log_time)
+        log = _draw_evenly(times.log_time)
         if log is times.log_time:
             continue
         even[key] = replace(times, log_time=log)
-        late = timing.find_held_up_s(times.log_time, log)
+        late = _find_held_up_s(times.log_time, log)
         text = (
             f"{times.topic} has no stamps and was recorded in bunches, up to {late * 1e3:.0f} ms late: its "
             "messages were spread at the rate of their sender"
         )
         findings.append(Finding("bunched_times", "info", text, where=times.topic, value=late))
     return even, findings
+
+
+def _draw_evenly(log_time: Stamps) -> Stamps:
+    """Arrival times of bunched messages at the rate of their sender.
+
+    The messages of a steady sender lie on a line over their number, and a bridge only delays them: the line
+    is below all of them. It is estimated for every message from its neighbours, so that it follows the
+    sender's rate; holes interrupt it.
+
+    Args:
+        log_time: log times of a topic [ns], increasing, shape (n,).
+
+    Returns:
+        Times [ns], shape (n,); unchanged if messages did not arrive in bunches.
+    """
+    gaps = np.diff(log_time).astype(np.float64)
+    if gaps.size < _REACH:
+        return log_time
+    period = float(gaps[gaps <= np.quantile(gaps, _USUAL_SHARE)].mean())
+    if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
+        return log_time
+    even = (log_time - log_time[0]).astype(np.float64)
+    holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
+    for part in np.split(np.arange(even.size), holes):
+        if part.size > 2 * _REACH:
+            even[part] = np.minimum(_draw_below(even[part]), even[part])
+    spread: Stamps = log_time[0] + np.rint(np.maximum.accumulate(even)).astype(np.int64)
+    return spread if _find_held_up_s(log_time, spread) > _LEAST_HELD_UP_S else log_time
+
+
+def _is_steady(log_time: Stamps, period: float) -> bool:
+    """Whether equal numbers of messages take equal times, unlike those of a hand on a joystick."""
+    many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
+    took = np.diff(log_time[::many]).astype(np.float64)
+    if took.size < timing.FEWEST_PIECES:
+        return False
+    usual = float(np.median(took))
+    return robust_spread(took - usual) < _STEADY * usual
+
+
+def _find_held_up_s(log_time: Stamps, spread: Stamps) -> float:
+    """Delay of the bunches [s], a high quantile."""
+    return float(np.quantile(log_time - spread, _HELD_UP_SHARE)) / 1e9
+
+
+def _draw_below(times: Floats) -> Floats:
+    number = np.arange(times.size)
+    period = float(times[-1] - times[0]) / (times.size - 1)
+    above = times - period * number
+    windows = np.lib.stride_tricks.sliding_window_view
+    least = windows(np.pad(above, _REACH, mode="edge"), 2 * _REACH + 1).min(axis=1)
+    # Minimum over the neighbours, then its mean: a smooth line below the messages.
+    smooth = windows(np.pad(least, _REACH, mode="edge"), 2 * _REACH + 1).mean(axis=1)
+    drawn: Floats = smooth + period * number
+    return drawn
 
 
 def _read_clock(times: Recorded) -> TopicClock:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, robust_spread, solve_tridiagonal
+from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints, robust_spread, solve_banded
 from pipeline.core.rigid import LONGEST_WAIT_S
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run import GyroFit, MotionRun, Track
@@ -31,34 +33,12 @@ _PIECES = 20
 clock spoils one piece."""
 _FEWEST_IN_PIECE = 50
 """Least number of messages per piece: of 50, one is at `_FLOOR_SHARE`."""
-_FEWEST_PIECES = 5
+FEWEST_PIECES = 5
 """Least number of pieces, or of steps of a clock, for a median and a spread."""
 _LEAST_DRIFT_NS = round(1e9 * LEAST_DELAY_S)
 """Least drift over a whole run: without drift stamps deviate by as much (`LEAST_DELAY_S`)."""
 _FASTEST_DRIFT = 5e-4
 """Largest drift: quartz clocks differ by less than 200e-6, NTP adjusts a clock by up to 500e-6 (slew)."""
-_AT_ONCE = 0.1
-"""Fraction of the period below which two messages were simultaneous."""
-_BUNCHED = 0.25
-"""Fraction of simultaneous messages above which a bridge delays them: with bunches of two it is a half."""
-_PACE_NS = 5e9
-"""Time [ns] over which a sender's rate is measured: 25 times a delay of 0.2 s."""
-_FEWEST_OF_PACE = 100
-"""Least number of messages for the rate: independent ones vary by 10 %, twice `_STEADY`."""
-_STEADY = 0.05
-"""Relative variation of a steady rate: bridge delays of .2 s change 5 s by 2 %, random 10 Hz ones by 14 %."""
-_USUAL_SHARE = 0.99
-"""Quantile of gaps between messages that are not holes."""
-_HELD_UP_SHARE = 0.95
-"""Quantile of delays that is reported: a few are a hole of the network."""
-_LEAST_HELD_UP_S = 0.03
-"""Least delay of a bunch [s], below a command period: two simultaneous messages are not a bunch."""
-_HOLE_PERIODS = 8.0
-"""Usual periods that a hole of a slow topic exceeds: bunches of eight cause gaps of as many."""
-_HOLE_NS = 1_000_000_000
-"""Gap [ns] above which a line is interrupted: bridges delay messages by less."""
-_REACH = 25
-"""Messages on each side for a line: fifty include several bunches of ten."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +103,7 @@ def map_clock(log_time: Stamps, stamp: Stamps) -> ClockMap | None:
     log, shown = log_time[last], latest[last]
     new = np.append([True], np.diff(shown) > 0)
     log, shown = log[new].astype(np.float64), shown[new].astype(np.float64)
-    return ClockMap(log, shown) if log.size >= _FEWEST_PIECES else None
+    return ClockMap(log, shown) if log.size >= FEWEST_PIECES else None
 
 
 @dataclass(frozen=True)
@@ -166,7 +146,7 @@ class Drift:
 def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
     """Drift of a topic's stamps: a straight line through the least delays of pieces of the run."""
     pieces = min(_PIECES, stamp.size // _FEWEST_IN_PIECE)
-    if pieces < _FEWEST_PIECES:
+    if pieces < FEWEST_PIECES:
         return Drift()
     delay = (log_time - stamp).astype(np.float64)
     spans = np.array_split(np.arange(stamp.size), pieces)
@@ -182,67 +162,23 @@ def measure_drift(log_time: Stamps, stamp: Stamps) -> Drift:
     return Drift(-slope, scatter, int(stamp.min()), int(stamp.max()), float(np.median(rest)))
 
 
-def spread_bunches(log_time: Stamps) -> Stamps:
-    """Arrival times of bunched messages at the rate of their sender.
-
-    The messages of a steady sender lie on a line over their number, and a bridge only delays them: the line
-    is below all of them. It is estimated for every message from its neighbours, so that it follows the
-    sender's rate; holes interrupt it.
-
-    Args:
-        log_time: log times of a topic [ns], increasing, shape (n,).
-
-    Returns:
-        Times [ns], shape (n,); unchanged if messages did not arrive in bunches.
-    """
-    gaps = np.diff(log_time).astype(np.float64)
-    if gaps.size < _REACH:
-        return log_time
-    period = float(gaps[gaps <= np.quantile(gaps, _USUAL_SHARE)].mean())
-    if float(np.mean(gaps < _AT_ONCE * period)) < _BUNCHED or not _is_steady(log_time, period):
-        return log_time
-    even = (log_time - log_time[0]).astype(np.float64)
-    holes = np.flatnonzero(gaps > max(_HOLE_NS, _HOLE_PERIODS * period)) + 1
-    for part in np.split(np.arange(even.size), holes):
-        if part.size > 2 * _REACH:
-            even[part] = np.minimum(_draw_below(even[part]), even[part])
-    spread: Stamps = log_time[0] + np.rint(np.maximum.accumulate(even)).astype(np.int64)
-    return spread if find_held_up_s(log_time, spread) > _LEAST_HELD_UP_S else log_time
-
-
-def _is_steady(log_time: Stamps, period: float) -> bool:
-    """Whether equal numbers of messages take equal times, unlike those of a hand on a joystick."""
-    many = max(round(_PACE_NS / period), _FEWEST_OF_PACE) if period > 0.0 else log_time.size
-    took = np.diff(log_time[::many]).astype(np.float64)
-    if took.size < _FEWEST_PIECES:
-        return False
-    usual = float(np.median(took))
-    return robust_spread(took - usual) < _STEADY * usual
-
-
-def find_held_up_s(log_time: Stamps, spread: Stamps) -> float:
-    """Delay of the bunches [s], a high quantile."""
-    return float(np.quantile(log_time - spread, _HELD_UP_SHARE)) / 1e9
-
-
-def _draw_below(times: Floats) -> Floats:
-    number = np.arange(times.size)
-    period = float(times[-1] - times[0]) / (times.size - 1)
-    above = times - period * number
-    windows = np.lib.stride_tricks.sliding_window_view
-    least = windows(np.pad(above, _REACH, mode="edge"), 2 * _REACH + 1).min(axis=1)
-    # Minimum over the neighbours, then its mean: a smooth line below the messages.
-    smooth = windows(np.pad(least, _REACH, mode="edge"), 2 * _REACH + 1).mean(axis=1)
-    drawn: Floats = smooth + period * number
-    return drawn
-
-
 # Age of each pose: poses are shifted to the times of measurement, with the gyro as clock.
 #
 # The delay of a localization varies: a slow scan makes one pose a tenth of a second older than the next,
-# which at 3 m/s is 0.3 m. In a turn the gyro shows when the vehicle had the reported heading. These ages are
-# extended to straight stretches by their correlation time and by the pattern of the stamps: a pose after a
-# long wait is old. Positions and models are not used.
+# which at 3 m/s is 0.3 m along the path. In a turn the gyro shows when the vehicle had the reported heading.
+# While driving, the path shows by how much the ages of neighbouring poses differ: a vehicle does not leap. A
+# pose after a long wait is old. Ages beside these observations follow from their correlation time. Wheels,
+# commands and models are not used.
+#
+# Most likely ages e minimize the squares of, in standard deviations,
+#
+#     age by the heading - e_i,    e_i+1 - u_i+1 - c (e_i - u_i)    with the usual age u by the waits,
+#     p_i+1 - p_i - [(v_i + v_i+1) h / 2 - (a_i+1 - a_i) h^2 / 12 - v (e_i+1 - e_i)],
+#     v_i+1 - v_i - (a_i + a_i+1) h / 2,    a_i+1 - d a_i,
+#
+# for positions p [m], velocities v [m/s] and accelerations a [m/s^2] in the map, and the time h between two
+# poses: accelerations are a first-order process (Singer, IEEE Trans. Aerospace and Electronic Systems 6,
+# 1970).
 
 _ROUNDS = 3
 """Alternations between the ages and the gyro's fit; estimates of both are then stable."""
@@ -257,6 +193,8 @@ _OLDEST = 0.5
 """Largest age [s]: a larger one is a fault of the heading; those of the recordings vary by 0.04 to 0.15 s."""
 _LEAST_SPREAD = 0.015
 """Spread of ages [s] below which stamps are as accurate as the gyro can show."""
+_GYRO_CLOCK_S = 0.01
+"""Standard deviation of a time by the gyro, beside the heading's noise: its own stamps and their sampling."""
 _NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
 """Least time between two poses after the correction [s], so that stamps stay in order."""
@@ -264,7 +202,27 @@ _LEAST_OF_USUAL = 0.5
 """Least fraction of the usual time between two poses after the correction: those at 100 Hz must not shift
 each other."""
 _HUBER = 3.0
-"""Deviation [standard deviations] above which an age has less weight."""
+"""Deviation [standard deviations] above which an age, or a displacement, has less weight."""
+_ACCELERATION_MPS2 = 2.0
+"""Standard deviation of accelerations: with half or twice of it, ages of withheld turns are 4 % nearer or
+3 % farther off (`make pose-ages`)."""
+_STEADY_S = 0.7
+"""Correlation time of accelerations: with 0.3 to 2 s, ages of withheld turns change by 1 to 4 %."""
+_ROUGH = 0.2
+"""Change of velocity beyond that of a steady acceleration, relative to the acceleration over the time."""
+_POSITION_NOISE = 3.0
+"""Noise of a position relative to its spread across a straight path, as scan matching errs while turning:
+with 1 in place of 3, ages of withheld turns are 3 to 11 % farther off (`make pose-ages`)."""
+_LEAST_NOISE_M = 0.003
+"""Least noise of a position, of a scan matcher at rest."""
+_DRIVING_MPS = 0.3
+"""Speed above which a path has a direction."""
+_FAST_MPS = 30.0
+"""Standard deviation of the velocity of a first pose: nothing is known of it."""
+_SMOOTHED = 4
+"""Solutions for the ages in each of `_ROUNDS`: with two, ages of withheld turns are up to 5 % farther off."""
+_STATES = 5
+"""Unknowns of a pose: velocity and acceleration in the map, east and north, and its age."""
 
 
 @dataclass(frozen=True)
@@ -305,7 +263,7 @@ def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
         seen = _look(run, moved.track, gyro, ages)
         if seen.telling.sum() < _FEWEST:
             return nothing
-        ages, spread = _estimate(track, seen)
+        ages, spread = _estimate(track, seen, ages)
         if spread < _LEAST_SPREAD:
             return nothing
     return track.times - _take_off(track, ages), spread
@@ -330,8 +288,8 @@ def _look(run: MotionRun, track: Track, gyro: GyroFit, ages: Floats) -> _Seen:
     )
 
 
-def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
-    """Ages of all poses [s], shape (n,), and their variation [s]."""
+def _estimate(track: Track, seen: _Seen, ages: Floats) -> tuple[Floats, float]:
+    """Ages of all poses [s], shape (n,), and their variation [s], from estimates to start from."""
     pattern = _list_terms(track)
     weight = 1.0 / ((seen.noise / np.maximum(np.abs(seen.rate), _TURNING)) ** 2 + 0.05**2)
     rows = pattern[seen.telling] * weight[seen.telling, None]
@@ -347,33 +305,139 @@ def _estimate(track: Track, seen: _Seen) -> tuple[Floats, float]:
     own = np.sqrt(max(spread**2 - heard, 0.0))
     if own < 1e-3:  # noqa: PLR2004 - nothing but noise
         return np.zeros(usual.size), 0.0
-    ages = usual + _smooth(track, seen, beside, float(own))
+    ages = _smooth(track, seen, ages, usual, float(own))
     ages -= float(np.mean(ages[seen.good])) if seen.good.any() else 0.0
     return ages, float(np.std(ages[seen.telling]))
 
 
-def _smooth(track: Track, seen: _Seen, beside: Floats, spread: float) -> Floats:
-    """Most likely ages relative to the usual ones: a first-order process in time, observed in turns."""
-    wait = np.where(np.diff(track.segment) != 0, np.inf, np.diff(track.times))
-    both = seen.telling[1:] & seen.telling[:-1] & (wait < LONGEST_WAIT_S - ROUNDING_S)
-    limited = np.clip(beside, -3.0 * spread, 3.0 * spread)
+def _smooth(track: Track, seen: _Seen, ages: Floats, usual: Floats, spread: float) -> Floats:
+    """Most likely ages by headings, path and usual ages, see above [s], shape (n,).
+
+    Args:
+        track: the poses.
+        seen: their ages by the heading.
+        ages: ages to start from [s], shape (n,).
+        usual: usual ages by the waits [s], shape (n,).
+        spread: standard deviation of ages about these [s].
+    """
+    wait = np.diff(track.times)
+    is_next = (np.diff(track.segment) == 0) & (wait < LONGEST_WAIT_S - ROUNDING_S)
+    both = seen.telling[1:] & seen.telling[:-1] & is_next
+    limited = np.clip(seen.age - usual, -3.0 * spread, 3.0 * spread)
     alike = 0.5
     if both.sum() >= _FEWEST // 2:
         alike = float(np.clip(np.corrcoef(limited[1:][both], limited[:-1][both])[0, 1], 0.05, 0.95))
     lasts = -float(np.median(wait[both] if both.any() else wait)) / np.log(alike)
-    decay = np.exp(-wait / lasts)
-    stiff = 1.0 / (spread**2 * (1.0 - decay**2))
-    diagonal = np.concatenate(([1.0 / spread**2], stiff))
-    diagonal[:-1] += stiff * decay**2
-    known = np.where(seen.good, (seen.rate / seen.noise) ** 2, 0.0)
-    smoothed = np.zeros(beside.size)
-    for _ in range(3):
-        off = np.abs(beside - smoothed) * np.abs(seen.rate) / seen.noise
-        trusted = known * np.where(off > _HUBER, _HUBER / np.maximum(off, _HUBER), 1.0)
-        smoothed = solve_tridiagonal(
-            diagonal + trusted, -stiff * decay, trusted * np.where(known > 0, beside, 0)
-        )
-    return smoothed
+    one = np.flatnonzero(is_next)
+    first = np.flatnonzero(np.concatenate(([True], ~is_next)))
+    decay = np.exp(-wait[one] / lasts)
+    by_wait = [
+        _Equations(
+            one, {4: -decay, 9: 1.0}, usual[one + 1] - decay * usual[one], spread**2 * (1.0 - decay**2)
+        ),
+        _Equations(first, {4: 1.0}, usual[first], spread**2),
+    ]
+    known, noise = np.flatnonzero(seen.good & (seen.rate != 0.0)), _measure_position_noise(track)
+    by_heading = (seen.noise / seen.rate[known]) ** 2 + _GYRO_CLOCK_S**2
+    moved, rough = np.diff(track.path)[one], np.ones(one.size)
+    states = np.zeros((track.times.size, _STATES))
+    for _ in range(_SMOOTHED):
+        step = np.maximum(wait - np.diff(ages), _SHORTEST_STEP)[one]
+        pace = _read_pace(states, one) if states.any() else moved / step
+        off = np.abs(seen.age - ages)[known] / np.sqrt(by_heading)
+        heard = _Equations(known, {4: 1.0}, seen.age[known], by_heading * np.maximum(off / _HUBER, 1.0))
+        equations = [*by_wait, heard, *_list_motion(moved, pace, ages, step, one, first, noise**2 * rough)]
+        states = _solve_equations(equations, track.times.size)
+        ages = np.clip(states[:, 4], -_OLDEST, _OLDEST)
+        step = np.maximum(wait - np.diff(ages), _SHORTEST_STEP)[one]
+        bend = np.diff(states[:, 2] + 1j * states[:, 3])[one]
+        rest = np.abs(moved - _read_pace(states, one) * step + bend * step**2 / 12.0)
+        rough = np.maximum(rest / (_HUBER * noise * np.sqrt(2.0)), 1.0)
+    return ages
+
+
+@dataclass(frozen=True)
+class _Equations:
+    """Linear equations of the states of a pose and of the next one.
+
+    Attributes:
+        pose: index of the pose of each, shape (k,), each at most once.
+        factors: by unknown: those of the pose from 0, those of the next one from `_STATES`.
+        target: sum of the unknowns times their factors, shape (k,).
+        variance: its variance, shape (k,) or one for all.
+    """
+
+    pose: Ints
+    factors: Mapping[int, Floats | float]
+    target: Floats
+    variance: Floats | float
+
+
+def _list_motion(
+    moved: Complex, pace: Complex, ages: Floats, step: Floats, one: Ints, first: Ints, noise: Floats
+) -> Iterator[_Equations]:
+    """Equations of velocity and acceleration along both axes of the map, see above."""
+    keeps = np.exp(-step / _STEADY_S)
+    variance, zero = _ACCELERATION_MPS2**2, np.zeros(one.size)
+    bend = step**2 / 12.0
+    for axis, (way, speed) in enumerate(((moved.real, pace.real), (moved.imag, pace.imag))):
+        v, a = axis, 2 + axis
+        w, b = v + _STATES, a + _STATES
+        factors: dict[int, Floats | float] = {
+            v: 0.5 * step,
+            w: 0.5 * step,
+            a: bend,
+            b: -bend,
+            4: speed,
+            9: -speed,
+        }
+        # To first order in the ages, about the present ones.
+        target = way - speed * (ages[one + 1] - ages[one])
+        yield _Equations(one, factors, target, 2.0 * noise)
+        factors = {v: -1.0, w: 1.0, a: -0.5 * step, b: -0.5 * step}
+        yield _Equations(one, factors, zero, variance * (_ROUGH * step) ** 2)
+        yield _Equations(one, {a: -keeps, b: np.ones(one.size)}, zero, variance * (1.0 - keeps**2))
+        yield _Equations(first, {a: 1.0}, np.zeros(first.size), variance)
+        yield _Equations(first, {v: 1.0}, np.zeros(first.size), _FAST_MPS**2)
+
+
+def _solve_equations(equations: Iterable[_Equations], poses: int) -> Floats:
+    """Unknowns of all poses by least squares, shape (poses, `_STATES`)."""
+    matrix, right = np.zeros((2 * _STATES, poses * _STATES)), np.zeros(poses * _STATES)
+    for one in equations:
+        start = _STATES * one.pose
+        for unknown, factor in one.factors.items():
+            weighted = factor / one.variance
+            right[start + unknown] += weighted * one.target
+            for other, second in one.factors.items():
+                if other >= unknown:
+                    matrix[other - unknown, start + other] += weighted * second
+    return solve_banded(matrix, right).reshape(poses, _STATES)
+
+
+def _read_pace(states: Floats, one: Ints) -> Complex:
+    """Mean velocity from each pose to the next one [m/s], shape (k,)."""
+    velocity = states[:, 0] + 1j * states[:, 1]
+    mean: Complex = np.asarray(0.5 * (velocity[one] + velocity[one + 1]))
+    return mean
+
+
+def _measure_position_noise(track: Track) -> float:
+    """Noise of a position [m], from its spread across straight stretches of the path."""
+    before, times, path = slice(None, -2), track.times, track.path
+    here, after = slice(1, -1), slice(2, None)
+    wait = times[after] - times[before]
+    share = (times[after] - times[here]) / np.maximum(wait, _SHORTEST_STEP)
+    velocity = (path[after] - path[before]) / np.maximum(wait, _SHORTEST_STEP)
+    speed = np.abs(velocity)
+    straight = np.abs(track.heading[after] - track.heading[before]) < _STRAIGHT * wait
+    known = straight & (track.segment[after] == track.segment[before]) & (speed > _DRIVING_MPS)
+    if known.sum() < _FEWEST // 2:
+        return _POSITION_NOISE * _LEAST_NOISE_M
+    off = path[here] - share * path[before] - (1.0 - share) * path[after]
+    across = (off * np.conj(velocity))[known].imag / speed[known]
+    # The spread of a difference to the mean of two others.
+    return _POSITION_NOISE * max(robust_spread(across) / math.sqrt(1.5), _LEAST_NOISE_M)
 
 
 def _list_terms(track: Track) -> Floats:

@@ -11,11 +11,11 @@ from scipy.optimize import nnls
 from scipy.special import ndtr, stdtrit
 
 from pipeline.core.arrays import (
-    _solve_tridiagonal,
+    _solve_banded,
     jackknife_deviation,
     normal_tail,
+    solve_banded,
     solve_nonnegative,
-    solve_tridiagonal,
     student_quantile,
 )
 
@@ -62,19 +62,21 @@ def test_a_target_that_no_number_comes_nearer_to_gives_zeros() -> None:
     assert solve_nonnegative(np.ones((4, 2)), -np.ones(4)).tolist() == [0.0, 0.0]
 
 
-@pytest.mark.parametrize("count", [2, 3, 500])
-def test_tridiagonal_systems_are_solved_as_by_scipy(count: int) -> None:
+@pytest.mark.parametrize(("count", "width"), [(1, 1), (2, 2), (3, 2), (5, 10), (500, 2), (500, 10)])
+def test_banded_systems_are_solved_as_by_scipy(count: int, width: int) -> None:
     rng = np.random.default_rng(count)
-    beside, right = rng.normal(size=count - 1), rng.normal(size=count)
-    diagonal = rng.random(count) + 4.0
-    diagonal[:-1] += np.abs(beside)
-    theirs = solveh_banded(np.vstack((np.concatenate(([0.0], beside)), diagonal)), right)
-    assert np.allclose(solve_tridiagonal(diagonal, beside, right), theirs, rtol=1e-12)
+    matrix, right = np.zeros((width, count)), rng.normal(size=count)
+    for lag in range(1, min(width, count)):
+        matrix[lag, lag:] = rng.normal(size=count - lag)
+    matrix[0] = 2.0 * width + 20.0
+    upper = matrix[::-1]
+    theirs = solveh_banded(upper[-min(width, count) :], right)
+    assert np.allclose(solve_banded(matrix, right), theirs, rtol=1e-10, atol=1e-14)
 
 
 def test_an_empty_system_writes_no_memory() -> None:
     around = np.ones(3)
     for inside in (around[1:1], np.empty(0)):
-        _solve_tridiagonal(inside, inside, inside)
+        _solve_banded(inside.reshape(0, 2), inside)
     assert around.tolist() == [1.0, 1.0, 1.0]
-    assert solve_tridiagonal(np.ones(1), np.empty(0), np.array([2.0])).tolist() == [2.0]
+    assert solve_banded(np.ones((1, 1)), np.array([2.0])).tolist() == [2.0]

@@ -116,6 +116,20 @@ def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame])
     assert np.std(everywhere) < np.std(stamps - true)
 
 
+def test_the_path_tells_how_old_poses_of_straight_driving_are(tables: Mapping[str, pl.DataFrame]) -> None:
+    poses = tables["poses"]
+    true = poses["t"].to_numpy()
+    stamps = delay(true, draw_ages(true.size, 0.06))
+    track = load(tables, poses=poses.with_columns(pl.Series("t", stamps))).track
+    speed = np.abs(np.gradient(track.path, true))
+    straight = (np.abs(np.gradient(track.heading, true)) < 0.1) & (speed > 0.2)
+    before, after = (stamps - true)[straight], (track.times - true)[straight]
+    assert np.std(after) < 0.65 * np.std(before)
+    # Speeding up is not taken for a pose that is old.
+    faster = np.gradient(speed, true)[straight]
+    assert abs(np.polyfit(faster, after, 1)[0]) < 0.01  # s per m/s^2
+
+
 def test_poses_that_grow_older_while_turning_do_not_scale_the_gyro(
     tables: Mapping[str, pl.DataFrame],
 ) -> None:
