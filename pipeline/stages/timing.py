@@ -380,7 +380,7 @@ def _list_motion(
     keeps = np.exp(-step / _STEADY_S)
     variance, zero = _ACCELERATION_MPS2**2, np.zeros(one.size)
     bend = step**2 / 12.0
-    for axis, (way, speed) in enumerate(((moved.real, pace.real), (moved.imag, pace.imag))):
+    for axis, (distance, speed) in enumerate(((moved.real, pace.real), (moved.imag, pace.imag))):
         v, a = axis, 2 + axis
         w, b = v + _STATES, a + _STATES
         factors: dict[int, Floats | float] = {
@@ -392,7 +392,7 @@ def _list_motion(
             9: -speed,
         }
         # To first order in the ages, about the present ones.
-        target = way - speed * (ages[one + 1] - ages[one])
+        target = distance - speed * (ages[one + 1] - ages[one])
         yield _Equations(one, factors, target, 2.0 * noise)
         factors = {v: -1.0, w: 1.0, a: -0.5 * step, b: -0.5 * step}
         yield _Equations(one, factors, zero, variance * (_ROUGH * step) ** 2)
