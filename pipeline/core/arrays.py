@@ -439,7 +439,7 @@ def solve_banded(matrix: Floats, right: Floats) -> Floats:
     Source: Golub and Van Loan, Matrix Computations, 4.3.5, as L D L^T.
     """
     solution = right.copy()
-    _solve_banded(np.ascontiguousarray(matrix.T).copy(), solution)
+    _solve_banded(np.array(matrix.T, order="C"), solution)
     return solution
 
 
