@@ -14,7 +14,6 @@ from pipeline.core.arrays import (
     Flags,
     Floats,
     Ints,
-    join_parts,
     robust_spread,
     solve_banded,
 )
@@ -369,8 +368,8 @@ def _smooth(track: Track, seen: _Seen, ages: Floats, usual: Floats, spread: floa
         pace = _average_velocity(states, one)
         curve = np.diff(states[:, 2] + 1j * states[:, 3])[one] * step**2 / 12.0
         rest = np.abs(moved - pace * step + curve) / (_HUBER * noise * np.sqrt(2.0))
-        # A wrong position has no weight: a bounded force of it would move the ages about it.
-        rough = np.maximum(rest, 1.0) ** 3
+        # A position far off has no weight: even a bounded force of it would move the ages about it.
+        rough = np.maximum(rest, 1.0) * np.maximum(rest / _HUBER, 1.0) ** 2
     return ages
 
 
