@@ -3,10 +3,10 @@
     python benchmarks/pose_ages.py [LOG...] [--set NAME=VALUE ...]
 
 Of each log, every other six seconds of headings are withheld from the last solution, then the others; the
-fit of the gyro knows all. Ages of the withheld poses in
-turns (faster than 0.7 rad/s) are compared with those of their headings: robust spread of the difference [ms]
-with no ages at all and with the estimated ones, by speed. --set changes numbers of `pipeline.stages.timing`.
-Without a log, the recordings under ../shared/logs. Logs whose poses do not differ in age are left out.
+fit of the gyro knows all. Ages of the withheld poses in turns (faster than 0.7 rad/s) are compared with those
+of their headings: robust spread of the difference [ms] with no ages at all and with the estimated ones, by
+speed. --set changes numbers of `pipeline.stages.timing`. Without a log, the recordings under ../shared/logs.
+Logs whose poses do not differ in age are left out.
 """
 
 from __future__ import annotations

@@ -434,7 +434,7 @@ def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
     for run in runs:
         spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
         if spread > 0.0:
-            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s, now corrected")
+            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s: corrected")
         if outlier_s > 0.0:
             lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
     return lines

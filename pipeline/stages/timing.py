@@ -14,6 +14,7 @@ from pipeline.core.arrays import (
     Flags,
     Floats,
     Ints,
+    join_parts,
     robust_spread,
     solve_banded,
 )
@@ -204,7 +205,8 @@ _LEAST_SPREAD = 0.015
 """Spread of ages [s] below which stamps are as accurate as the gyro can show."""
 _GYRO_CLOCK_S = 0.01
 """Standard deviation of a time by the gyro, beside the heading's noise: its own stamps and their sampling.
-With 0.007 the error over 2 s on ice is 0.324 m instead of 0.313 m, on four others within 9 %."""
+With 0.002 the error over 2 s on ice is 0.334 m instead of 0.311 m, on asphalt, gravel and sand within 5 %
+(`slip batch --diagnosis`)."""
 _NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
 """Least time between two poses after the correction [s], so that stamps stay in order."""
@@ -214,15 +216,15 @@ each other."""
 _HUBER = 3.0
 """Deviation [standard deviations] above which an age, or a displacement, has less weight."""
 _ACCELERATION_MPS2 = 2.0
-"""Standard deviation of accelerations: with half or twice of it, ages of withheld turns are 4 % nearer or
-3 % farther off (`make pose-ages`)."""
+"""Standard deviation of accelerations: with half or twice of it, ages of withheld turns are up to
+5 % nearer or 5 % farther off (`make pose-ages`)."""
 _STEADY_S = 0.7
-"""Correlation time of accelerations: with 0.3 to 2 s, ages of withheld turns change by 1 to 4 %."""
+"""Correlation time of accelerations: with 0.3 or 2 s, ages of withheld turns change by up to 5 %."""
 _ROUGH = 0.2
 """Change of velocity beyond that of a steady acceleration, relative to the acceleration over the time."""
 _POSITION_NOISE = 3.0
 """Noise of a position relative to its spread across a straight path, as scan matching errs while turning:
-with 1 in place of 3, ages of withheld turns are 3 to 11 % farther off (`make pose-ages`)."""
+with 1 instead, ages of withheld turns are 7 % farther off at walking pace, 5 % nearer beyond 2 m/s."""
 _LEAST_NOISE_M = 0.003
 """Least noise of a position, of a scan matcher at rest."""
 _DRIVING_MPS = 0.3
@@ -230,7 +232,7 @@ _DRIVING_MPS = 0.3
 _FAST_MPS = 30.0
 """Standard deviation of the velocity of a first pose: nothing is known of it."""
 _SMOOTHED = 4
-"""Solutions for the ages in each of `_ROUNDS`: with two, ages of withheld turns are up to 5 % farther off."""
+"""Solutions for the ages in each of `_ROUNDS`: with two, ages of withheld turns are up to 4 % farther off."""
 _STATES = 5
 """Unknowns of a pose: velocity and acceleration in the map, east and north, and its age."""
 _AGE = 4
@@ -276,6 +278,7 @@ def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
         if seen.telling.sum() < _FEWEST:
             return nothing
         ages, spread = _estimate(track, seen, ages)
+        # Nor where it is not a number.
         if not spread >= _LEAST_SPREAD:
             return nothing
     return track.times - _take_off(track, ages), spread
@@ -340,33 +343,33 @@ def _smooth(track: Track, seen: _Seen, ages: Floats, usual: Floats, spread: floa
     if both.sum() >= _FEWEST // 2:
         alike = float(np.clip(np.corrcoef(limited[1:][both], limited[:-1][both])[0, 1], 0.05, 0.95))
     lasts = -float(np.median(wait[both] if both.any() else wait)) / np.log(alike)
-    one = np.flatnonzero(is_next)
+    linked = np.flatnonzero(is_next)
     first = np.flatnonzero(np.concatenate(([True], ~is_next)))
-    decay = np.exp(-wait[one] / lasts)
+    decay = np.exp(-wait[linked] / lasts)
     by_wait = [
         _Equations(
-            one,
+            linked,
             {_AGE: -decay, _AGE + _STATES: 1.0},
-            usual[one + 1] - decay * usual[one],
+            usual[linked + 1] - decay * usual[linked],
             spread**2 * (1.0 - decay**2),
         ),
         _Equations(first, {_AGE: 1.0}, usual[first], spread**2),
     ]
     known, noise = np.flatnonzero(seen.good & (seen.rate != 0.0)), _measure_position_noise(track)
     by_heading = (seen.noise / seen.rate[known]) ** 2 + _GYRO_CLOCK_S**2
-    moved, shortest = np.diff(track.path)[one], _find_shortest_step(track)
-    step = np.maximum(wait - np.diff(ages), shortest)[one]
+    moved, shortest = np.diff(track.path)[linked], _find_shortest_step(track)
+    step = np.maximum(wait - np.diff(ages), shortest)[linked]
     pace: Complex = moved / step
-    rough = np.ones(one.size)
+    rough = np.ones(linked.size)
     for _ in range(_SMOOTHED):
         off = np.abs(seen.age - ages)[known] / np.sqrt(by_heading)
         heard = _Equations(known, {_AGE: 1.0}, seen.age[known], by_heading * np.maximum(off / _HUBER, 1.0))
-        motion = _list_motion(moved, pace, wait[one] - step, step, one, first, noise**2 * rough)
+        motion = _list_motion(moved, pace, wait[linked] - step, step, linked, first, noise**2 * rough)
         states = _solve_equations([*by_wait, heard, *motion], track.times.size)
         ages = np.clip(states[:, _AGE], -_OLDEST, _OLDEST)
-        step = np.maximum(wait - np.diff(ages), shortest)[one]
-        pace = _average_velocity(states, one)
-        curve = np.diff(states[:, 2] + 1j * states[:, 3])[one] * step**2 / 12.0
+        step = np.maximum(wait - np.diff(ages), shortest)[linked]
+        pace = _average_velocity(states, linked)
+        curve = np.diff(join_parts(states[:, 2], states[:, 3]))[linked] * step**2 / 12.0
         rest = np.abs(moved - pace * step + curve) / (_HUBER * noise * np.sqrt(2.0))
         # A position far off has no weight: even a bounded force of it would move the ages about it.
         rough = np.maximum(rest, 1.0) * np.maximum(rest / _HUBER, 1.0) ** 2
@@ -391,7 +394,7 @@ class _Equations:
 
 
 def _list_motion(
-    moved: Complex, pace: Complex, older: Floats, step: Floats, one: Ints, first: Ints, variance: Floats
+    moved: Complex, pace: Complex, older: Floats, step: Floats, linked: Ints, first: Ints, variance: Floats
 ) -> Iterator[_Equations]:
     """Equations of velocity and acceleration along both axes of the map, see above.
 
@@ -400,12 +403,12 @@ def _list_motion(
         pace: mean velocity until then, as last estimated [m/s], shape (k,).
         older: age of the next pose less that of the pose, as last estimated [s], shape (k,).
         step: time between both after these ages [s], shape (k,).
-        one: poses that have a next one, shape (k,).
+        linked: poses that have a next one, shape (k,).
         first: poses that follow no other one.
         variance: of a position at both ends of each displacement [m^2], shape (k,).
     """
     keeps = np.exp(-step / _STEADY_S)
-    spread, zero = _ACCELERATION_MPS2**2, np.zeros(one.size)
+    spread, zero = _ACCELERATION_MPS2**2, np.zeros(linked.size)
     bend = step**2 / 12.0
     for axis, (distance, speed) in enumerate(((moved.real, pace.real), (moved.imag, pace.imag))):
         v, a = axis, 2 + axis
@@ -420,10 +423,10 @@ def _list_motion(
         }
         # To first order in the ages, about the present ones.
         target = distance - speed * older
-        yield _Equations(one, factors, target, 2.0 * variance)
+        yield _Equations(linked, factors, target, 2.0 * variance)
         factors = {v: -1.0, w: 1.0, a: -0.5 * step, b: -0.5 * step}
-        yield _Equations(one, factors, zero, spread * (_ROUGH * step) ** 2)
-        yield _Equations(one, {a: -keeps, b: np.ones(one.size)}, zero, spread * (1.0 - keeps**2))
+        yield _Equations(linked, factors, zero, spread * (_ROUGH * step) ** 2)
+        yield _Equations(linked, {a: -keeps, b: np.ones(linked.size)}, zero, spread * (1.0 - keeps**2))
         yield _Equations(first, {a: 1.0}, np.zeros(first.size), spread)
         yield _Equations(first, {v: 1.0}, np.zeros(first.size), _FAST_MPS**2)
 
@@ -431,21 +434,21 @@ def _list_motion(
 def _solve_equations(equations: Iterable[_Equations], poses: int) -> Floats:
     """Unknowns of all poses by least squares, shape (poses, `_STATES`)."""
     matrix, right = np.zeros((2 * _STATES, poses * _STATES)), np.zeros(poses * _STATES)
-    for one in equations:
-        start = _STATES * one.pose
-        for unknown, factor in one.factors.items():
-            weighted = factor / one.variance
-            right[start + unknown] += weighted * one.target
-            for other, second in one.factors.items():
+    for equation in equations:
+        start = _STATES * equation.pose
+        for unknown, factor in equation.factors.items():
+            weighted = factor / equation.variance
+            right[start + unknown] += weighted * equation.target
+            for other, second in equation.factors.items():
                 if other >= unknown:
                     matrix[other - unknown, start + other] += weighted * second
     return solve_banded(matrix, right).reshape(poses, _STATES)
 
 
-def _average_velocity(states: Floats, one: Ints) -> Complex:
+def _average_velocity(states: Floats, linked: Ints) -> Complex:
     """Mean velocity from each pose to the next one [m/s], shape (k,)."""
-    velocity = states[:, 0] + 1j * states[:, 1]
-    mean: Complex = np.asarray(0.5 * (velocity[one] + velocity[one + 1]))
+    velocity = join_parts(states[:, 0], states[:, 1])
+    mean: Complex = 0.5 * (velocity[linked] + velocity[linked + 1])
     return mean
 
 
