@@ -18,7 +18,7 @@ from pipeline.core import SlipError
 from pipeline.estimation import Recording, RunDiagnosis
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.parts import Part, WheelPart
+from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
 from pipeline.fleet.joint_levels import RunEvidence
@@ -94,10 +94,8 @@ def forecast_deployment(
         active = problem.active_effects(Model(geometry, tuple(mine)))
         # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
         state = replace(problem.start_state(active), timing=timing)
-        fit = fit_part_jointly(part, state, shares)
-        if isinstance(part, WheelPart):
-            fit = _add_held(part, fit, held, shares)
-            also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
+        fit = _add_held(part, fit_part_jointly(part, state, shares), held, shares)
+        also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
         timing = fit.state.timing
         fits.append((part, fit))
     if also:

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.models.effect import INF, CommandEffect, Effect, Excitation, Parameter
 from pipeline.models.effects.turn_droop import TurnDroop
-from pipeline.models.parameter import Conditions, Largest, Quantity
+from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.run.signals import Commands, RunContext
 
 _ON_A_CAR = """
@@ -40,6 +40,7 @@ class BodyTurnLimit(CommandEffect):
             relative_to="turn",
             step=1e-3,
             quantities=(Quantity.TURN_LIMIT,),
+            level=Level.VEHICLE,
         ),
     )
     motion = "Yaw rate limit: commands are clipped at {size:.3g} rad/s"
