@@ -321,16 +321,17 @@ def _fit_rivals(
     selection: Selection, current: CandidateModel, names: tuple[str, ...]
 ) -> list[CandidateModel]:
     without = selection.drop(current, names)
-    # With a lag, limits have little evidence: take that of rivals at the model without the effects.
+    # Beside a lag, limits have little evidence.
     evidence = selection.take_evidence(without, (), selection.noise)
     own = [one.chi_square for one in evidence.rank_singles(0.0) if one.starts[0].effect.id in names]
+    least = _RIVALS * max(own, default=math.inf)
     for name in names:
         evidence = evidence.leave_out(name)
-    least = _RIVALS * max(own, default=math.inf)
     # A rival must also reduce the loss by the minimum for naming.
     useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
     models = selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
-    # A search keeps hundreds of rough fits, and a fit that goes on from one begins with its own derivatives.
+    # Contact friction may collapse to the track that it replaces. Hundreds of rough fits are kept.
+    models = [one for one in models if set(names).isdisjoint(one.ids)]
     return [replace(one, fit=one.fit.without_derivatives) if one.is_rough else one for one in models]
 
 
@@ -444,7 +445,11 @@ def search_wheels(
     start = State((), body.final.state.timing).add(*usable)
     part, candidates = context.problem.parts[1], context.list_drivetrain()
     selection, first = open_selection(part, start, candidates, context.conditions, budget)
-    late = [one().make_usual(context.largest) for one in candidates if _is_dead_time(one())]
+    late = [
+        one().make_usual(context.largest)
+        for one in candidates
+        if any(Quantity.COMMAND_DELAY in parameter.quantities for parameter in one.parameters)
+    ]
     delayed = selection.enter_each([first.state.add(effect) for effect in late if effect.id not in first.ids])
     begin = choose(selection, first, [model for model in delayed if selection.is_sound(model)])
     begin = _begin_whole(selection, begin)
@@ -493,7 +498,3 @@ def _make_sound(selection: Selection, model: CandidateModel) -> CandidateModel:
     while gone := [one.id for one in model.state.effects if not selection.may_stay(one, model.state)]:
         model = selection.drop(model, gone)
     return model
-
-
-def _is_dead_time(effect: Effect) -> bool:
-    return any(Quantity.COMMAND_DELAY in parameter.quantities for parameter in effect.parameters)

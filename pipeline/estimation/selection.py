@@ -363,12 +363,12 @@ class Selection:
         """
         singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
         models, best = dict[tuple[str, ...], CandidateModel](), 0.0
-        while singles and not models and _surplus(singles[0]) > 0.0:
+        while singles and not best and _surplus(singles[0]) > 0.0:
             enough = _COMPARABLE * singles[0].chi_square
             batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
             singles = singles[len(batch) :]
             for hypothesis, model in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
-                if self._keep(model, base, models):
+                if self._keep(model, base, models) and self.judge(base, model).is_significant:
                     best = max(best, _surplus(hypothesis))
         together = evidence.rank_pairs(PRICE) if pairs else []
         together = [one for one in together if one.chi_square >= max(least, best + PRICE)]

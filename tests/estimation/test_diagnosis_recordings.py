@@ -222,3 +222,11 @@ def test_an_inertia_that_halves_a_skid_is_named_or_told_with_it(asked: Asked, so
     if named.keys() & {"body_inertia", "contact_friction"}:
         beside["body_inertia"] = skid.parameters["c"].value
     assert beside["body_inertia"] < 0.6 * alone.effect("lateral_skid").values["c"]
+
+
+def test_a_crab_angle_is_named_and_a_track_has_no_clock_for_a_rival(asked: Asked) -> None:
+    """On tile the poses drift sideways by .025 of the way, forward and backward; a clock promises more."""
+    run = asked.diagnose("husky_wheels-deflated_tile_2023_12_12_16h16", "measured")
+    named = {effect.id: effect for effect in run.effects}
+    assert named["yaw_misalignment"].parameters["psi"].value == pytest.approx(-0.025, abs=0.003)
+    assert not any("effective_track" in group.candidates for group in run.undecided)

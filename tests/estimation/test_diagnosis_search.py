@@ -250,6 +250,22 @@ def test_an_extension_of_which_nothing_new_is_left_is_not_fitted_again(
     assert refitted == []
 
 
+def test_a_promise_that_its_fit_does_not_keep_ends_no_search(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a start far away a clock promises most, and is no more than nothing when it is fitted."""
+    selection, ideal = _open(_HUSKY, tmp_path / "husky")
+    evidence = selection.take_evidence(ideal)
+    ranked = evidence.rank_singles(0.0)
+    clock = next(one for one in ranked if one.starts[0].effect.id == "clock_offset")
+    promised = replace(clock, chi_square=10.0 * ranked[0].chi_square)
+    monkeypatch.setattr(evidence, "rank_singles", lambda _: [promised, *ranked])
+    monkeypatch.setattr(evidence, "rank_pairs", lambda _: [])
+    assert selection.is_sound(selection.enter(ideal.state.add(clock.starts[0].effect)))
+    fitted = selection.fit_hypotheses(ideal, evidence)
+    assert ("effective_track",) in {one.ids for one in fitted}
+
+
 def test_rivals_far_from_a_model_are_fitted_roughly_and_near_ones_to_the_end(tmp_path: Path) -> None:
     """A shifted centre of rotation does not stand for the track, and is no more than nothing beside it."""
     selection, ideal = _open(_HUSKY, tmp_path / "husky")
