@@ -9,7 +9,7 @@ import numpy as np
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
-from pipeline.estimation.fit import fit_model
+from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import hold_out
 from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.ladder import Judgement
@@ -203,6 +203,15 @@ class Clocks:
     effects: tuple[Effect, ...]
     timing: tuple[Mapping[str, float | str | None], ...]
     undecided: tuple[Undecided, ...] = ()
+
+    def list_runs(self, fitted: Fitted | None) -> list[Mapping[str, float | str | None]]:
+        """`timing`, with the delays of the encoders in the fit of the written model, if there is one."""
+        if fitted is None:
+            return list(self.timing)
+        return [
+            row if row["wheel_delay_s"] is None else {**row, "wheel_delay_s": round(delay.wheel_delay_s, 4)}
+            for row, delay in zip(self.timing, fitted.state.timing, strict=True)
+        ]
 
 
 def read_clocks(context: Context, body: SearchResult) -> Clocks:

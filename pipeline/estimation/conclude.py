@@ -165,7 +165,7 @@ def summarize(
         explained_share=math.nan if last is None else last,
         learned={} if judgement is None else learn_beyond(judgement),
         where=tuple(pick_regions(regions, residual, part.noise)),
-        timing={"runs": cast("Json", list(clocks.timing))},
+        timing={"runs": cast("Json", clocks.list_runs(judgement.fitted if judgement else None))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(
             body, _describe_rest(unexplained, lead, _find_room(judgement))

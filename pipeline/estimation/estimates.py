@@ -177,7 +177,7 @@ def find_unless(
         if name in taken:
             continue
         model = judgement.fitted.model + one.effect
-        fitted = fit_model(judgement.problem, model, start=judgement.fitted)
+        fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
         beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
         if explain_values(name, beside[name]):
             continue

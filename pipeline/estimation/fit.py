@@ -51,7 +51,7 @@ _SAME_SCALE = 0.01
 """Relative change below which weights count as unchanged."""
 _SETTLED = 1e-9
 """Relative decrease of the loss at which the fit of a model that is written ends."""
-_SETTLED_ROUNDS = 8
+_SETTLED_ROUNDS = 60
 """Maximum number of rounds until neither parameters nor weights change."""
 _SAME_NUMBER = 2e-4
 """Relative change below which a parameter counts as unchanged."""
@@ -191,8 +191,7 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
         and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
     ]
     state = state.drop([effect.id for effect in fresh])
-    weights = make_weights(part.find_residuals(state), part)
-    state = _estimate_delays(part, weights, state)
+    weights, state = _estimate_delays(part, state)
     fit = fit_part(part, weights, state, per_run=per_run)
     for effect in fresh:
         proposal = propose(part, fit, Unset(effect), problem.largest)
@@ -209,13 +208,22 @@ def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]
     return fit
 
 
-def _estimate_delays(part: Part, weights: Weights, state: State) -> State:
-    """The state with delays fitted before its effects: fitted all at once, the effects may diverge."""
+def _estimate_delays(part: Part, state: State) -> tuple[Weights, State]:
+    """Weights, and the state with delays fitted before its effects: fitted all at once, these may diverge.
+
+    Both settle before the effects move: a fit that starts from the values of a fitted model ends there.
+    """
+    weights = make_weights(part.find_residuals(state), part)
     delays = tuple(number for number in part.list_free(state) if not number.effect)
     if not state.effects or not delays or any(state.get(number) for number in delays):
-        return state
-    until = Until()
-    return _descend(part, _enter(part, weights, state, delays, until), until).state
+        return weights, state
+    until = Until(enough=_SETTLED)
+    for _ in range(_SETTLED_ROUNDS):
+        before, fit = weights, _descend(part, _enter(part, weights, state, delays, until), until)
+        weights, state = make_weights(fit.residual, part), fit.state
+        if np.allclose(weights.scale, before.scale, rtol=_SAME_NUMBER):
+            break
+    return weights, state
 
 
 def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:

@@ -109,9 +109,6 @@ def climb(
     """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     whole = fit_model(problem, active, per_run=per_run, exact=True)
-    # Fit again from the estimates, as a user who refits the written model to these runs does: on a
-    # loss with local minima the first fit may end elsewhere.
-    whole = fit_model(problem, whole.model, per_run=per_run, exact=True)
     known = {frozenset(step.effects): step for step in known_steps}
     rungs: list[LadderStep] = []
     waiting, taken = list(whole.model.ids), list[str]()

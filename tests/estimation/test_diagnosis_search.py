@@ -293,11 +293,14 @@ def test_rivals_far_from_a_model_are_fitted_roughly_and_near_ones_to_the_end(tmp
 def test_rivals_are_fitted_once_for_a_model_and_again_under_new_weights_where_they_come_near(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    selection, ideal = _open(_HUSKY, tmp_path / "husky")
-    found = selection.reweight(selection.enter(ideal.state.add(_give("effective_track", 1.6))))
-    rivals = list_rivals(selection, found, ("effective_track",))
-    assert rivals
-    assert list_rivals(selection, found, ("effective_track",)) is rivals
+    # Where nothing but turning on the spot was driven, radius and track are one number.
+    spins = replace(_HUSKY, effects={"wheel_radius": 0.85}, program=Program("spins"))
+    selection, ideal = _open(spins, tmp_path / "husky")
+    found = selection.reweight(selection.enter(ideal.state.add(_give("wheel_radius", 0.85))))
+    rivals = list_rivals(selection, found, ("wheel_radius",))
+    assert ("effective_track",) in {one.ids for one in rivals}
+    assert not any("wheel_radius" in one.ids for one in rivals)
+    assert list_rivals(selection, found, ("wheel_radius",)) is rivals
     asked = list[object]()
     enter_each = selection.enter_each
 
@@ -308,7 +311,8 @@ def test_rivals_are_fitted_once_for_a_model_and_again_under_new_weights_where_th
     found = selection.reweight(found)
     near = [one for one in rivals if selection.loss(one) < USEFUL * selection.loss(found)]
     monkeypatch.setattr(selection, "enter_each", note)
-    again = list_rivals(selection, found, ("effective_track",))
+    again = list_rivals(selection, found, ("wheel_radius",))
+    assert near
     assert {one.ids for one in again} == {one.ids for one in rivals}
     assert len(asked) == len(near)
     assert all(one is other.fit for one, other in zip(asked, near, strict=True))

@@ -106,6 +106,8 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
     found = {effect["id"] for effect in told["effects"] if not effect["corrected"]}
     found |= {item["in_model"] for item in told["undecided"] if item["in_model"] is not None}
     assert {name for name in file.model.ids if not is_term(name)} == found
+    if told["timing"]["wheel_delay_s"] is not None:
+        assert same(told["timing"]["wheel_delay_s"], file.find_wheel_delay(told["run"]), 1e-4 / SAME)
     assert {"unexplained" if is_term(name) else name for name in file.model.ids} == set(
         told["ladder"][-1]["effects"]
     )

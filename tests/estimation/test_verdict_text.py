@@ -73,7 +73,10 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
         for entry in diagnosis["effects"]
     ]
     for entry, effect in zip(diagnosis["effects"], effects, strict=True):
-        clause = effect.describe_clause(vehicle, effects)
+        # Of several numbers those without an interval are not told.
+        open_numbers = [key for key, one in entry["parameters"].items() if one.get("low", 0.0) is None]
+        told = effect.omit_open(open_numbers) if len(entry["parameters"]) > 1 else effect
+        clause = told.describe_clause(vehicle, effects)
         assert entry["clause"].startswith(clause)
         known |= set(_NUMBER.findall(clause))
     return known

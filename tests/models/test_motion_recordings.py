@@ -45,7 +45,8 @@ REACHED = {
     ("warthog_wheels_grass_2024_7_29_14h46s15", M): (0.857, 0.752, 0.085, 0.537, 0.063, 0.063),
     ("warthog_wheels_grass_2024_7_29_14h46s15", C): (0.518, 0.748, 0.213, 0.355, 0.116, 0.116),
     ("warthog_wheels_grass_2024_8_8_16h19s23", M): (0.704, 0.385, 0.086, 0.368, 0.075, 0.075),
-    ("warthog_wheels_grass_2024_8_8_16h19s23", C): (0.303, 0.432, 0.245, 0.213, 0.113, 0.113),
+    # With the ages of poses from the path; `wheel_servo` in place of the lags reaches .03 in R.
+    ("warthog_wheels_grass_2024_8_8_16h19s23", C): (0.292, 0.422, 0.245, 0.205, 0.125, 0.125),
 }
 # Channels that stay further than ten percent above the table of METHODS section 5.
 BEYOND = {
