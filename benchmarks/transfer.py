@@ -6,7 +6,7 @@ Every run is left out in turn, the model is that which `slip fleet predict` expe
 others, and nothing but its clocks is the run's own: that of its poses, where no gyro knows it, and that of
 its encoders, fitted with all effects held. Printed are errors
 of position [m] and heading [rad] over 2 s of the whole run: of the ideal model, of the expected one, of the
-expected one with the ground's numbers fitted to the run (those of the vehicle held), and of the run's own
+expected one with the numbers fitted to the run that are not declared the vehicle's, and of the run's own
 written model on stretches held out (its diagnosis), and the ratios of the former two to the last; medians of
 the expected one are those of runs on a ground that another run is on. With --single the expected numbers are
 those of `forecast_vehicle` alone, without the fit to all runs together.
@@ -76,7 +76,7 @@ def make_problem(manifest: Manifest, source: str) -> Problem:
 
 
 def measure(problem: Problem, effects: Sequence[Effect]) -> Errors:
-    return measure_fit(problem, [effect.fix(*effect.values) for effect in effects])
+    return measure_fit(problem, hold(effects))
 
 
 def measure_fit(problem: Problem, effects: Sequence[Effect]) -> Errors:
@@ -86,8 +86,12 @@ def measure_fit(problem: Problem, effects: Sequence[Effect]) -> Errors:
     return Errors(pooled.t_mrmse_m, pooled.r_mrmse_rad)
 
 
+def hold(effects: Sequence[Effect]) -> list[Effect]:
+    return [effect.fix(*effect.values) for effect in effects]
+
+
 def hold_vehicle(effect: Effect) -> Effect:
-    """The effect with only the ground's numbers free, as the catalogue says whose they are."""
+    """The effect with all numbers free that the catalogue does not declare the vehicle's."""
     return effect.fix(*(one.name for one in effect.parameters if one.level is Level.VEHICLE))
 
 
@@ -123,9 +127,7 @@ def judge_path(
     clock = list_clocks(store, manifest.run, source)
     ideal = measure(problem, tuple(clock))
     expected = measure(problem, (*forecast.effects, *clock))
-    ground = measure_fit(
-        problem, [*map(hold_vehicle, forecast.effects), *(one.fix(*one.values) for one in clock)]
-    )
+    ground = measure_fit(problem, [*map(hold_vehicle, forecast.effects), *hold(clock)])
     own = read_own(manifest, source)
     ratios = [
         one / mine

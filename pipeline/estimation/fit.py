@@ -52,7 +52,8 @@ _SAME_SCALE = 0.01
 _SETTLED = 1e-9
 """Relative decrease of the loss at which the fit of a model that is written ends."""
 _SETTLED_ROUNDS = 60
-"""Maximum number of rounds until neither parameters nor weights change."""
+"""Maximum number of rounds until neither parameters nor weights change, a safeguard: half a minute of gentle
+driving, which hardly determines a controller, needs 20."""
 _SAME_NUMBER = 2e-4
 """Relative change below which a parameter counts as unchanged."""
 
@@ -217,13 +218,8 @@ def _estimate_delays(part: Part, state: State) -> tuple[Weights, State]:
     delays = tuple(number for number in part.list_free(state) if not number.effect)
     if not state.effects or not delays or any(state.get(number) for number in delays):
         return weights, state
-    until = Until(enough=_SETTLED)
-    for _ in range(_SETTLED_ROUNDS):
-        before, fit = weights, _descend(part, _enter(part, weights, state, delays, until), until)
-        weights, state = make_weights(fit.residual, part), fit.state
-        if np.allclose(weights.scale, before.scale, rtol=_SAME_NUMBER):
-            break
-    return weights, state
+    fit = _converge(part, _enter(part, weights, state, delays, Until(enough=_SETTLED)), ())
+    return make_weights(fit.residual, part), fit.state
 
 
 def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:

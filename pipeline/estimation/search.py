@@ -330,7 +330,7 @@ def _fit_rivals(
     # A rival must also reduce the loss by the minimum for naming.
     useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
     models = selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
-    # Contact friction may collapse to the track that it replaces. Hundreds of rough fits are kept.
+    # Contact friction may collapse to the track that it replaces. Rough fits are many: no derivatives.
     models = [one for one in models if set(names).isdisjoint(one.ids)]
     return [replace(one, fit=one.fit.without_derivatives) if one.is_rough else one for one in models]
 
