@@ -47,7 +47,7 @@ class Commands(Table):
 class Wheels(Table):
     """One row an encoder message."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     t = schemas.seconds()
     stamp = schemas.stamp()
@@ -58,6 +58,13 @@ class Wheels(Table):
     steering = schemas.body("rad", "measured steering angle (Ackermann), left positive", nullable=True)
     sideways = schemas.optional(
         "rad/s", "measured speed of the wheels that moves to the left (mecanum, omni)"
+    )
+    left_aligned = schemas.optional("rad/s", "speed of the left wheels, linear between its readings")
+    right_aligned = schemas.optional("rad/s", "speed of the right wheels, linear between its readings")
+    speed_aligned = schemas.body("m/s", "speed, linear between its readings (Ackermann)", nullable=True)
+    steering_aligned = schemas.body("rad", "steering angle, linear between its readings", nullable=True)
+    sideways_aligned = schemas.optional(
+        "rad/s", "speed of the wheels that moves to the left, linear between its readings"
     )
     latency = schemas.number("s", "delay of the encoders: they describe t - latency", frame="log clock")
     active = schemas.flag("inside an interval in which commands are live")

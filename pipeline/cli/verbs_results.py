@@ -445,7 +445,7 @@ def _format_alignment(manifest: Manifest) -> list[str]:
         return []
     row = manifest.read("alignments").row(0, named=True)
     lines = [
-        "aligned        (table alignments; latency, outlier and *_aligned are columns of poses and commands)"
+        "aligned        (table alignments; latency, outlier, *_aligned: columns of poses, wheels, commands)"
     ]
     for name, value in row.items():
         if isinstance(value, float) and not name.startswith("recorded_modulus"):

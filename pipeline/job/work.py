@@ -378,8 +378,8 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     if table == "poses":
         return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
     if table == "wheels":
-        return frame.with_columns(pl.lit(0.0).alias("latency"))
-    if table == "commands":
+        frame = frame.with_columns(pl.col("steering").alias("steering_aligned"), pl.lit(0.0).alias("latency"))
+    if table in {"wheels", "commands"}:
         return frame.with_columns(
             pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "sideways", "speed")
         )

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
-_WHEELS = ("t", "left", "right", "sideways", "speed", "steering", "latency")
+_ALIGNED = tuple(f"{name}_aligned" for name in ("left", "right", "sideways", "speed"))
 COLUMNS: Mapping[str, tuple[str, ...]] = {
     "poses": (
         *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
@@ -37,8 +37,8 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
         *("recorded_modulus_command", "recorded_modulus_measured"),
     ),
-    "commands": ("t", *(f"{name}_aligned" for name in ("left", "right", "sideways", "speed")), "steering"),
-    "wheels": _WHEELS,
+    "commands": ("t", *_ALIGNED, "steering"),
+    "wheels": ("t", *_ALIGNED, "steering_aligned", "latency"),
     "imu": ("t", "rate_z"),
     "slip": ("t", "input", "step", "suspect"),
 }

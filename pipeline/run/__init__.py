@@ -373,14 +373,14 @@ def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | N
     if table is None or table.is_empty():
         return None
     times = read_wheel_times(table)
-    aligned = "left_aligned" in table.columns
 
     def read(name: str) -> Floats:
-        return table[f"{name}_aligned" if aligned else name].to_numpy()
+        aligned = f"{name}_aligned"
+        return table[aligned if aligned in table.columns else name].to_numpy()
 
     if vehicle.kinematics.has_inputs("speed", "steering"):
         axle = read("speed") / vehicle.wheel_radius_m
-        left, right, steering = axle, axle, table["steering"].to_numpy()
+        left, right, steering = axle, axle, read("steering")
     else:
         left, right, steering = read("left"), read("right"), np.zeros(times.size)
     sideways = read("sideways") if vehicle.kinematics.has_inputs("sideways") else None

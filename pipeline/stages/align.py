@@ -19,7 +19,7 @@ from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.drive_numbers import find_timeout, report_timeout
+from pipeline.stages.drive_numbers import find_timeout, interpolate_readings, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
@@ -249,7 +249,8 @@ def align_tables(
     Raises:
         StageError: ``no_segment``, no stretch of the poses can be differentiated.
     """
-    commands, wheels = tables.get("commands", pl.DataFrame()), tables.get("wheels", pl.DataFrame())
+    commands = tables.get("commands", pl.DataFrame())
+    wheels, findings = interpolate_readings(tables.get("wheels", pl.DataFrame()))
     hold = None
     if not commands.is_empty():
         hold = arrays.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
@@ -264,18 +265,17 @@ def align_tables(
     known = keep_known(inputs)
     grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
     scale = CommandScale(1.0, vehicle.controller_track_multiplier)
-    findings: list[Finding] = []
     events = MotionEvents()
     if known:
         cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
         incidents = find_incidents(velocities, tables, known, vehicle, hold)
         usual = {name: ideal.leave_out(incidents.excluded) for name, ideal in known.items()}
-        bad, findings = find_bad_stretches(
+        bad, contradictions = find_bad_stretches(
             velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
         )
         events = find_events(velocities, known, vehicle, bad, incidents.spans)
         bad |= incidents.excluded
-        findings += incidents.findings
+        findings += [*contradictions, *incidents.findings]
         findings += events.findings
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)

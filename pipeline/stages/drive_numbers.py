@@ -1,7 +1,7 @@
-"""What a log tells of the drive beside slip: electric power, and the time-out of its commands.
+"""What a log tells of the drive beside slip: electric power, command time-out and encoder periods.
 
 Power over time with energy per distance; how long the base moves after its last command, from gaps in the
-command topic.
+command topic; encoder readings that are published repeatedly until the next one.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import NORMAL_95
-from pipeline.core.arrays import Floats, Ints, fit_robustly, nearest_indices, robust_spread
+from pipeline.core.arrays import (
+    Floats,
+    Ints,
+    fit_robustly,
+    interpolate_repeats,
+    nearest_indices,
+    robust_spread,
+)
 from pipeline.logs import TopicColumns
 from pipeline.run.signals import MOVING_MPS
 from pipeline.sources.candidates import PowerSource, Signal
@@ -284,3 +291,31 @@ class _Run:
             return math.inf, was
         share = (speed[reached - 1] - 0.5 * was) / (speed[reached - 1] - speed[reached])
         return float(times[reached - 1] + share * (times[reached] - times[reached - 1]) - start), was
+
+
+_FEW_REPEATS = 0.05
+"""Share of readings between two others above which their repeats are reported, as of poses."""
+_SIGNALS = ("left", "right", "speed", "steering", "sideways")
+
+
+def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    """Table `wheels` with readings that are repeated interpolated, each side between its own readings."""
+    if wheels.is_empty():
+        return wheels, []
+    times = wheels["t"].to_numpy()
+    columns, periods, moved = {}, [0.0], np.zeros(times.size, dtype=bool)
+    for name in _SIGNALS:
+        values = wheels[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+        filled, period = interpolate_repeats(times, values)
+        columns[f"{name}_aligned"] = pl.Series(filled).fill_nan(None)
+        periods.append(period)
+        moved |= ~np.isclose(filled, values, equal_nan=True)
+    repeated = wheels.with_columns(**columns)
+    share = float(moved.mean())
+    if share <= _FEW_REPEATS:
+        return repeated, []
+    text = (
+        f"the encoders are read every {max(periods):.2g} s, and their readings repeated in between: linear "
+        "from one to the next"
+    )
+    return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]
