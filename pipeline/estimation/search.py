@@ -16,6 +16,7 @@ from pipeline.core.compute import Budget
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_innovations, scale_evidence
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
+from pipeline.estimation.parts import make_weights
 from pipeline.estimation.proposals import Candidate
 from pipeline.estimation.selection import USEFUL, CandidateModel, Context, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
@@ -165,8 +166,6 @@ _BESIDE = (0.7, 1.4)
 _CLEAR = 2.5
 """Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
 421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
-_EXPECTED = 0.6
-"""Evidence over that required at which companions of an effect stay: a controller has ramps and limits."""
 _WHOLE = 0.9
 """Largest loss with an effect and its companions, over that with its special cases in its place, for a search
 to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs
@@ -346,7 +345,10 @@ def _refit_rivals(
 
 
 def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
-    """Drop effects whose evidence is no longer significant; the least significant first."""
+    """Drop effects whose evidence is no longer significant; the least significant first.
+
+    Companions of an effect are expected and stay while they matter: a controller has ramps and limits.
+    """
     while True:
         doubtful = _list_doubtful(selection, current)
         models = selection.drop_each(current, [[name] for name in doubtful])
@@ -355,7 +357,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         weak = [
             (one.share, without)
             for name, (one, without) in zip(doubtful, judged, strict=True)
-            if not one.reaches(_EXPECTED if name in expected else 1.0)
+            if not one.reaches(0.0 if name in expected else 1.0)
         ]
         if not weak:
             return current
@@ -460,30 +462,28 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
     """The model with an effect and its companions, less what is not significant; else the model itself.
 
     A speed loop answers ramps of its command: fitted to steps, one without ramps ends in a local minimum. So
-    does friction in contact whose search began with a wider track and a skid.
+    does friction in contact whose search began with a wider track and a skid. Every start is fitted with the
+    weights of its own residuals: those of the model without the effect see no outlier.
     """
     usual = {one.id: _make_possible(one(), selection.conditions) for one in selection.candidates}
     for one in (one for one in usual.values() if one.companions and one.id not in first.ids):
-        loaded = [first.state.add(*some) for some in _list_companions(one, usual)]
+        loaded = first.state.add(*(usual[name] for name in one.companions if name in usual))
         cases = [usual[name] for name in one.contains if name in usual]
-        start, *starts = (state.add(one.change(**values)) for state in loaded for values in one.starts)
-        tried, simpler = selection.enter_each([start, loaded[0].add(*cases)])
+        starts = [loaded.add(one.change(**values)) for values in one.starts]
+        tried, simpler = selection.enter_each([starts[0], loaded.add(*cases)])
         if selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
-        sound = _make_sound(selection, min([tried, *selection.enter_each(starts)], key=selection.loss))
-        weights, selection.noise = selection.weights, selection.take_evidence(sound).noise
-        pruned = prune(selection, selection.reweight(sound))
+        weights, best = selection.weights, _make_sound(selection, tried)
+        for state in starts:
+            selection.take_weights(make_weights(selection.part.find_residuals(state), selection.part))
+            model = _make_sound(selection, selection.reweight(selection.enter(state)))
+            best = model if selection.compare_losses(model, best) < 1.0 else best
+        selection.noise = selection.take_evidence(best).noise
+        pruned = prune(selection, selection.reweight(best))
         if not set(pruned.ids) <= set(first.ids):
             return pruned
         selection.take_weights(weights)
     return first
-
-
-def _list_companions(effect: Effect, usual: Mapping[str, Effect]) -> list[list[Effect]]:
-    """The companions of an effect; if some of them clip large commands, also those without them."""
-    every = [usual[name] for name in effect.companions if name in usual]
-    fewer = [one for one in every if not any(p.relative_to for p in one.parameters)]
-    return [every] if fewer == every else [every, fewer]
 
 
 def _make_possible(effect: Effect, conditions: Conditions) -> Effect:

@@ -303,11 +303,16 @@ class Selection:
         """
         if self.loss(model) > USEFUL * self.loss(best):
             return False
-        return self.sum_losses(model) < (1.0 - _BETTER) * self.sum_losses(best)
+        return self.compare_losses(model, best) < 1.0 - _BETTER
+
+    def compare_losses(self, model: CandidateModel, best: CandidateModel) -> float:
+        """Sum of a model's losses over another's, by the weights of either: these forgive their own model."""
+        weights = [make_weights(one.fit.residual, self.part) for one in (model, best)]
+        return math.sqrt(math.prod(_sum_losses(one, model) / _sum_losses(one, best) for one in weights))
 
     def sum_losses(self, model: CandidateModel) -> float:
         """Mean cost of residuals, plus that where states begin anew with each prediction over 2 s."""
-        return self.loss(model) + self.weights.loss(model.restarted)
+        return _sum_losses(self.weights, model)
 
     def judge(self, before: CandidateModel, after: CandidateModel) -> Improvement:
         """How much better ``after``, which has more numbers, is."""
@@ -483,3 +488,7 @@ def open_selection(
         given=frozenset(start.ids), budget=budget, shapes=shapes,
     )  # fmt: skip
     return selection, selection.reweight(selection.enter(start))
+
+
+def _sum_losses(weights: Weights, model: CandidateModel) -> float:
+    return weights.loss(model.fit.residual) + weights.loss(model.restarted)
