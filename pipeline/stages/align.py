@@ -176,8 +176,8 @@ def _find_gain(asked: Floats, got: Floats) -> float | None:
 
 
 _LEAST_S = 0.05
-"""Least delay of encoders [s]: occasional readings of the wheels cause an apparent delay up to this. The
-delays of the recordings are 0 or 0.11 to 0.28."""
+"""Least delay of encoders [s] that is corrected here; fits find shorter ones. Of the recordings six of twelve
+are shorter, the others are 0.06 to 0.27."""
 
 
 def measure_wheel_delay(

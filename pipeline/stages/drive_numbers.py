@@ -304,7 +304,7 @@ def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Findi
         return wheels, []
     times = wheels["t"].to_numpy()
     columns, periods, moved = {}, [0.0], np.zeros(times.size, dtype=bool)
-    for name in _SIGNALS:
+    for name in (name for name in _SIGNALS if name in wheels.columns):
         values = wheels[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
         filled, period = interpolate_repeats(times, values)
         columns[f"{name}_aligned"] = pl.Series(filled).fill_nan(None)
@@ -315,7 +315,7 @@ def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Findi
     if share <= _FEW_REPEATS:
         return repeated, []
     text = (
-        f"the encoders are read every {max(periods):.2g} s, and their readings repeated in between: linear "
-        "from one to the next"
+        f"the encoders are read every {max(periods):.2g} s and each reading is repeated until the next one: "
+        "interpolated between readings"
     )
     return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]

@@ -115,3 +115,54 @@ def test_stretches_are_the_same_whenever_the_recorder_was_started(start: float, 
     raster = np.arange(2000) * step
     found = arrays.number_stretches((raster + start) - (raster[0] + start), 10.0)
     assert np.array_equal(found, np.arange(2000) // round(10.0 / step))
+
+
+def hold(times: arrays.Floats, values: arrays.Floats, every: int, first: int = 0) -> arrays.Floats:
+    """Each value that is read, repeated until the next one is."""
+    rows = np.arange(times.size)
+    return values[np.maximum((rows - first) // every * every + first, 0)]
+
+
+@pytest.mark.parametrize("first", [0, 2])
+def test_repeated_readings_are_linear_between_readings(first: int) -> None:
+    times = np.arange(0.0, 60.0, 0.05)
+    true = 2.0 * np.sin(0.9 * times)
+    filled, period = arrays.interpolate_repeats(times, hold(times, true, 5, first))
+    assert period == pytest.approx(0.25)
+    inside = slice(first, times.size - 5)
+    assert np.abs(filled - true)[inside].max() < 0.02
+    assert np.abs(hold(times, true, 5, first) - true)[inside].max() > 0.3
+
+
+def test_readings_at_rest_last_until_one_period_before_they_change() -> None:
+    times = np.arange(0.0, 30.0, 0.05)
+    true = np.where(times < 10.0, 0.0, np.minimum(times - 10.0, 5.0))
+    filled, _ = arrays.interpolate_repeats(times, hold(times, true, 5))
+    assert np.all(filled[times < 9.99] == 0.0)
+    assert np.all(filled[times > 15.3] == 5.0)
+    assert np.abs(filled - true).max() < 0.26 * 0.25
+
+
+def test_readings_of_which_none_is_repeated_stay_as_they_are() -> None:
+    generator = np.random.default_rng(5)
+    times = np.cumsum(0.02 + 0.01 * generator.random(2000))
+    values = np.cumsum(generator.standard_normal(times.size))
+    values[400:900] = values[400]
+    assert np.array_equal(arrays.interpolate_repeats(times, values)[0], values)
+
+
+def test_steps_that_last_for_seconds_are_no_repeated_readings() -> None:
+    times = np.arange(0.0, 60.0, 0.05)
+    values = np.floor(times / 4.0)
+    filled, period = arrays.interpolate_repeats(times, values)
+    assert period == 0.0
+    assert np.array_equal(filled, values)
+
+
+def test_readings_that_are_missing_stay_so() -> None:
+    times = np.arange(0.0, 20.0, 0.05)
+    values = hold(times, np.sin(times), 4)
+    values[100:120] = np.nan
+    filled, period = arrays.interpolate_repeats(times, values)
+    assert period == pytest.approx(0.2)
+    assert np.array_equal(np.isnan(filled), np.isnan(values))

@@ -10,8 +10,15 @@ from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import restore_known
 from pipeline.sources import find_preset
 
-_UNITS = {"tau": "s", "reset": "1/s", "drag": "m/s", "bound": "m/s", "scrub": "m/s", "creep": "s/m"}
-_UNITS |= {"tau_mean": "s", "tau_diff": "s"}
+_UNITS = {
+    "tau": "s",
+    "tau_mean": "s",
+    "tau_diff": "s",
+    "friction": "1",
+    "creep": "1",
+    "k": "1",
+    "gyration": "1",
+}
 
 
 def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -> tuple[str, str]:
@@ -29,10 +36,11 @@ def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -
 
 def test_numbers_that_no_driving_determined_are_not_told() -> None:
     """The gentle run on grass said `limit 5 rad/s^2`, the value that the search starts from."""
-    numbers = {"tau": 0.17, "reset": 0.338, "drag": 0.08, "bound": 1.3, "scrub": 1.05, "creep": 0.07}
-    motion, clause = put_in_words("wheel_servo", numbers, ("tau", "reset", "scrub"))
-    assert motion == "Wheel servo: lag 0.17 s, reset 0.34/s, scrub 1.1 m/s"
-    assert clause == "answers commands against a friction of 1.1 m/s"
+    numbers = {"friction": 0.41, "creep": 0.2, "k": 1.69, "gyration": 1.0}
+    motion, clause = put_in_words("contact_friction", numbers, ("k",))
+    assert motion == "Contact friction: track 1.69 times as wide"
+    assert clause == "shows signs of contact friction"
+    assert "0.41" in put_in_words("contact_friction", numbers, ("friction",))[1]
 
 
 def test_what_is_determined_is_told_as_before() -> None:
@@ -42,8 +50,11 @@ def test_what_is_determined_is_told_as_before() -> None:
 
 
 def test_without_any_number_the_name_remains() -> None:
-    numbers = {"tau": 0.17, "reset": 0.338, "drag": 0.08, "bound": 1.3, "scrub": 1.05, "creep": 0.07}
-    assert put_in_words("wheel_servo", numbers, ()) == ("Wheel servo", "shows wheel servo")
+    numbers = {"friction": 0.41, "creep": 0.2, "k": 1.69, "gyration": 1.0}
+    assert put_in_words("contact_friction", numbers, ()) == (
+        "Contact friction",
+        "shows signs of contact friction",
+    )
 
 
 @pytest.mark.parametrize("known", [(), ("tau",)])

@@ -12,6 +12,7 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
+from pipeline.stages.drive_numbers import interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
 
@@ -320,3 +321,24 @@ def test_a_skid_steer_is_read_from_every_form(drive: TakeThrough, layout: str) -
     steady = taken.slip("measured").filter(~pl.col("transitory"))
     assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=0.02)
     assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=0.03)
+
+
+def test_sides_that_are_read_in_turn_turn_as_the_vehicle_does() -> None:
+    """Encoders that a bus reads four times a second, left and right alternately, in a topic of 20 Hz."""
+    times = np.arange(0.0, 60.0, 0.05)
+    both = 5.0 + 3.0 * np.sin(0.7 * times)
+    rows = np.arange(times.size)
+    left, right = (both[np.maximum((rows - late) // 5 * 5 + late, 0)] for late in (0, 2))
+    wheels = pl.DataFrame({"t": times, "left": left, "right": right, "speed": None, "steering": 0.0})
+    read, (finding,) = interpolate_readings(wheels)
+    assert (finding.id, finding.value) == ("held_wheels", pytest.approx(0.25))
+    turning = (read["right_aligned"] - read["left_aligned"]).to_numpy()[10:-10]
+    assert np.abs(right - left).max() > 0.3
+    assert np.abs(turning).max() < 0.03
+    assert np.array_equal(read["left"], left)
+    assert read["speed_aligned"].null_count() == times.size
+
+
+def test_encoders_that_are_read_for_every_message_are_left_alone(drive: TakeThrough) -> None:
+    taken = drive(replace(FIELD, recording=Recording("husky")))
+    assert "held_wheels" not in {finding.id for finding in taken.findings}

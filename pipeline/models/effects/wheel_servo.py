@@ -162,11 +162,8 @@ class WheelServo(DriveEffect):
         {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "no_load": 5.0, "scrub": 0.2, "creep": 0.3},
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
-    motion = (
-        "Wheel servo: lag {tau:.2f} s, reset {reset:.2g}/s, bound {bound:.2g}/{no_load:.2g} m/s, "
-        "drag {drag:.2g} m/s, scrub {scrub:.2g} m/s, creep {creep:.2g} s/m"
-    )
-    clause = "answers commands against a friction of {scrub:.2g} m/s"
+    motion = "Wheel servo: the speed controllers of the sides yield to the friction of the ground"
+    clause = "follows its commands late against the friction of the ground"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
     contains = ("deadband", "drive_lag", "turn_lag")
