@@ -377,11 +377,12 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     """An extracted table before alignment, with neutral corrections."""
     if table == "poses":
         return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
+    names = ["left", "right", "sideways", "speed", *(["steering"] if table == "wheels" else [])]
     if table == "wheels":
-        frame = frame.with_columns(pl.col("steering").alias("steering_aligned"), pl.lit(0.0).alias("latency"))
+        frame = frame.with_columns(pl.lit(0.0).alias("latency"))
     if table in {"wheels", "commands"}:
         return frame.with_columns(
-            pl.col(name).alias(f"{name}_aligned") for name in ("left", "right", "sideways", "speed")
+            pl.col(name).alias(f"{name}_aligned") for name in names if name in frame.columns
         )
     return frame
 

@@ -43,32 +43,31 @@ HELD = frozenset({"held_poses"})
 ROTATED = frozenset({"bad_stretch"})
 LIVE = frozenset({"interval_applied"})
 LATE = frozenset({"pose_delay"})
-ENCODERS = frozenset({"wheels_delay"})
+READ = frozenset({"held_wheels"})
+ENCODERS = frozenset({"wheels_delay"}) | READ
 
 KNOWN = {
     "husky_wheels-deflated_tile_2023_12_12_16h16": Known(
         0.49, 0.256, 0.283, 1.76, HELD | LATE | ENCODERS | {"command_beyond_limit"}, COMMON | ROTATED
     ),
     "husky_snow_boreal": Known(
-        0.52, 0.751, 2.04, 4.98, HELD | ROTATED | {"command_scale"}, COMMON - {"command_scale"}
+        0.52, 0.751, 2.04, 4.98, HELD | ROTATED | READ | {"command_scale"}, COMMON - {"command_scale"}
     ),
-    "husky_wheels_wetgrass": Known(0.0, 0.488, 0.617, 3.16, LIVE),
+    "husky_wheels_wetgrass": Known(0.0, 0.488, 0.617, 3.16, LIVE | READ),
     "husky_wheels_avide2": Known(0.0, 0.939, 0.946, 5.83, LIVE | {"not_moving"}, COMMON - {"not_moving"}),
-    "warthog_gravel_1": Known(0.52, 1.09, 2.04, 7.15, HELD | ROTATED | LATE | ENCODERS),
-    "warthog_wheels_asphalt": Known(0.80, 1.08, 1.65, 8.21, HELD | ROTATED | LATE | ENCODERS),
-    "warthog_wheels_asphalt_2024_8_7_11h30s30": Known(
-        0.75, 0.866, 1.51, 6.81, HELD | ROTATED | LATE | ENCODERS
-    ),
+    "warthog_gravel_1": Known(0.52, 1.09, 2.04, 7.15, HELD | ROTATED | LATE | READ),
+    "warthog_wheels_asphalt": Known(0.80, 1.08, 1.65, 8.21, HELD | ROTATED | LATE | READ),
+    "warthog_wheels_asphalt_2024_8_7_11h30s30": Known(0.75, 0.866, 1.51, 6.81, HELD | ROTATED | LATE | READ),
     "warthog_wheels_asphalt_2024_9_20_8h13s12": Known(0.0, 0.235, 1.06, 1.72, LIVE | LATE | ENCODERS),
     "warthog_wheels_grass_2024_7_29_14h46s15": Known(0.0, 0.066, 0.405, 0.72, LIVE | LATE | ENCODERS),
     "warthog_wheels_grass_2024_8_8_16h19s23": Known(0.0, 0.176, 0.498, 1.53, LIVE | LATE | ENCODERS),
     "warthog_wheels_gravel_2024_8_6_11h37s32": Known(
-        0.79, 0.923, 1.41, 7.13, HELD | ROTATED | LATE | {"imu_sign"}, COMMON - {"imu_sign"}
+        0.79, 0.923, 1.41, 7.13, HELD | ROTATED | LATE | READ | {"imu_sign"}, COMMON - {"imu_sign"}
     ),
     "warthog_wheels_ice_2024_7_30_16h30s21": Known(
-        0.72, 1.79, 2.18, 12.1, HELD | ROTATED | LATE | {"imu_sign"}, COMMON - {"imu_sign"}
+        0.72, 1.79, 2.18, 12.1, HELD | ROTATED | LATE | READ | {"imu_sign"}, COMMON - {"imu_sign"}
     ),
-    "warthog_wheels_sand_2024_9_25_14h32s32": Known(0.75, 1.36, 2.12, 10.1, HELD | ROTATED | LATE | ENCODERS),
+    "warthog_wheels_sand_2024_9_25_14h32s32": Known(0.75, 1.36, 2.12, 10.1, HELD | ROTATED | LATE | READ),
 }
 
 
