@@ -183,7 +183,8 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
         "profile": index.profile,
         "library": index.library,
         "duration_s": index.duration_s,
-        "messages": index.message_count,
+        "messages": seen.messages,
+        "messages_stated": index.message_count,
         "chunks": index.chunk_count,
         "compressions": list(index.compressions),
         "complete": not seen.losses,
@@ -217,7 +218,7 @@ def _format_log(seen: Inspection) -> list[str]:
     lines = [
         f"log       {index.path}",
         f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
-        f"          {index.message_count} messages in {index.chunk_count} chunks",
+        f"          {_format_count(seen)} in {index.chunk_count} chunks",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"
         + (f", unchecked: {seen.unchecked}" if seen.unchecked else ""),
@@ -245,6 +246,13 @@ def _format_log(seen: Inspection) -> list[str]:
     if seen.problem:
         lines.append(f"problem   {seen.problem}")
     return lines
+
+
+def _format_count(seen: Inspection) -> str:
+    """Number of messages that can be read, and of how many where some cannot."""
+    stated = seen.index.message_count
+    some = f" of {stated}" if seen.messages < stated else ""
+    return f"{seen.messages}{some} messages"
 
 
 def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:

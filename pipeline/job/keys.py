@@ -181,7 +181,8 @@ class TopicHealth:
     Attributes:
         topic: name.
         type_name: message type.
-        messages: number of messages.
+        messages: number of messages that can be read; of an encoding that cannot be read, those of the index.
+        messages_stated: number of messages that the index of the log states.
         rate_hz: inverse of the median period of log times; None with fewer than two messages.
         largest_gap_s: longest time between two messages.
         gaps: intervals between messages longer than three periods (and 0.12 s).
@@ -191,6 +192,7 @@ class TopicHealth:
     topic: str
     type_name: str
     messages: int
+    messages_stated: int
     rate_hz: float | None = None
     largest_gap_s: float | None = None
     gaps: int = 0
@@ -208,6 +210,11 @@ class Inspection:
     choice: Choice | None
     problem: str
     unchecked: str = ""
+
+    @property
+    def messages(self) -> int:
+        """Number of messages of all topics that can be read."""
+        return sum(topic.messages for topic in self.topics)
 
     @property
     def vehicle(self) -> Vehicle | None:
@@ -242,7 +249,7 @@ def inspect_log(
     data = read_topics(index, [Wanted(topic, ()) for topic in dict.fromkeys(c.topic for c in channels)])
     times = {columns.channel_id: (columns.log_time, columns.header_time) for columns in data.topics}
     topics = tuple(
-        _measure_topic(channel, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))
+        _measure_topic(channel, data.readable, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))
         for channel in index.channels
     )
     choice, problem = _choose(index, configuration, overrides)
@@ -253,8 +260,11 @@ def inspect_log(
     return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)
 
 
-def _measure_topic(channel: ChannelInfo, log_time: Ints, header_time: Ints | None) -> TopicHealth:
-    plain = TopicHealth(channel.topic, channel.type_name, channel.message_count)
+def _measure_topic(
+    channel: ChannelInfo, readable: Mapping[int, int], log_time: Ints, header_time: Ints | None
+) -> TopicHealth:
+    stated = channel.message_count
+    plain = TopicHealth(channel.topic, channel.type_name, readable.get(channel.id, stated), stated)
     if log_time.size < 2:  # noqa: PLR2004 - one message has no rate
         return plain
     periods = np.diff(np.sort(log_time)).astype(np.float64) / 1e9

@@ -106,6 +106,7 @@ class LogData:
         fetched_bytes: number of bytes fetched from an object store.
         unchecked: description of the data that no checksum covers; empty if all data read is covered.
         repeated: number of omitted duplicates of messages, by topic.
+        readable: number of messages that could be decoded, duplicates included, by channel number.
     """
 
     index: LogIndex
@@ -116,6 +117,7 @@ class LogData:
     fetched_bytes: int = 0
     unchecked: str = ""
     repeated: Mapping[str, int] = field(default_factory=dict)
+    readable: Mapping[int, int] = field(default_factory=dict)
 
     def of(self, topic: str) -> list[TopicColumns]:
         """Columns of every channel of a topic."""
@@ -184,6 +186,8 @@ def read_topics(
     twice = {jobs[number].info.topic: 0 for number in repeated}
     for number, rows in repeated.items():
         twice[jobs[number].info.topic] += rows.size
+    none = np.empty(0, dtype=np.int64)
+    readable = {one.channel_id: len(one) + repeated.get(one.channel_id, none).size for one in topics}
     return LogData(
         index,
         tuple(topics),
@@ -193,6 +197,7 @@ def read_topics(
         fetched,
         coverage.format_coverage(),
         twice,
+        readable,
     )
 
 

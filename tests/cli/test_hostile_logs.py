@@ -137,3 +137,17 @@ def test_a_budget_that_is_no_size_is_refused(samples: Path) -> None:
     done = run_verb("inspect", samples / "husky_tile.mcap", "--max-inflated", "much")
     assert done.returncode == 1
     assert done.stderr.splitlines() == ["slip: 'much' is not a size. Write for example 500MB or 2GB."]
+
+
+def test_messages_of_a_damaged_chunk_are_not_counted(samples: Path, tmp_path: Path) -> None:
+    content = bytearray((samples / "husky_tile.mcap").read_bytes())
+    content[600_000:605_000] = bytes(5000)
+    (damaged := tmp_path / "damaged.mcap").write_bytes(content)
+    whole = json.loads(run_verb("inspect", samples / "husky_tile.mcap", "--json").stdout)
+    found = json.loads(run_verb("inspect", damaged, "--json").stdout)
+
+    assert whole["messages"] == whole["messages_stated"] == found["messages_stated"]
+    assert found["messages"] == sum(topic["messages"] for topic in found["topics"]) < whole["messages"]
+    plain = run_verb("inspect", damaged).stdout
+    assert f"{found['messages']} of {whole['messages']} messages in" in plain
+    assert all(f"  {topic['messages']}  " in plain for topic in found["topics"])
