@@ -250,25 +250,37 @@ def _format_topics(summary: Summary) -> list[str]:
 
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
-    """Findings that need attention, except those in the verdict."""
+    """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
     findings = objects_in(summary, "findings")
-    new = [finding for finding in findings if str(finding["text"]).casefold() not in verdict.casefold()]
-    serious = [finding for finding in new if finding["severity"] != "info"]
-    timed = [finding for finding in serious if finding.get("t_end") is not None]
-    shown = [finding for finding in serious if finding not in timed][: _SHOWN - 1 if timed else _SHOWN]
-    lines = [_row("findings", f"!  {_format_timed(timed)}")] if timed else []
-    for finding in shown:
-        mark = "!!" if finding["severity"] == "error" else "! "
-        lines.append(_row("" if lines else "findings", f"{mark} {finding['text']}"))
-    rest = len(new) - len(shown) - len(timed)
-    if rest and (everything or len(serious) > len(shown) + len(timed)):
-        further = "more " if lines else ""
-        lines.append(_row("" if lines else "findings", f"   {rest} {further}in findings.parquet"))
-    return lines
+    known = {str(finding["text"]) for finding in findings}
+    own = objects_in(mapping_in(summary, "diagnosis"), "findings")
+    findings = [*findings, *(finding for finding in own if str(finding["text"]) not in known)]
+    incidents: dict[str, list[Mapping[str, object]]] = {}
+    rows, notes = [], []
+    for finding in findings:
+        if (text := str(finding["text"])).casefold() in verdict.casefold():
+            continue
+        if finding["severity"] == "info":
+            notes.append(f"   {text}")
+        elif finding.get("t_end") is not None:
+            incidents.setdefault(str(finding["id"]), []).append(finding)
+        else:
+            rows.append(f"{_mark([finding])} {text}")
+    rows = [*(f"{_mark(alike)} {_format_timed(alike)}" for alike in incidents.values()), *rows]
+    if everything:
+        rows += notes
+    elif len(rows) > _SHOWN:
+        rest = len(rows) - _SHOWN + len(notes)
+        rows = [*rows[:_SHOWN], f"   {rest} more (--all)"]
+    return [_row("" if number else "findings", row) for number, row in enumerate(rows)]
+
+
+def _mark(findings: Sequence[Mapping[str, object]]) -> str:
+    return "!!" if any(finding["severity"] == "error" for finding in findings) else "! "
 
 
 def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
-    """Number of findings with start and end, and the longest of them."""
+    """Number of incidents of one kind, and the longest of them."""
 
     def read(one: Mapping[str, object]) -> tuple[float, float]:
         start, end = cast("float", one["t_start"]), cast("float", one["t_end"])
@@ -281,19 +293,17 @@ def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
 
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
-    """Lines of the diagnosis, without the verdict and the run's findings, which are shown elsewhere."""
-    from pipeline.estimation.diagnosis_lines import choose_lines  # noqa: PLC0415 - heavy
+    """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
+    from pipeline.estimation.diagnosis_lines import FINDING_LABELS, choose_lines  # noqa: PLC0415 - heavy
 
     stored = mapping_in(summary, "diagnosis").get("lines") or []
     lines = choose_lines(cast("Sequence[tuple[str, str]]", stored), everything=everything)
-    said = {str(finding["text"]) for finding in objects_in(summary, "findings")}
     described: list[str] = []
-    label = due = ""
+    label = ""
     for name, text in lines:
-        label, due = name or label, name or due
-        if label != "verdict" and not (label == "findings" and text in said):
-            described.append(_row(due, text))
-            due = ""
+        label = name or label
+        if label not in ("verdict", *FINDING_LABELS):
+            described.append(_row(name, text))
     return described
 
 

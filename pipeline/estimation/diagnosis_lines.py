@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
@@ -56,7 +57,9 @@ _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 """Upper bounds that are listed, the tightest ones."""
 _FINDINGS_SHOWN = 4
-"""Distinct severe findings that are listed."""
+"""Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
+FINDING_LABELS = ("findings", "further", "notes")
+"""Labels of the findings: severe ones shown by default, other severe ones, and those of severity info."""
 
 
 def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = False) -> str:
@@ -72,7 +75,7 @@ def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = Fa
     heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason)}"
     lines = list_lines(first)
     for run in others:
-        lines += _label("findings", [f"{run.run}: {text}" for text in _list_grave(run)])
+        lines += _list_findings(run, prefix=f"{run.run}: ")
     return _write(heads, lines, following if first.effects else "", everything=everything)
 
 
@@ -119,11 +122,10 @@ def _name_input(source: str, reason: str) -> str:
 def list_lines(run: RunDiagnosis) -> list[Row]:
     """Label and text of every line after the head; a line without a label continues the section above."""
     verdict = format_verdict(run.to_json())
-    # Findings stated in the verdict are not repeated.
-    grave = [text for text in _list_grave(run) if text.casefold() not in verdict.casefold()]
+    findings = _list_findings(run, verdict)
     lines = [(VERDICT, verdict)]
     if not run.ladder:
-        return [*lines, *_label("findings", grave)]
+        return [*lines, *findings]
     main, minor = _split_effects(run)
     felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
@@ -139,7 +141,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("effects", effects)
     lines += _label("remaining", _format_remaining(run))
     lines += _label("learned", [] if run.learned.get("kept") else [format_learned_share(run.learned)])
-    lines += _label("findings", grave)
+    lines += findings
     others = [text for one in minor for text in _format_effect(one, run, falls)]
     others += [text for item in small for text in _format_ambiguous(item, run, falls)]
     lines += _label("smaller", others)
@@ -362,12 +364,20 @@ def _format_detectable(run: RunDiagnosis) -> str:
     return f"upper bounds ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
 
 
-def _list_grave(run: RunDiagnosis) -> list[str]:
-    grave = [str(finding["text"]) for finding in run.findings if finding.get("severity") != "info"]
-    # Repeated findings are listed once, with their count.
-    counts = {text: grave.count(text) for text in grave}
-    shown = [text if count == 1 else f"{text} ({count} times)" for text, count in counts.items()]
-    return shown[:_FINDINGS_SHOWN]
+def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> list[Row]:
+    """The findings of a run, except those stated in the verdict: the severe ones, then the notes."""
+    texts = Counter((finding.get("severity") == "info", str(finding["text"])) for finding in run.findings)
+    severe: list[str] = []
+    notes: list[str] = []
+    for (is_note, text), count in texts.items():
+        if text.casefold() not in verdict.casefold():
+            # Repeated findings are listed once, with their count.
+            times = f" ({count} times)" if count > 1 else ""
+            (notes if is_note else severe).append(f"{prefix}{text}{times}")
+    shown, further = severe[:_FINDINGS_SHOWN], severe[_FINDINGS_SHOWN:]
+    folded = [f"{len(further)} more{_FOLDED}"] if further else []
+    parts = zip(FINDING_LABELS, ([*shown, *folded], further, notes), strict=True)
+    return [row for label, part in parts for row in _label(label, part)]
 
 
 def _number(content: Mapping[str, Json], key: str) -> str:

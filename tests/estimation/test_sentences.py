@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
-from pipeline.estimation.diagnosis_lines import list_lines
+from pipeline.estimation.diagnosis_lines import choose_lines, list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression
@@ -142,3 +142,13 @@ def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() ->
     (way_on,) = [text for _, text in lines if text.startswith("next steps: ")]
     assert "another run" in way_on
     assert "slip model new-effect" in way_on
+
+
+def test_every_finding_is_listed_with_all_and_those_left_out_are_counted_without() -> None:
+    severe = [{"id": "w", "severity": "warning", "text": f"warning {number}"} for number in range(6)]
+    note = {"id": "n", "severity": "info", "text": "a note"}
+    lines = list_lines(RunDiagnosis("run", "command", findings=(note, *severe)))
+    folded = [text for _, text in choose_lines(lines, everything=False)][1:]
+    assert folded == ["warning 0", "warning 1", "warning 2", "warning 3", "2 more (--all)"]
+    whole = [text for _, text in choose_lines(lines, everything=True)][1:]
+    assert whole == [*(str(one["text"]) for one in severe), "a note"]
