@@ -56,6 +56,7 @@ _UNOBSERVABLE_SHOWN = 8
 """Unobservable effects that are listed: more would fill a screen."""
 _DETECTABLE_SHOWN = 5
 """Upper bounds that are listed, the tightest ones."""
+_CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
 _FINDINGS_SHOWN = 4
 """Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
 FINDING_LABELS = ("findings", "further", "notes")
@@ -228,11 +229,21 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
-    share = f"{format_share(run.unexplained.share)} of the residual"
-    rows.append(f"{share} has a structure that the model does not explain: {run.unexplained.where}")
+    rows.append(format_unexplained(run.unexplained.to_json()))
     formula = (run.unexplained.formula or "").splitlines()
     rows += [f"suggested term {line}" for line in formula if line.startswith("v_")]
     return [*rows, *_suggest_next_steps(run)]
+
+
+def format_unexplained(rest: Mapping[str, object]) -> str:
+    """The structure of the residual that nothing explains: its share of the residual, and what it depends on.
+
+    A suggested formula is compared with the whole residual, all else with that of one channel.
+    """
+    share = number_in(rest, "share")
+    channel = "" if rest.get("formula") else f" {_CHANNELS.get(str(rest.get('channel')), 'motion')}"
+    what = f"{'part' if share is None else format_share(share)} of the residual{channel}"
+    return f"{what} has a structure that the model does not explain: {rest.get('where', '')}"
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
-from pipeline.estimation.diagnosis_lines import format_learned_share
+from pipeline.estimation.diagnosis_lines import format_learned_share, format_unexplained
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models.catalogue import list_effects
@@ -180,7 +180,6 @@ def view_provenance(page: Page) -> dict[str, object]:
 
 
 _MANY_FOLD = 10.0
-_CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
 _HEAD = (
     Column("effect"),
     Column("value", number=True),
@@ -291,12 +290,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "undecided", f"{names}: {advice}", ""
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
-        share = format_known_share(number_in(rest, "share"))
         formula = str(rest.get("formula") or "")
         example = "; suggested term" if formula else ""
-        channel = _CHANNELS.get(str(rest.get("channel")), "motion")
-        sentence = f"{share} of the residual {channel}: {rest.get('where', '')}{example}"
-        yield "unexplained", sentence, formula
+        yield "unexplained", f"{format_unexplained(rest)}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]

@@ -7,13 +7,14 @@ import math
 import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
-from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
-from pipeline.estimation.diagnosis_lines import choose_lines, list_lines
+from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
+from pipeline.estimation.diagnosis_lines import choose_lines, format_unexplained, list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression
 from pipeline.models.parameter import parse_unit
-from pipeline.report.sections_why import format_row
+from pipeline.report.scene import RunReport
+from pipeline.report.sections_why import _list_open, format_row
 from pipeline.run import MotionError
 from pipeline.sources import find_preset
 
@@ -152,3 +153,17 @@ def test_every_finding_is_listed_with_all_and_those_left_out_are_counted_without
     assert folded == ["warning 0", "warning 1", "warning 2", "warning 3", "2 more (--all)"]
     whole = [text for _, text in choose_lines(lines, everything=True)][1:]
     assert whole == [*(str(one["text"]) for one in severe), "a note"]
+
+
+def test_a_share_of_the_residual_names_what_it_is_a_share_of() -> None:
+    rest = Unexplained(0.98, "w", ("w",), "yaw error grows with roll", None, {}, "body")
+    ladder = ({"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},)
+    said = "98 % of the residual yaw rate has a structure that the model does not explain: "
+    said += "yaw error grows with roll"
+    run = RunDiagnosis("run", "command", ladder=ladder, unexplained=rest)
+    assert said in [text for _, text in list_lines(run)]
+    report = RunReport({"run": "a"}, diagnosis=run.to_json())
+    assert said in [sentence for _, sentence, _ in _list_open(report)]
+    # A formula is compared with the residual of all channels.
+    whole = format_unexplained({**rest.to_json(), "formula": "[[effect]]"})
+    assert whole.startswith("98 % of the residual has a structure")
