@@ -409,10 +409,12 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
 
 
 def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
-    """Every parameter of a model file by ``effect.name``, with the intervals of its last fit."""
+    """Every parameter of a model file by ``effect.name``: intervals of its last fit, and doubts."""
     parameters = parameters_as_json(file.model, NOT_FITTED)
     for label, (low, high) in file.intervals.items():
         parameters[label] |= {"low": _round(low), "high": _round(high)}
+    for label, doubt in file.list_doubts().items():
+        parameters[label]["doubt"] = doubt
     for label in file.per_run:
         rows = [row for row in file.own_numbers if row.get("parameter") == label]
         if rows and label in parameters:
@@ -452,10 +454,9 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
                 text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
             elif row.get("fitted"):
                 text += UNDETERMINED
-            if row.get("at_bound"):
-                text += "  (at its bound)"
-            if row.get("observable") is False:
-                text += "  (not observable in these runs)"
+            marks = ["at its bound"] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
+            marks += ["not observable in these runs"] * (row.get("observable") is False)
+            text += "".join(f"  ({mark})" for mark in marks)
             if "run" in row:
                 text += f"  run {row['run']}"
             lines.append(text.rstrip())

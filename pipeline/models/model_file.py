@@ -112,6 +112,12 @@ class ModelFile:
             return "undetermined: its interval reaches a limit of the search"
         return ""
 
+    def list_doubts(self) -> dict[str, str]:
+        """Reasons why values are not reliable, by label ``effect.name``; see `find_doubt`."""
+        numbers = ((effect, parameter) for effect in self.model for parameter in effect.parameters)
+        doubts = {f"{effect.id}.{one.name}": self.find_doubt(effect, one) for effect, one in numbers}
+        return {label: doubt for label, doubt in doubts.items() if doubt}
+
     def list_fitted(self, key: str) -> list[dict[str, object]]:
         """Tables of a name in the last fit, such as `runs` or `own`; empty before the first fit."""
         rows = self.fit.get(key)

@@ -18,6 +18,7 @@ from target_schemas import ALL, SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
+from pipeline.estimation.estimates import format_parameters, list_parameters
 from pipeline.export import export_model, find_target, list_targets, read_current
 from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
@@ -178,6 +179,22 @@ def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     at_bound = "at its bound: a limit of the search, not a measurement"
     assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
     assert "# Fitted from wheel encoders of yard/monday." in lines
+
+
+def test_show_marks_the_numbers_that_an_export_marks() -> None:
+    effects = (
+        find_effect("effective_track")(k=1.8),
+        find_effect("transport_delay")(d=1.0),
+        find_effect("drive_lag")(tau=0.3),
+    )
+    file = make(*effects, intervals={"effective_track.k": (1.7, 1.9)}, fit=FIT)
+    doubts = file.list_doubts()
+    assert doubts.keys() == {"transport_delay.d", "drive_lag.tau"}
+    shown = "\n".join(format_parameters(list_parameters(file)))
+    exported = export_model(file, "ros2_control")
+    for doubt in doubts.values():
+        assert f"({doubt})" in shown
+        assert doubt in exported
 
 
 def test_what_is_not_known_is_not_written() -> None:
