@@ -105,6 +105,7 @@ def _compare_causes(
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.fleet import MEASURES  # noqa: PLC0415 - heavy
     from pipeline.fleet.pairs import compare_orders  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import NOT_VALID  # noqa: PLC0415 - heavy
 
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
         "dataset", "runs", "median_window_norm"
@@ -122,7 +123,9 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
-    return [*lines, "", *(f"! {note}" for note in answer.notes), f"page    {written['comparison.html']}"]
+    # The plain test is a column of the page and of the files only.
+    notes = [f"! {note}" for note in answer.notes if note != NOT_VALID]
+    return [*lines, "", *notes, f"page    {written['comparison.html']}"]
 
 
 def _format_dataset(row: Mapping[str, object], width: int) -> str:
@@ -136,22 +139,17 @@ def _format_dataset(row: Mapping[str, object], width: int) -> str:
 
 
 def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    shown = [row for row in rows if isinstance(row["p_adjusted"], float) and row["p_adjusted"] <= 0.05]  # noqa: PLR2004 - the usual level
+    from pipeline.fleet.pairs import ABOUT_BLOCKS, DIFFERENT, OF_TWO_RUNS, count_pairs, judge_pair  # noqa: PLC0415 - heavy
+
+    verdicts = [judge_pair(row) for row in rows]
     lines = [
         f"{row['a']} and {row['b']} differ: shift {format_value(row['shift'])} m/s, "
         f"Cliff's delta {format_value(row['cliffs_delta'])} ({row['size']}), "
-        f"p = {format_value(row['p_adjusted'])} corrected"
-        + (
-            ", a difference between two runs, not between terrains"
-            if row["unit_of_analysis"] == "blocks"
-            else ""
-        )
-        for row in shown
+        f"p = {format_value(row['p_adjusted'])} corrected" + f", {ABOUT_BLOCKS}" * (verdict == OF_TWO_RUNS)
+        for row, verdict in zip(rows, verdicts, strict=True)
+        if verdict in (DIFFERENT, OF_TWO_RUNS)
     ]
-    rest = len(rows) - len(shown)
-    if rest:
-        lines.append(f"{rest} pair{'s' * (rest != 1)} without a significant difference")
-    return lines
+    return lines if len(lines) == len(rows) else [*lines, count_pairs(rows)]
 
 
 _OWN = Path("deployments.csv")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -322,6 +323,39 @@ def tabulate_pairs(
     ]
     frame = pl.DataFrame(rows, schema=contract_of("comparisons").schema.create_empty().schema)
     return frame.select(cs.string(), cs.float(), cs.integer(), cs.enum())
+
+
+DIFFERENT, OF_TWO_RUNS, ALIKE, TOO_FEW = "different", "different runs", "alike", "too few"
+
+
+def judge_pair(row: Mapping[str, object]) -> str:
+    """What a row of `comparisons` says: `DIFFERENT`, `OF_TWO_RUNS`, `ALIKE` or `TOO_FEW`."""
+    if _number(row["p_adjusted"]) <= LEVEL:
+        return DIFFERENT if row["unit_of_analysis"] == RUNS else OF_TWO_RUNS
+    return TOO_FEW if _number(row["smallest_p"]) > LEVEL else ALIKE
+
+
+def _number(value: object) -> float:
+    return float(value) if isinstance(value, (int, float)) else 1.0
+
+
+_WORDS = {
+    DIFFERENT: ("differs significantly", "differ significantly"),
+    OF_TWO_RUNS: ("differs only as two single runs", "differ only as two single runs"),
+    ALIKE: ("shows no significant difference", "show no significant difference"),
+    TOO_FEW: ("has too few runs for a test", "have too few runs for a test"),
+}
+"""What is said of one pair, and of several."""
+
+
+def count_pairs(rows: Sequence[Mapping[str, object]]) -> str:
+    """How many pairs of the table `comparisons` differ, and what is said of the others, as one sentence."""
+    counts = Counter(judge_pair(row) for row in rows)
+    if len(rows) == 1:
+        return f"The pair of datasets {_WORDS[next(iter(counts))][0]}."
+    parts = [] if counts[DIFFERENT] else ["none differs significantly"]
+    parts += [f"{counts[kind]} {words[counts[kind] > 1]}" for kind, words in _WORDS.items() if counts[kind]]
+    return f"Of {len(rows)} pairs of datasets, {', '.join(parts)}."
 
 
 def write_csv(frame: pl.DataFrame) -> str:

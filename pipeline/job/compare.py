@@ -202,8 +202,8 @@ _WINDOW_COLUMNS = {
     "window_norm": pl.Float64,
 }
 NOT_VALID = (
-    "p_uncorrected is the plain Mann-Whitney test of published work over all samples; it is not valid here, "
-    "because samples of one run are correlated"
+    "plain p (p_uncorrected) is the Mann-Whitney test of published work over all samples; it is not valid "
+    "here, because samples of one run are correlated"
 )
 
 
@@ -368,9 +368,15 @@ def _keys(compared: ComparedRuns) -> dict[str, str]:
 def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
     if len(groups) < 2:  # noqa: PLR2004 - a pair
         return ["there is one dataset only: nothing to compare it with"]
-    hopeless = sorted({pair.note for pair in pairs if "cannot be significant" in pair.note})
+    hopeless: dict[str, list[str]] = {}
+    for pair in pairs:
+        if "cannot be significant" in pair.note:
+            hopeless.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
     single = sorted(group.name for group in groups if len(group.runs) == 1)
-    sentences = [f"{note}" for note in hopeless]
+    sentences = []
+    for note, (first, *others) in sorted(hopeless.items()):
+        more = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
+        sentences.append(f"{first}{more}: {note}")
     if single:
         sentences.append(
             f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"

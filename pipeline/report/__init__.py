@@ -71,7 +71,7 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
     if value == 0.0:
         return "0"
     places = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
+    return f"{value:z,.{min(places, _MOST_PLACES)}f}".replace("-", "\u2212")
 
 
 def format_known_share(value: float | None) -> str:

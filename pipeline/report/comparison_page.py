@@ -8,7 +8,15 @@ import polars as pl
 from pipeline.core import INPUT_WORDS, format_duration, format_share
 from pipeline.fleet import MEASURES
 from pipeline.fleet.causes import Budget, Causes, Difference
-from pipeline.fleet.pairs import Answer, compare_orders
+from pipeline.fleet.pairs import (
+    DIFFERENT,
+    OF_TWO_RUNS,
+    TOO_FEW,
+    Answer,
+    compare_orders,
+    count_pairs,
+    judge_pair,
+)
 from pipeline.fleet.rank_tests import LEVEL, kendall_tau, list_swaps
 from pipeline.report import (
     MISSING,
@@ -220,16 +228,8 @@ def list_pictures(answer: Answer) -> list[Picture]:
 def _format_verdict(comparisons: pl.DataFrame) -> str:
     if comparisons.is_empty():
         return "There is one dataset only: nothing to compare it with."
-    different = comparisons.filter(pl.col("p_adjusted") <= LEVEL)
-    over_runs = different.filter(pl.col("unit_of_analysis") == "runs").height
-    hopeless = comparisons.filter(pl.col("smallest_p") > LEVEL).height
-    verdict = (
-        f"Of {comparisons.height} pairs of datasets {over_runs} differ significantly; of "
-        f"{different.height - over_runs} more only the single runs do, not their terrains"
-    )
-    if hopeless:
-        verdict += f"; {hopeless} have too few runs for a test"
-    return f"{verdict}. Level {format_share(LEVEL)}, corrected for multiple comparisons."
+    counts = count_pairs(comparisons.to_dicts())
+    return f"{counts} Level {format_share(LEVEL)}, corrected for multiple comparisons."
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -276,15 +276,10 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
 
 
 def _format_pair(row: Mapping[str, object]) -> str | Cell:
-    if _number(row["p_adjusted"]) <= LEVEL:
+    verdict = judge_pair(row)
+    if verdict in (DIFFERENT, OF_TWO_RUNS):
         return Cell("different", tag="b")
-    if _number(row["smallest_p"]) > LEVEL:
-        return "too few runs for a test"
-    return "without a significant difference"
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) else 1.0
+    return "too few runs for a test" if verdict == TOO_FEW else "no significant difference"
 
 
 def _format_p(p: float) -> str:

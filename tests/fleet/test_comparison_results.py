@@ -12,9 +12,10 @@ from comparison_store import Run, write_run
 
 from pipeline.cli import main
 from pipeline.fleet import ComparisonError
-from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders
+from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders, count_pairs
 from pipeline.job import JobError
 from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer
+from pipeline.report.scene import format_ends
 from pipeline.store import Store
 from schemas import list_contracts
 from schemas.run_tables import Slip
@@ -73,7 +74,11 @@ def test_three_runs_a_side_are_told_what_would_do(store: Store) -> None:
     pair = pick(answer, "warthog_asphalt", "warthog_ice")
     assert pair["smallest_p"] == pytest.approx(0.1)
     assert pair["note"] == "cannot be significant with 3 runs per side; 4 per side are needed"
-    assert any("cannot be significant with 3 runs per side" in note for note in answer.notes)
+    told = (
+        "warthog_asphalt and warthog_ice: cannot be significant with 3 runs per side; 4 per side are needed"
+    )
+    assert told in answer.notes
+    assert count_pairs(answer.comparisons.to_dicts()) == "The pair of datasets has too few runs for a test."
 
 
 def test_one_run_a_side_is_labelled_run_against_run(store: Store) -> None:
@@ -290,3 +295,31 @@ def test_runs_without_wheels_have_no_published_number_and_that_is_said(store: St
     assert any("ice, sand not compared: no published norm" in note for note in answer.notes)
     assert answer.comparisons.is_empty()
     assert "comparison.html" in write_answer(store, answer)
+
+
+def test_pages_and_terminal_count_pairs_alike(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    def row(p: float, smallest: float, unit: str = "runs") -> dict[str, object]:
+        return {"p_adjusted": p, "smallest_p": smallest, "unit_of_analysis": unit}
+
+    rows = [row(0.3, 0.02), *[row(0.3, 0.1)] * 3, *[row(0.01, 0.01, "blocks")] * 2]
+    assert count_pairs(rows) == (
+        "Of 6 pairs of datasets, none differs significantly, 2 differ only as two single runs, "
+        "1 shows no significant difference, 3 have too few runs for a test."
+    )
+    assert count_pairs([*rows, row(0.01, 0.01)]).startswith(
+        "Of 7 pairs of datasets, 1 differs significantly, 2"
+    )
+
+    fill(store, TERRAINS, runs=2)
+    with pytest.raises(SystemExit):
+        main(["compare", str(store.root)])
+    shown = capsys.readouterr().out
+    counted = count_pairs(ask(store).comparisons.to_dicts())
+    assert counted in shown
+    assert counted in (store.root / "comparison.html").read_text("utf-8")
+    # The terminal has no column of the plain test.
+    assert "p_uncorrected" not in shown
+
+
+def test_an_end_that_rounds_to_zero_has_no_sign() -> None:
+    assert format_ends({"low": -0.0003, "high": 1.01}) == "0.000 to 1.01"
