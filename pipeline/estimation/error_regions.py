@@ -412,17 +412,18 @@ def format_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[
     Args:
         error: name of the error.
         unit: of the error.
-        signal: name of the feature.
+        signal: name of the feature, with its unit: ``roll [rad]``.
         table: values of the signal, rising, and the mean error at each.
     """
     for symbol, words in _SIGNALS.items():
         signal = signal.replace(symbol, words)
-    signal = signal.replace(" 0 s ago", "").replace(" s ago", " s earlier")
+    signal, _, of = signal.replace(" 0 s ago", "").replace(" s ago", " s earlier").partition(" [")
+    places = f" {of}".replace("]", "").rstrip()
     low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
     verbs = {(table[0], table[-1]): "grows with", (table[-1], table[0]): "falls with"}
     return (
         f"{error} {verbs.get((low, high), 'depends on')} {signal}: "
-        f"{high[1]:+.3g} {unit} at {high[0]:.3g}, {low[1]:+.3g} {unit} at {low[0]:.3g}"
+        f"{high[1]:+.3g} {unit} at {high[0]:.3g}{places}, {low[1]:+.3g} {unit} at {low[0]:.3g}{places}"
     )
 
 

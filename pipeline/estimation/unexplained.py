@@ -226,7 +226,7 @@ def list_window_signals(comparisons: Sequence[Comparison]) -> tuple[Floats, tupl
     """Everything recorded, at the middle of every window.
 
     Returns:
-        Features of shape (n, f), and their names.
+        Features of shape (n, f), and their names with units: ``roll [rad]``; without one where there is none.
     """
     parts = [_list_signals(comparison) for comparison in comparisons]
     return np.concatenate([part[0] for part in parts]), parts[0][1]
@@ -241,10 +241,10 @@ def _list_signals(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
     vehicle = context.vehicle
     columns: dict[str, Floats] = {}
     for late in _LAGS_S:
-        columns[f"v_x {late:g} s ago"] = np.interp(at - late, context.times, velocity.x)
-        columns[f"v_w {late:g} s ago"] = np.interp(at - late, context.times, velocity.w)
+        columns[f"v_x {late:g} s ago [m/s]"] = np.interp(at - late, context.times, velocity.x)
+        columns[f"v_w {late:g} s ago [rad/s]"] = np.interp(at - late, context.times, velocity.w)
         if vehicle.kinematics.has_inputs("sideways"):
-            columns[f"v_y {late:g} s ago"] = np.interp(at - late, context.times, velocity.y)
+            columns[f"v_y {late:g} s ago [m/s]"] = np.interp(at - late, context.times, velocity.y)
     x, y, yaw = (np.interp(at, context.times, column) for column in context.from_start.T)
     for times, name in ((1.0, "yaw"), (2.0, "2 yaw")):
         columns[f"sin {name} since the start"] = np.sin(times * yaw)
@@ -253,22 +253,22 @@ def _list_signals(comparison: Comparison) -> tuple[Floats, tuple[str, ...]]:
         now, before = (
             np.interp(at - late, context.times, context.attitude[:, index]) for late in (0.0, _MOMENT_S)
         )
-        columns |= {name: now, f"change of {name} in {_MOMENT_S:g} s": now - before}
-    columns |= {"x ahead of the start": x, "y left of the start": y}
+        columns |= {f"{name} [rad]": now, f"change of {name} in {_MOMENT_S:g} s [rad]": now - before}
+    columns |= {"x ahead of the start [m]": x, "y left of the start [m]": y}
     half = 0.5 * context.track_m * velocity.w if vehicle.kind == "differential" else 0.0 * velocity.w
     for name, rim in (("left", velocity.x - half), ("right", velocity.x + half)):
         angle = np.cumsum(rim) * grid.step_s / vehicle.wheel_radius_m
         for word, wave in (("sin", np.sin(angle)), ("cos", np.cos(angle))):
-            columns[f"{word} {name} wheel"] = _average(rim * wave, at, comparison)
-        columns[f"seconds since the {name} wheel reversed"] = _age(at, context, _find_reversals(rim))
-    for name, signal in (("v_x", velocity.x), ("v_w", velocity.w)):
+            columns[f"{word} {name} wheel [m/s]"] = _average(rim * wave, at, comparison)
+        columns[f"time since the {name} wheel reversed [s]"] = _age(at, context, _find_reversals(rim))
+    for name, unit, signal in (("v_x", "m/s", velocity.x), ("v_w", "rad/s", velocity.w)):
         before = np.interp(context.times - _MOMENT_S, context.times, signal)
         gained = np.abs(signal) - np.abs(before)
-        columns[f"change of |{name}| in {_MOMENT_S:g} s"] = np.interp(at, context.times, gained)
+        columns[f"change of |{name}| in {_MOMENT_S:g} s [{unit}]"] = np.interp(at, context.times, gained)
         hard = np.abs(signal - before) > _HARD * np.abs(signal).max()
-        columns[f"seconds since {name} changed hard"] = _age(at, context, hard)
-    columns["way driven"] = np.interp(at, context.times, np.cumsum(np.abs(velocity.x)) * grid.step_s)
-    columns["time"] = at
+        columns[f"time since {name} changed hard [s]"] = _age(at, context, hard)
+    columns["way driven [m]"] = np.interp(at, context.times, np.cumsum(np.abs(velocity.x)) * grid.step_s)
+    columns["time [s]"] = at
     return np.column_stack(list(columns.values())), tuple(columns)
 
 
@@ -386,7 +386,7 @@ def _name_signal(body: Explored, signal: Floats, share: float, formula: str | No
     whose = " of the wheels" if body.search.path == "wheels" else ""
     where = format_dependence(ERROR_WORDS[CHANNELS[channel]] + whose, unit, name, table)
     partial: Mapping[str, Json] = {
-        "of": name,
+        "of": name.partition(" [")[0],
         "unit": unit,
         "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
     }

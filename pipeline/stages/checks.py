@@ -408,10 +408,10 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     if along is not None and turning is not None and samples.measured is not None:
         skew = turning[0] - along[0]
         if abs(skew) > max(_SKEW, SURE * float(np.hypot(along[1], turning[1]))):
-            later = "later" if skew > 0.0 else "earlier"
+            order = "lags" if skew > 0.0 else "leads"
             text = (
-                f"against the wheels the heading is {abs(skew) * 1e3:.0f} ms {later} than the position: "
-                "a skew of the localization (it looks like lateral skid) or inertia of the body"
+                f"compared with the wheels, the heading {order} the position by {abs(skew) * 1e3:.0f} ms: "
+                "the localization delays them differently (similar to lateral skid), or the body has inertia"
             )
             name = find_late_effect(Late.HEADING).id
             findings.append(Finding(name, "warning", text, where="pose", value=skew))

@@ -175,7 +175,7 @@ def _spread_by_speed(size: Floats, speed: Floats) -> Floats:
 # position with a changing heading, or a path that is far too long although the drive was steady: a
 # localization that had lost the vehicle and catches up (a path far too short is possible: wheels do spin).
 # Stretches of two seconds from each command step's start, and of one second throughout, are tested against a
-# robust model of the whole run; faults are marked, shown, and left out of medians.
+# robust model of the whole run; faults are marked, shown, and left out of medians and fits.
 
 _FEWEST_IN_STRETCH = 8
 """Least number of stretches for a usual gain and direction."""
@@ -265,7 +265,7 @@ def _report_faults(times: Floats, faults: Mapping[str, Flags], suspect: Flags, j
     kinds = [f"{words} ({of:.3g} s)" for words, of in shown.items()] if len(shown) > 1 else list(shown)
     text = (
         f"{suspect.sum() * period:.3g} s of the poses ({format_share(share)} of those that could be judged) "
-        f"have {' or '.join(kinds)}: left out of medians"
+        f"have {' or '.join(kinds)}: left out of medians and fits"
     )
     count = int((np.diff(suspect.astype(np.int8), prepend=0) > 0).sum())
     first = float(times[np.flatnonzero(suspect)[0]])

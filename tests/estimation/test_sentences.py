@@ -93,11 +93,16 @@ def test_the_source_of_a_vehicle_is_that_of_its_geometry() -> None:
     [
         (
             (-0.1, 0.0, 0.2),
-            "v_x 0 s ago",
-            "lateral error grows with forward speed: +0.2 m/s at 1, -0.1 m/s at -1",
+            "v_x 0 s ago [m/s]",
+            "lateral error grows with forward speed: +0.2 m/s at 1 m/s, -0.1 m/s at -1 m/s",
         ),
-        ((0.2, 0.0, -0.1), "v_w 0.5 s ago", "lateral error falls with yaw rate 0.5 s earlier: "),
-        ((0.0, 0.2, -0.1), "roll", "lateral error depends on roll: +0.2 m/s at 0, -0.1 m/s at 1"),
+        ((0.2, 0.0, -0.1), "v_w 0.5 s ago [rad/s]", "lateral error falls with yaw rate 0.5 s earlier: "),
+        (
+            (0.0, 0.2, -0.1),
+            "roll [rad]",
+            "lateral error depends on roll: +0.2 m/s at 0 rad, -0.1 m/s at 1 rad",
+        ),
+        ((0.2, 0.0, -0.1), "sin yaw", "lateral error falls with sin yaw: +0.2 m/s at -1, -0.1 m/s at 1"),
     ],
 )
 def test_a_dependence_says_which_way_it_goes(means: tuple[float, ...], signal: str, start: str) -> None:

@@ -40,6 +40,9 @@ def test_eight_seconds_at_ten_hertz_show_a_heading_that_is_late() -> None:
     assert found.id == "heading_skew"
     assert found.value is not None
     assert abs(found.value - 0.2) < 0.03
+    assert found.text.startswith("compared with the wheels, the heading lags the position by ")
+    (early,) = check_delays(make_samples(times, move(0.0), move(-0.2)), find_preset("husky_a200"))
+    assert "the heading leads the position by " in early.text
 
 
 def test_bunches_of_seven_messages_of_a_slow_topic_are_put_back_to_its_pace() -> None:

@@ -156,6 +156,7 @@ def test_trap_18_stretches_with_a_rotated_heading_are_found(
     turned = replace(ICP, rotated_stretches=3, update_hz=update_hz)
     taken = drive(replace(FIELD, vehicle=VEHICLES[vehicle], duration_s=180.0, pose=turned))
     found = taken.finding("bad_stretch")
+    assert found.text.endswith(": left out of medians and fits")
     # A stretch that falls into slow driving cannot be told, one over two steps may count twice.
     assert found.count is not None
     assert 2 <= found.count <= 6
