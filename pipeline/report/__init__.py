@@ -51,6 +51,7 @@ writing_export = partial(
 )
 
 MISSING = "\u2013"
+_SQUARE = re.compile(r"\b(m|rad|s)\^2")
 _OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
 """Command line option in a text: browsers would break it after a hyphen."""
 _KILOMETRE = 1000.0
@@ -62,6 +63,11 @@ def begin_large(text: str) -> str:
     """Capitalize the text; identifiers such as `drive_lag.tau` remain unchanged."""
     first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
     return text if "_" in first or "." in first else text[:1].upper() + text[1:]
+
+
+def set_squares(text: str) -> str:
+    """Units of a text with squares as a page sets them: m/s\u00b2 for m/s^2."""
+    return _SQUARE.sub("\\1\u00b2", text)
 
 
 def format_number(value: float | None, *, digits: int = 3) -> str:
@@ -162,6 +168,7 @@ def _environment() -> Environment:
     environment.filters |= {
         "bytes": format_bytes,
         "capital": begin_large,
+        "squares": set_squares,
         "split_options": _OPTION.split,
         "distance": format_distance,
         "number": format_number,

@@ -22,6 +22,7 @@ from pipeline.report import (
     format_known_share,
     format_number,
     format_split,
+    set_squares,
 )
 from pipeline.report.figures import Section
 from pipeline.report.scene import RunReport, format_ends
@@ -238,7 +239,7 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
 def format_row(entry: Mapping[str, object]) -> tuple[str, str]:
     """Description of an effect, and its possible causes."""
     does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(CAUSE)
-    return does, may_be
+    return set_squares(does), set_squares(may_be)
 
 
 def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
@@ -262,7 +263,7 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
     for key in parameters:
         values = mapping_in(parameters, key)
         unit = values.get("unit")
-        shown = str(unit).replace("^2", "\u00b2") if unit not in (None, "1", "") else ""
+        shown = set_squares(str(unit)) if unit not in (None, "1", "") else ""
         rows.append(
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),

@@ -57,6 +57,7 @@ def test_an_effect_with_several_causes_names_them_and_what_separates_them() -> N
         motion,
         "skidding or a wrong track width; a run on another surface separates them.",
     )
+    assert format_row({"sentence": "Turn acceleration limit: 1.55 rad/s^2"})[0].endswith("1.55 rad/s\u00b2")
 
 
 def test_causes_that_hold_alternatives_are_joined_by_commas() -> None:

@@ -130,6 +130,7 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
     assert 'data-figure="trajectory"' in first
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in join_commands(first)
     assert "To separate lateral_skid or icr_offset: drive circles" in first
+    assert "<code>effective_track</code><br>Cause: skidding or a wrong track width" in page
     told = "remaining error 31 cm, noise floor 19 cm: the effects remove 86 % of the error above it"
     assert told not in first
     assert told in page
