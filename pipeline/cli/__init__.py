@@ -13,7 +13,15 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Literal, get_args, get_origin
 
-from cyclopts import App, CycloptsError, CycloptsPanel, Group, MissingArgumentError, Parameter
+from cyclopts import (
+    App,
+    CycloptsError,
+    CycloptsPanel,
+    Group,
+    MissingArgumentError,
+    Parameter,
+    UnusedCliTokensError,
+)
 
 from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, print_note
 from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
@@ -107,6 +115,10 @@ def _install_completion(app: App, /, *, shell: Literal["bash", "zsh", "fish"] | 
 
 def _format_usage(error: CycloptsError) -> object:
     """Format the panel of a usage error; for a missing argument it states name and meaning."""
+    verb = f"slip {' '.join(error.command_chain or ())}".rstrip()
+    if isinstance(error, UnusedCliTokensError):
+        rest = " ".join(error.unused_tokens or ())
+        return CycloptsPanel(f"{verb} takes no further argument: {rest}. See {verb} --help.")
     lacking = error.argument
     if not isinstance(error, MissingArgumentError) or lacking is None or lacking.tokens or error.keyword:
         return CycloptsPanel(error)
@@ -115,7 +127,6 @@ def _format_usage(error: CycloptsError) -> object:
     documented = error.app.assemble_argument_collection(parse_docstring=True) if error.app else ()
     meanings = (one.parameter.help for one in documented if one.name == lacking.name)
     about = " ".join((next(meanings, "") or " or ".join(map(str, choices))).split()).removesuffix(".")
-    verb = f"slip {' '.join(error.command_chain or ())}"
     return CycloptsPanel(f"{verb} needs {lacking.name}{f': {about}' if about else ''}.")
 
 

@@ -42,7 +42,9 @@ if TYPE_CHECKING:
 def analyze(  # noqa: D417 - the shared choices document themselves
     logs: Annotated[
         list[Path],
-        Parameter(help="MCAP files or folders of split recordings; after -- if a name begins with a dash"),
+        Parameter(
+            help="MCAP files, or folders of split recordings; write -- before names that begin with a dash"
+        ),
     ],
     /,
     *,

@@ -63,12 +63,18 @@ def shorten(text: str, most: int = _READABLE) -> str:
     return text if len(text) <= most else f"{text[:most]}..."
 
 
-def guess_names(name: str, known: Iterable[str]) -> str:
-    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty."""
+def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
+    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty.
+
+    Args:
+        name: the unknown name.
+        known: the names that there are.
+        end: common end of all names, which does not make them alike.
+    """
     import difflib  # noqa: PLC0415 - only needed once something is already wrong
 
-    near = difflib.get_close_matches(name, list(known), n=3)
-    return f"Did you mean {' or '.join(near)}? " if near else ""
+    near = difflib.get_close_matches(name.removesuffix(end), [one.removesuffix(end) for one in known], n=3)
+    return f"Did you mean {' or '.join(f'{one}{end}' for one in near)}? " if near else ""
 
 
 def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:

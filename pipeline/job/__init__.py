@@ -20,7 +20,18 @@ ANALYZE_FIRST = "Analyze logs first: slip analyze LOG... --results RESULTS --ter
 
 
 def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] = ()) -> JobError:
-    """Build the error that no run in `root` fits the request; `notes` list what was excluded."""
+    """Build the error that no run in `root` fits the request; `notes` list what was excluded.
+
+    A file, or a folder of other things, is no results folder: then this is the error.
+    """
+    from pipeline.store.results import RUNS  # noqa: PLC0415 - heavy
+
+    if root.is_file() or (root.is_dir() and any(root.iterdir()) and not (root / RUNS).is_dir()):
+        what, hint = (
+            "this is not a results folder",
+            "Give the folder that `slip analyze` writes (default: results).",
+        )
+        return JobError(code, what, where=str(root), hint=hint)
     return JobError(code, what + "".join(f"; {note}" for note in notes), where=str(root), hint=hint)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from pipeline.core import SlipError, guess_names
 from pipeline.core.arrays import Ints
-from pipeline.job import STAGES, JobError, Options
+from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.logs import (
     ChannelInfo,
@@ -306,7 +306,12 @@ def find_run(text: str, store: Store) -> Manifest:
     Raises:
         JobError: no run matches, or several runs do.
     """
-    manifests = store.survey().manifests
+    survey = store.survey()
+    manifests = survey.manifests
+    if not manifests:
+        unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
+        what = f"there is no run {text!r}: no run has been analyzed yet{unread}"
+        raise JobError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     path = spell_location(Path(text).resolve())
     fitting = [
         manifest
@@ -315,7 +320,7 @@ def find_run(text: str, store: Store) -> Manifest:
     ]
     if len(fitting) == 1:
         return fitting[0]
-    names = ", ".join(manifest.run for manifest in (fitting or manifests)) or "none yet"
+    names = ", ".join(manifest.run for manifest in (fitting or manifests))
     what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
     known = [name for manifest in manifests for name in (manifest.run, manifest.run.rsplit("/", 1)[-1])]
     near = "" if fitting else guess_names(text, dict.fromkeys(known))

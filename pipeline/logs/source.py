@@ -33,10 +33,10 @@ class ByteSource(Protocol):
 
 
 def _list_neighbours(path: Path) -> list[str]:
-    """Names of the folders beside a path, and of the files with its suffix (all files if it has none)."""
+    """Names beside a path with its suffix; all names if it has none."""
     with suppress(OSError), os.scandir(path.parent) as entries:
-        beside = [(entry.name, entry.is_dir()) for entry in islice(entries, _MOST_NEIGHBOURS)]
-        return [name for name, is_dir in beside if is_dir or path.suffix in {"", Path(name).suffix}]
+        beside = [entry.name for entry in islice(entries, _MOST_NEIGHBOURS)]
+        return [name for name in beside if path.suffix in {"", Path(name).suffix}]
     return []
 
 
@@ -60,7 +60,7 @@ class FileSource(AbstractContextManager["FileSource"]):
             # Without O_NONBLOCK, opening a pipe would wait for a writer.
             self._descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except FileNotFoundError:
-            hint = f"{guess_names(path.name, _list_neighbours(path))}Check the path"
+            hint = f"{guess_names(path.name, _list_neighbours(path), end=path.suffix)}Check the path"
             raise LogError("log_not_found", "there is no such file", where=str(path), hint=hint) from None
         except OSError as error:
             what = f"the file cannot be opened ({error.strerror})"

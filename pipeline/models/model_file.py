@@ -170,13 +170,17 @@ def read_text(path: Path) -> str:
         what = "there is no such model file"
         hint = f"Make one: slip model new {path.name} --vehicle husky_a200."
         raise MotionError("model_not_found", what, where=str(path), hint=hint) from None
-    except UnicodeDecodeError:
-        what = "this is not a model file: it is not text"
+    except (UnicodeDecodeError, IsADirectoryError) as error:
+        is_folder = isinstance(error, IsADirectoryError)
+        what = f"this is not a model file: it is {'a folder' if is_folder else 'not text'}"
         hint = "Give the TOML file that `slip diagnose --apply` or `slip model new` wrote."
         raise MotionError("model_unreadable", what, where=str(path), hint=hint) from None
     except OSError as error:
         raise MotionError(
-            "model_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."
+            "model_unreadable",
+            f"cannot be read: {error.strerror or error}",
+            where=str(path),
+            hint="Check the file.",
         ) from None
 
 

@@ -203,10 +203,22 @@ def test_what_was_not_given_is_said_to_be_needed(capsys: pytest.CaptureFixture[s
     assert "needs --to: ros2_control, nav2," in capsys.readouterr().err
 
 
+def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as left:
+        main(["compare", "results", "other"])
+    assert left.value.code == 2
+    assert "slip compare takes no further argument: other." in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         (("model", "show", "log.mcap"), "this is not a model file: it is not text"),
+        (("model", "show", "folder"), "folder: this is not a model file: it is a folder. Give the TOML file"),
+        (("compare", "log.mcap"), "log.mcap: this is not a results folder. Give the folder"),
+        (("compare", "folder"), "folder: this is not a results folder. Give the folder"),
+        (("diagnose", "no/such"), "there is no run 'no/such': no run has been analyzed yet. Analyze"),
+        (("inspect", "missing.mcap"), "missing.mcap: there is no such file. Check the path."),
         (("plan", "--check", "robot.toml", "log.mcap"), "this is not a plan.toml"),
         (("model", "add", "robot.toml", "drive_lag", "--on"), "--on names no run"),
     ],
@@ -220,6 +232,9 @@ def test_a_file_of_another_kind_is_refused_in_plain_words(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "log.mcap").write_bytes(b"\x89MCAP0\r\n")
+    (tmp_path / "mystery_1.mcap").touch()
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "folder" / "husky.txt").touch()
     with pytest.raises(SystemExit):
         main(["model", "new", "robot.toml", "--vehicle", "husky_a200", "--quiet"])
     with pytest.raises(SystemExit) as left:
