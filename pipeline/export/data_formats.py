@@ -245,7 +245,8 @@ def write_traction(file: ModelFile, current: Current) -> str:
         "    Args:\n"
         "        wheels: forward speed by the encoders over the last 10 s or more [m/s].\n"
         "        turning: half the track times the yaw rate by the encoders [m/s].\n"
-        "        body: forward speed of the localization, smoothed over half a second [m/s].\n"
+        "        body: forward speed of the localization, smoothed over half a second [m/s]. Sideways\n"
+        "            motion counts up to the speed of the wheels: sliding through a turn is moving.\n"
         "        step_s: time between two of them [s].\n"
         '    """\n'
         "    usual = [USUAL_GAIN * speed for speed in wheels]\n"

@@ -371,7 +371,7 @@ def trace_traction(
     Args:
         wheels: forward speed of the body that is usual at the wheel speeds [m/s].
         turning: rim speed due to turning, half the track times the yaw rate from the wheels [m/s].
-        body: forward speed of the body [m/s].
+        body: forward speed of the body, with sideways motion up to the speed of the wheels [m/s].
         step_s: time step [s].
         live: usual body speed above which traction is judged [m/s].
         margin: speed of a sliding body above `excess` times its wheels [m/s]; half of it is detected later.

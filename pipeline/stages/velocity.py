@@ -271,11 +271,12 @@ def find_events(
         unknown = bad | mark_excluded(times, [span for span in incidents if span[0] != "stuck"])
         gain = measure_gain(rims, 0)
         limits = find_limits(rims.top, gain)
+        brought = gain * rims.driven[:, 0]
         signals = _Signals(
             times,
-            np.where(unknown, 0.0, gain * rims.driven[:, 0]),
+            np.where(unknown, 0.0, brought),
             rims.driven[:, 2],
-            np.where(unknown, 0.0, rims.moved[:, 0]),
+            np.where(unknown, 0.0, _count_sideways(rims.moved, brought)),
         )
         events = _leave_out_usual(_find_traction(signals, limits), times, rims.wheels > LIVE * rims.top)
         events = _end_where_stuck(events, times, incidents)
@@ -307,6 +308,23 @@ class _Signals:
     wheels: Floats
     turning: Floats
     body: Floats
+
+
+def _count_sideways(moved: Floats, brought: Floats) -> Floats:
+    """Forward speed of the body, to which sideways motion is added up to the speed of the wheels.
+
+    A vehicle that slides sideways through a turn moves: neither does it dig in nor do its wheels spin in
+    place. Only up to the speed of the wheels, because a sensor ahead of the axles moves sideways in every
+    turn, which is no slide.
+
+    Args:
+        moved: (v_x, v_y, v_w times half the track) of the body [m/s], shape (n, 3).
+        brought: forward speed of the body that is usual at the wheel speeds [m/s], shape (n,).
+    """
+    forward, total = moved[:, 0], np.hypot(moved[:, 0], moved[:, 1])
+    missing = np.minimum(total, np.abs(brought)) - np.abs(forward)
+    counted: Floats = forward + np.sign(brought) * np.maximum(missing, 0.0)
+    return counted
 
 
 def _find_traction(signals: _Signals, limits: Limits) -> list[_Event]:

@@ -25,6 +25,8 @@ from pipeline.simulate import (
 )
 from pipeline.simulate.programs import Commands
 from pipeline.sources import find_preset
+from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.velocity import find_events
 
 STEP_S = 0.05
 LIMITS = vars(Limits(live=0.1, margin=0.25))
@@ -91,6 +93,37 @@ def test_poses_that_ran_ahead_and_wait_are_no_event() -> None:
     times = np.arange(0.0, 20.0, STEP_S)
     share = np.where((times > 8.0) & (times < 9.5), 3.0, np.where((times > 9.5) & (times < 12.0), 0.0, 1.0))
     assert set(trace(np.ones(times.size), share)) == {0}
+
+
+@pytest.mark.parametrize(
+    ("forward", "sideways", "said"), [(0.2, -0.95, []), (0.0, 0.9, []), (0.4, 0.0, ["digging_in"])]
+)
+def test_a_body_that_slides_sideways_does_not_dig_in(
+    forward: float, sideways: float, said: list[str]
+) -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    times = np.arange(0.0, 60.0, STEP_S)
+    # Over two seconds the motion turns from ahead to the side, or is lost.
+    part = np.clip((times - 40.0) / 2.0, 0.0, 1.0) * (times < 46.0)
+    v_x, v_y = 1.0 + part * (forward - 1.0), part * sideways
+    columns = {"t": times, "v_x": v_x, "v_y": v_y, "v_w": 0.0 * times, "x": times, "y": times}
+    wheels = np.column_stack((np.ones(times.size), np.zeros((times.size, 2))))
+    flags = np.zeros(times.size, dtype=bool)
+    inputs = {"measured": Ideal(wheels, flags, ~flags)}
+    assert find_events(pl.DataFrame(columns), inputs, vehicle, flags, ()).table["kind"].to_list() == said
+
+
+def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    times = np.arange(0.0, 60.0, STEP_S)
+    turns = np.where((times > 30.0) & (times < 40.0), 1.0, 0.0)
+    columns = {"t": times, "v_x": 1.0 - turns, "v_y": turns, "v_w": turns, "x": times, "y": times}
+    wheels = np.column_stack((1.0 - turns, 0.0 * turns, turns))
+    flags = np.zeros(times.size, dtype=bool)
+    inputs = {"measured": Ideal(wheels, flags, ~flags)}
+    assert find_events(pl.DataFrame(columns), inputs, vehicle, flags, ()).findings == ()
 
 
 def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Path:
