@@ -360,7 +360,13 @@ _ROUGHNESS_S = 1.0
 
 
 def aggregate_run(
-    slip: pl.DataFrame, windows: pl.DataFrame, velocities: pl.DataFrame, *, vehicle: Vehicle, length: float
+    slip: pl.DataFrame,
+    windows: pl.DataFrame,
+    velocities: pl.DataFrame,
+    *,
+    vehicle: Vehicle,
+    length: float,
+    moves: bool = True,
 ) -> pl.DataFrame:
     """Table `aggregates` of one run.
 
@@ -374,9 +380,11 @@ def aggregate_run(
         velocities: table `velocities`.
         vehicle: for the kinetic energy.
         length: length scale L [m].
+        moves: whether the vehicle moves; the path of one that stands is noise of the poses.
     """
     clean, whole = slip.filter(~pl.col("suspect")), windows.filter(~pl.col("suspect"))
     motion = _summarize_motion(velocities, vehicle)
+    period = float(np.median(np.diff(velocities["t"].to_numpy())))
     rows = []
     for name in slip["input"].unique(maintain_order=True):
         for subset in ("all", "transitory", "steady"):
@@ -389,6 +397,7 @@ def aggregate_run(
                     "input": name,
                     "subset": subset,
                     **_summarize_slip(chosen[0], chosen[1]),
+                    **_measure_way(chosen[0], period, moves=moves),
                     **split,
                     **motion,
                     "length_scale": length,
@@ -444,23 +453,19 @@ def _split_parts(slip: pl.DataFrame, length: float) -> dict[str, float]:
     }
 
 
+def _measure_way(slip: pl.DataFrame, period: float, *, moves: bool) -> dict[str, float | None]:
+    """Time of samples and distance driven in them; unknown if the vehicle stands, where it is noise alone."""
+    speed = np.hypot(slip["v_x"].to_numpy(), slip["v_y"].to_numpy())
+    return {"distance": float(speed.sum()) * period if moves else None, "duration": slip.height * period}
+
+
 def _summarize_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, float | None]:
-    """Distance, time, height variation and largest kinetic energy of a run."""
-    times = velocities["t"].to_numpy()
-    inside = np.diff(velocities["segment"].to_numpy()) == 0
-    period = np.diff(times)
+    """Height variation and largest kinetic energy of a run."""
     speed = np.hypot(velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy())
-    distance = float(np.sum((speed[:-1] * period)[inside]))
-    duration = float(np.sum(period[inside]))
     # The 99.5th percentile replaces the largest speed: a single noisy sample would inflate the energy.
     fastest = float(np.quantile(speed, 0.995))
     energy = None if vehicle.mass_kg is None else 0.5 * vehicle.mass_kg * fastest**2
-    return {
-        "distance": distance,
-        "duration": duration,
-        "height_rate": _height_rate(velocities),
-        "largest_kinetic_energy": energy,
-    }
+    return {"height_rate": _height_rate(velocities), "largest_kinetic_energy": energy}
 
 
 def _height_rate(velocities: pl.DataFrame) -> float | None:

@@ -84,8 +84,34 @@ def test_distance_energy_and_height_are_those_of_the_motion(drive: TakeThrough) 
 
 def test_holes_are_not_driven(drive: TakeThrough) -> None:
     whole = row(aggregate(drive(FIELD)), "measured")
-    holed = row(aggregate(drive(replace(FIELD, recording=Recording(gaps=2, gap_s=5.0)))), "measured")
-    assert holed["duration"] == pytest.approx(whole["duration"] - 10.0, abs=0.5)
+    taken = drive(replace(FIELD, recording=Recording(gaps=2, gap_s=5.0)))
+    # A drive whose commands ceased is left out besides.
+    left_out = 0.05 * taken.slip("measured").filter("suspect").height
+    holed = row(aggregate(taken), "measured")
+    assert holed["duration"] + left_out == pytest.approx(whole["duration"] - 10.0, abs=0.5)
+
+
+def test_only_the_samples_that_are_compared_count_as_time_and_distance(drive: TakeThrough) -> None:
+    taken = drive(FIELD)
+    some = taken.result.slip.with_columns(suspect=pl.col("t") > 50.0).filter(pl.col("t") > 30.0)
+    found = aggregate_run(
+        some, taken.result.windows, taken.velocities, vehicle=taken.aligned.vehicle, length=1.0
+    )
+    for name in ("command", "measured"):
+        kept = some.filter(pl.col("input") == name, ~pl.col("suspect"))
+        assert row(found, name)["duration"] == pytest.approx(20.0, abs=0.2)
+        way = float(np.hypot(kept["v_x"], kept["v_y"]).sum()) * 0.05
+        assert row(found, name)["distance"] == pytest.approx(way, rel=1e-6)
+        parts = [row(found, name, subset)["distance"] for subset in ("transitory", "steady")]
+        assert sum(parts) == pytest.approx(way, rel=1e-6)
+
+
+def test_noise_of_the_poses_is_no_distance_of_a_vehicle_that_stands(drive: TakeThrough) -> None:
+    taken = drive(FIELD)
+    parts = (taken.result.slip, taken.result.windows, taken.velocities)
+    found = aggregate_run(*parts, vehicle=taken.aligned.vehicle, length=1.0, moves=False)
+    assert found["distance"].null_count() == found.height
+    assert row(found, "command")["duration"] > 0.0
 
 
 def test_a_run_without_windows_has_no_window_norm(drive: TakeThrough) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import polars as pl
 import pytest
 
 from pipeline.job import Options
@@ -94,6 +95,9 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, res
     assert measured["median_window_norm"] <= 1.15 * known.norm
     if "command_scale" not in known.faults:
         assert command["median_modulus"] <= 1.02 * recorded["recorded_modulus_command"][0]
+    compared = Store(results).read(str(summary["run"]), "slip").filter(pl.col("input") == "command")
+    assert summary["duration_s"] == pytest.approx(0.05 * compared.filter(~pl.col("suspect")).height, abs=0.06)
+    assert (summary["distance_m"] is None) == ("not_moving" in known.faults)
     assert summary["held_poses"] == pytest.approx(known.held, abs=0.015)
     findings = summary["findings"]
     assert isinstance(findings, list)
