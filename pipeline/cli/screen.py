@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Self, cast
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
 from pipeline.core import INPUT_WORDS, format_duration, format_recorded
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.report import format_distance, format_split
+from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 
 if TYPE_CHECKING:
@@ -178,6 +178,9 @@ def _format_head(summary: Summary) -> list[str]:
     gaps = [f for f in objects_in(summary, "findings") if f["id"] == "pose_gap"]
     state = "log complete" if not losses else "log with losses"
     state += f" (unchecked: {log['unchecked']})" if log.get("unchecked") else ""
+    # The verdict states an error without the mark of a finding.
+    errors = count_serious(objects_in(summary, "findings")).get("error")
+    state += f", {errors}" if errors else ""
     holes = _format_gaps(gaps[0]) if gaps else ""
     head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
     return head + [_row("lost", _format_loss(loss)) for loss in losses[:_SHOWN]]

@@ -16,7 +16,7 @@ import math
 import os
 import re
 import unicodedata
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from functools import partial
@@ -105,6 +105,13 @@ def format_distance(metres: float | None) -> str:
     if metres is None:
         return MISSING
     return f"{metres / _KILOMETRE:.2f} km" if metres >= _KILOMETRE else f"{metres:.0f} m"
+
+
+def count_serious(findings: Iterable[Mapping[str, object]]) -> dict[str, str]:
+    """Number of findings of each serious severity as text, such as `2 warnings`."""
+    severities = [str(finding.get("severity")) for finding in findings]
+    counts = {name: severities.count(name) for name in ("error", "warning")}
+    return {name: f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count}
 
 
 def format_date(nanoseconds: int | None) -> str:

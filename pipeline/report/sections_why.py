@@ -18,6 +18,7 @@ from pipeline.report import (
     Column,
     Table,
     begin_large,
+    count_serious,
     format_bytes,
     format_known_share,
     format_number,
@@ -82,11 +83,7 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
             if held == 0
             else ("note", f"{format_known_share(held)} of the poses held")
         )
-    findings = [str(finding.get("severity")) for finding in list_findings(report)]
-    for severity, word in (("error", "error"), ("warning", "warning")):
-        count = findings.count(severity)
-        if count:
-            strip.append((severity, f"{count} {word}{'s' if count > 1 else ''}"))
+    strip.extend(count_serious(list_findings(report)).items())
     return strip
 
 

@@ -81,6 +81,8 @@ def test_a_vehicle_that_stands_is_refused_in_the_first_line(tmp_path: Path) -> N
         assert first.startswith("The vehicle does not move: ")
         assert first.endswith(" No effect can be estimated.")
         assert head.startswith("field/run ")
+        # The poses' noise is no distance, and the verdict is as grave as the report says.
+        assert head.endswith("40 s    log complete, 1 error")
         # No number that means nothing, and nothing twice.
         assert not any(line.startswith(("slip ", "effects")) for line in rest)
         assert done.stdout.lower().count("does not move") == 1
