@@ -390,7 +390,11 @@ def _count_apart(times: Floats) -> float:
 
 
 def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]) -> tuple[Floats, Floats]:
-    """Lags [s] and mean products of windows that many strides apart, for lags with enough pairs."""
+    """Lags [s] and correlations of windows that many strides apart, for lags with enough pairs.
+
+    Each is scaled by the mean squares of its own pairs: those of the whole series may be smaller, and the
+    correlation larger than one.
+    """
     stride, step = _stride(times), float(np.median(np.diff(times)))
     rows = []
     for lag in lags:
@@ -402,6 +406,8 @@ def _correlate(times: Floats, before: Floats, after: Floats, lags: Sequence[int]
             early, late = late, early
         together = np.abs(np.abs(times[late] - times[early]) - shift * step) < 0.5 * step
         if int(together.sum()) >= FEWEST // 2:
-            rows.append((lag * stride * step, float(np.mean((before[early] * after[late])[together]))))
+            pair = before[early][together], after[late][together]
+            size = np.sqrt(float(np.mean(pair[0] ** 2)) * float(np.mean(pair[1] ** 2))) + _NOTHING
+            rows.append((lag * stride * step, float(np.mean(pair[0] * pair[1])) / size))
     table = np.array(rows, dtype=np.float64).reshape(-1, 2)
     return table[:, 0], table[:, 1]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import polars as pl
 import pytest
@@ -13,7 +15,7 @@ from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.ladder import format_rises
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
 from pipeline.report.figures.model_figures import list_ladder_steps, list_parts
-from pipeline.report.figures.residual_figures import choose_signal
+from pipeline.report.figures.residual_figures import choose_signal, draw_autocorrelation
 from pipeline.report.figures.slip_figures import find_steps
 from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
 from pipeline.report.scene import RunReport, Scene
@@ -65,6 +67,28 @@ def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> Non
     assert slow[4] == pytest.approx(np.cos(lags[4]), abs=0.05)
     split = np.concatenate((t[:1000], t[1000:] + 1e6))
     assert np.allclose(autocorrelate(split, np.sin(t))[0], lags)
+
+
+def test_no_correlation_exceeds_one_where_stretches_differ() -> None:
+    # Single windows between holes are quiet, so that the pairs of the long stretch are larger than the mean.
+    lone = np.arange(400) * 100.0
+    t = np.concatenate((np.arange(400) * 0.5, 1000.0 + lone))
+    given = np.concatenate((3.0 * np.sin(0.3 * t[:400]), np.full(400, 0.01)))
+    assert np.abs(autocorrelate(t, given)[1]).max() <= 1.0 + 1e-9
+    assert np.abs(cross_correlate(t, given, -given)[1]).max() <= 1.0 + 1e-9
+
+
+@pytest.mark.parametrize("step", [0.25, 0.15, 0.35])
+def test_the_words_below_the_autocorrelation_say_its_numbers(step: float) -> None:
+    t = np.arange(800) * step
+    view = view_of(**{f"{series}_{one}": np.sin(0.5 * t) for series in ("ideal", "model") for one in "xyw"})
+    view = replace(view, residuals=view.residuals.with_columns(t=pl.Series(t)))
+    drawing = draw_autocorrelation(Scene(RunReport({}, motion=view)))
+    assert drawing is not None
+    rows = drawing.rows["autocorrelation_x"].filter(pl.col("lag") > 0.0, series="ideal")
+    lag, value = min(rows.select("lag", "value").iter_rows(), key=lambda row: abs(row[0] - 1.0))
+    assert f"residuals {lag:.2g} s apart: forward {value:.2f} before, {value:.2f} after" in drawing.words
+    assert value > 0.5
 
 
 def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:

@@ -288,16 +288,20 @@ def _tabulate_correlations(correlations: dict[str, Correlation]) -> pl.DataFrame
 
 
 def _format_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
-    """The correlation after one second, before and after, and the bound."""
-    parts = []
+    """The correlation at the lag nearest to one second, before and after, and the bound."""
+    parts, lag = [], 0.0
     for name, frame in rows.items():
-        near = frame.filter((pl.col("lag") - 1.0).abs() < 0.01)  # noqa: PLR2004 - rounding
-        values = dict(near.select("series", "value").iter_rows())
-        after = f"{values.get('ideal', 0.0):.2f} before, {values.get('model', 0.0):.2f} after"
-        parts.append(f"{QUANTITIES[name[-1]][0]} {after}")
+        later = frame.filter(pl.col("lag") > 0.0)
+        if later.is_empty():
+            continue
+        lag = float(later["lag"][int((later["lag"] - 1.0).abs().arg_min() or 0)])
+        values = dict(later.filter(pl.col("lag") == lag).select("series", "value").iter_rows())
+        parts.append(f"{QUANTITIES[name[-1]][0]} {values['ideal']:.2f} before, {values['model']:.2f} after")
+    if not parts:
+        return ""
     bound = float(next(iter(rows.values()))["high"][0])
     return (
-        f"Autocorrelation of residuals one second apart: {'; '.join(parts)}; noise stays below {bound:.2f}."
+        f"Autocorrelation of residuals {lag:.2g} s apart: {'; '.join(parts)}; noise stays below {bound:.2f}."
     )
 
 
