@@ -375,8 +375,8 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
     single = sorted(group.name for group in groups if len(group.runs) == 1)
     sentences = []
     for note, (first, *others) in sorted(hopeless.items()):
-        more = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
-        sentences.append(f"{first}{more}: {note}")
+        count_text = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
+        sentences.append(f"{first}{count_text}: {note}")
     if single:
         sentences.append(
             f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"
