@@ -349,7 +349,7 @@ def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_i
     monkeypatch.setattr(SideGain, "can_show", lambda *_: False)
     scenario = replace(_SCENE, effects={"effective_track": 1.6, "drive_lag": 0.3}, imu=Imu())
     recording, vehicle = _record(scenario, tmp_path)
-    wheels = recording.tables["wheels"].with_columns(pl.col("left") * 0.95)
+    wheels = recording.tables["wheels"].with_columns(pl.col("left", "left_aligned") * 0.95)
     recording = replace(recording, tables={**recording.tables, "wheels": wheels})
     (told,) = diagnose_runs([recording], vehicle, inputs=("command", "measured")).runs
     uneven = {one.id: one for one in told.effects}["wheel_asymmetry"].parameters["e"]
