@@ -29,6 +29,7 @@ from pipeline.estimation.verdict import (
     list_added,
     measure_excess,
     name_effect,
+    name_formula,
     name_group,
     rank_main,
     split_main,
@@ -147,6 +148,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     others += [text for item in small for text in _format_ambiguous(item, run, falls)]
     lines += _label("smaller", others)
     lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
+    lines += _label("clocks", [_format_encoders(run)])
     lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
     numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, (_, unit) in ERRORS_OVER_2S.items())
     lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
@@ -231,7 +233,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
     rows.append(format_unexplained(run.unexplained.to_json()))
     formula = (run.unexplained.formula or "").splitlines()
-    rows += [f"suggested term {line}" for line in formula if line.startswith("v_")]
+    rows += [f"{name_formula(run.ladder)}: {line}" for line in formula if line.startswith("v_")]
     return [*rows, *_suggest_next_steps(run)]
 
 
@@ -255,7 +257,7 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
         return ["next steps: diagnose the run again with a larger --budget"]
     if BREVITY in noted:
         return ["next steps: drive longer, with turns and speeds of both signs"]
-    steps = ["drive what `slip plan` proposes"] if run.undecided or run.unobservable else []
+    steps = ["see what `slip plan` proposes"] if run.undecided or run.unobservable else []
     steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
     how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
     return [f"next steps: {'; '.join(steps)}, {how}"]
@@ -289,6 +291,14 @@ def _format_range(effect: Named) -> Iterator[str]:
     ]
     if ends:
         yield f"expected range between runs: {effect.id} {', '.join(ends)}"
+
+
+def _format_encoders(run: RunDiagnosis) -> str:
+    """How late the encoders are in the fit, beyond what was corrected against the gyro before."""
+    late = number_in(run.timing, "wheel_delay_s")
+    corrected = any(one.get("id") == "wheels_delay" for one in run.findings)
+    beyond = ", beyond the delay that was corrected before" if corrected else ""
+    return f"the model takes the encoders as {late * 1e3:.0f} ms late{beyond}" if late else ""
 
 
 def _format_budget(run: RunDiagnosis) -> str:

@@ -226,6 +226,11 @@ def _name_model(step: Content, shown: int) -> str:
     return " and ".join(filter(None, [words, formula]))
 
 
+def name_formula(ladder: Sequence[Content]) -> str:
+    """What the formula of an unexplained structure is: a part of the written model, or a proposal."""
+    return "formula in the model" if ladder and FORMULA in _list_ids(ladder[-1]) else "suggested term"
+
+
 def _compare(diagnosis: Content, before: str) -> str:
     """The error of the last rung in times the noise floor; empty where it is not known."""
     times = {ERRORS_OVER_2S[key][0]: max(1, round(one)) for key, one in _list_excess(diagnosis).items()}

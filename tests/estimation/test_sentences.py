@@ -10,6 +10,7 @@ from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
 from pipeline.estimation.diagnosis_lines import choose_lines, format_unexplained, list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
+from pipeline.estimation.verdict import FORMULA
 from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression
 from pipeline.models.parameter import parse_unit
@@ -173,3 +174,15 @@ def test_a_share_of_the_residual_names_what_it_is_a_share_of() -> None:
     # A formula is compared with the residual of all channels.
     whole = format_unexplained({**rest.to_json(), "formula": "[[effect]]"})
     assert whole.startswith("98 % of the residual has a structure")
+
+
+def test_a_late_encoder_and_the_formula_of_the_model_are_said() -> None:
+    where = "lateral error grows with forward speed"
+    rest = Unexplained(0.02, "y", ("y",), where, "v_y = a * v0", {}, "command")
+    for ids, words in (["drive_lag"], "suggested term"), (["drive_lag", FORMULA], "formula in the model"):
+        ladder = ({"effects": [], "t_mrmse_m": 1.0}, {"effects": ids, "t_mrmse_m": 0.5})
+        timing = {"wheel_delay_s": 0.334}
+        run = RunDiagnosis("run", "command", ladder=ladder, unexplained=rest, timing=timing)
+        texts = [text for _, text in list_lines(run)]
+        assert f"{words}: v_y = a * v0" in texts
+        assert "the model takes the encoders as 334 ms late" in texts
