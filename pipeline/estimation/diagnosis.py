@@ -380,7 +380,7 @@ class RunDiagnosis:
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
             "budget": [budget_as_json(budget) for budget in self.budgets],
-            "enough": format_enough(self.effects) or None,
+            "enough": format_enough(self.effects, self.findings) or None,
             "learned": dict(self.learned),
         }
 

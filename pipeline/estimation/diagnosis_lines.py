@@ -15,6 +15,7 @@ from pipeline.estimation.ambiguity import Undecided
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
+    BREVITY,
     format_angle,
     format_enough,
     format_length,
@@ -23,7 +24,6 @@ from pipeline.estimation.error_regions import (
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
-    BREVITY,
     SEARCH_CUT,
     format_verdict,
     list_added,
@@ -154,7 +154,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
     lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
     lines += _label("budget", [_format_budget(run)])
-    lines += _label("data", [format_enough(run.effects)])
+    lines += _label("data", [format_enough(run.effects, run.findings)])
     lines += _label("minor", _format_immaterial(run))
     lines += _label("unseen", _format_unobservable(run))
     return [*lines, *_label("bounds", [_format_detectable(run)])]

@@ -268,6 +268,8 @@ _POINTS = 60
 _GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
 # Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
 _LEAST_SHOWN = 0.25
+BREVITY = "little_driving"
+"""Finding of a run with less driving than effects can be trusted on."""
 _DIGITS = 4
 """Significant digits of a curve in JSON: a figure shows three."""
 
@@ -304,22 +306,30 @@ def _format_half(half: float, unit: str) -> str:
     return f"{half:.2g}" if unit == "1" else f"{half:.2g} {unit}"
 
 
-def format_enough(effects: Sequence[Named]) -> str:
+def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, object]] = ()) -> str:
     """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
-    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger.
+    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger,
+    and open if the interval is as wide as that value itself.
+
+    Args:
+        effects: identified effects.
+        findings: findings of the run; one that is too short does not show what more driving brings.
 
     Returns:
         A sentence or two; empty where no identified effect has a growth curve.
     """
-    known, vague, needed, driven, small = [], [], 0.0, 0.0, False
+    known, vague, needed, driven, small, open_ones = [], [], 0.0, 0.0, False, 0
     for effect in effects:
         for name, curve in () if effect.growth is None else effect.growth.widths.items():
             value = effect.parameters.get(name)
-            if value is None or not math.isfinite(curve.values[-1]):
+            if value is None:
                 continue
             label, half = f"{effect.id}.{name}", float(curve.values[-1])
             goal = find_goal(effect.id, name, value.value)
+            if value.is_undetermined or not half < goal / INTERVAL_SHARE:
+                open_ones += 1
+                continue
             since = last_until(curve, goal)
             driven = max(driven, float(curve.seconds[-1]))
             needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
@@ -328,8 +338,7 @@ def format_enough(effects: Sequence[Named]) -> str:
                 small |= half > INTERVAL_SHARE * abs(value.value)
             else:
                 vague.append((half / goal, f"{label} known to {_format_half(half, value.unit)}", curve, goal))
-    if not known and not vague:
-        return ""
+    is_brief = any(one.get("id") == BREVITY for one in findings)
     sentences = []
     if known:
         since, label = max(known)
@@ -341,15 +350,15 @@ def format_enough(effects: Sequence[Named]) -> str:
         text += f" ({len(vague) - 1} more not known to {_GOAL})" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
         minutes = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
-        sentences.append(
-            f"{text}; {minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
-            if minutes
-            else f"{text}; more of such driving does not narrow the interval"
-        )
-    idle = 1.0 - needed / driven
-    if idle >= _LEAST_SHOWN:
-        share = format_share(idle)
-        sentences.append(f"the last {share} of the drive narrowed no interval by more than a tenth")
+        more = f"{minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
+        more = more if minutes else "more of such driving does not narrow the interval"
+        sentences.append(text if is_brief else f"{text}; {more}")
+    if open_ones:
+        sentences.append(f"{open_ones} parameter{'s' * (open_ones > 1)} undetermined")
+    idle = 1.0 - needed / driven if driven else 0.0
+    if idle >= _LEAST_SHOWN and not is_brief:
+        text = f"the last {format_share(idle)} of the drive"
+        sentences.append(f"{text} narrowed no interval by more than a tenth")
     return "; ".join(sentences)
 
 

@@ -14,6 +14,7 @@ from pipeline.core.arrays import Ints
 from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
+from pipeline.estimation.error_regions import BREVITY
 from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_intervals, estimate_part, join_blocks
@@ -22,7 +23,7 @@ from pipeline.estimation.parts import Part, count_seconds
 from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
-from pipeline.estimation.verdict import BREVITY, SEARCH_CUT
+from pipeline.estimation.verdict import SEARCH_CUT
 from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.estimation.error_regions import ABOVE_FLOOR, format_errors
+from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
 from pipeline.run.windows import HORIZON_S
@@ -21,8 +21,6 @@ Entry = TypeVar("Entry")
 
 FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 """Findings of which one makes every fit meaningless: no effect is named."""
-BREVITY = "little_driving"
-"""The finding of a run with less driving than effects can be trusted on."""
 SEARCH_CUT = "search_cut"
 """The finding of a run whose budget ended the search for effects before it was complete."""
 FORMULA = "unexplained"

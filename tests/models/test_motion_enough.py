@@ -11,6 +11,7 @@ from motion_runs import simulate, vehicle_of
 from pipeline.estimation import Fitted, Input, Named, Problem, Value, estimate_intervals, fit_model
 from pipeline.estimation.acceptance import compare, grow_evidence
 from pipeline.estimation.error_regions import (
+    BREVITY,
     Curve,
     Growth,
     extrapolate,
@@ -152,3 +153,20 @@ def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
     # 240 s give 0.6 / sqrt(24), a twentieth of 1.5 takes 640 s: 400 s more.
     assert "known to 0.12; 7 more minutes of such driving for 5 %" in format_enough([falling])
     assert format_enough([]) == ""
+
+
+def test_what_is_undetermined_is_not_known_to_anything() -> None:
+    wide = _name([9.0, 4.0, 2.0])
+    assert format_enough([wide]) == "1 parameter undetermined", "its interval is wider than its size"
+    vague, bound = _name([0.9, 0.6, 0.3]), _name([0.9, 0.6, 0.3])
+    at_bound = replace(bound, parameters={"k": replace(bound.parameters["k"], at_bound=True)})
+    said = format_enough([vague, at_bound, wide])
+    assert said.count("known to") == 1
+    assert said.endswith("; 2 parameters undetermined")
+
+
+def test_a_run_that_is_too_short_promises_nothing_of_more_driving() -> None:
+    brief = [{"id": BREVITY}]
+    assert format_enough([_name([0.9, 0.6, 0.3])], brief) == "effective_track.k known to 0.3"
+    idle = _name([0.2, *[0.05] * 9])
+    assert format_enough([idle], brief) == "effective_track.k known to 5 % after 20 s of 100 s"
