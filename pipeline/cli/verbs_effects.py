@@ -72,7 +72,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         memory: memory limit, for example 2GB (default: 80 % of the machine's).
         budget: CPU time that a search may take, for example 60s (default: 60s for up to 10 minutes of
             driving, more for longer runs); after it the best answer so far is given.
-        everything: show all of the summary: where the error is, budget, bounds, causes, ranges between runs.
+        everything: show all of the summary: where the error is, budget, limits, causes, ranges between runs.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """

@@ -70,7 +70,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
         figures: also write the figures in this format, for papers.
         force: compute again what is already there.
         memory: memory limit, for example 2GB (default: 80 % of the machine's).
-        everything: show all of the summary: where the error is, budget, bounds, topics.
+        everything: show all of the summary: where the error is, budget, limits, topics.
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """

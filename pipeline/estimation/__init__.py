@@ -121,7 +121,7 @@ class Explored:
         undecided: alternatives to the identified effects.
         not_significant: effects whose evidence is below the threshold.
         unobservable: effects that are not observable on this path.
-        detectable: upper bounds of the other effects that were not identified.
+        detectable: detection limits of the other effects that were not identified.
         explainable: predictable part of the residual; None where it was not computed.
     """
 

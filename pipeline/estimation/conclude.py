@@ -131,7 +131,6 @@ def summarize(
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
-    regions = map_errors(part, residual, places)
     hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in taken}
     hidden |= set().union(*(effect.searched_as for effect in taken))
     described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
@@ -141,6 +140,7 @@ def summarize(
         near = (one for path in paths for one in path.not_significant)
         named, unless = _note_unless(named, find_unless(judgement, named, near, hidden))
         hidden |= unless
+    stated = hidden.union(*(effect.contains for effect in taken))
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
     last = shares[-1] if shares else None
@@ -152,7 +152,7 @@ def summarize(
         immaterial=tuple(immaterial),
         undecided=tuple(undecided),
         unobservable=tuple(unobservable.values()),
-        detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
+        detectable=tuple(one for path in paths for one in path.detectable if one.id not in stated),
         unexplained=unexplained,
         findings=(
             *note_cut(body.search.selection.budget),
@@ -164,7 +164,7 @@ def summarize(
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
         explained_share=math.nan if last is None else last,
         learned={} if judgement is None else learn_beyond(judgement),
-        where=tuple(pick_regions(regions, residual, part.noise)),
+        where=tuple(pick_regions(map_errors(part, residual, places), residual, part.noise)),
         timing={"runs": cast("Json", clocks.list_runs(judgement.fitted if judgement else None))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(

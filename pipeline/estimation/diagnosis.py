@@ -280,7 +280,7 @@ class RunDiagnosis:
         immaterial: missing effects below the detection threshold.
         undecided: alternatives that fit equally well.
         unobservable: effects not observable in this log.
-        detectable: upper bounds of the other effects that were not identified.
+        detectable: detection limits of the other effects that were not identified.
         unexplained: residual structure without a known cause; None without.
         findings: of the stages and of the diagnosis.
         ladder: steps with their held-out errors.

@@ -56,7 +56,7 @@ _WHERE_SHOWN = 3
 _UNOBSERVABLE_SHOWN = 8
 """Unobservable effects that are listed: more would fill a screen."""
 _DETECTABLE_SHOWN = 5
-"""Upper bounds that are listed, the tightest ones."""
+"""Detection limits that are listed, the smallest ones."""
 _CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
 _FINDINGS_SHOWN = 4
 """Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
@@ -157,7 +157,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("data", [format_enough(run.effects, run.findings)])
     lines += _label("minor", _format_immaterial(run))
     lines += _label("unseen", _format_unobservable(run))
-    return [*lines, *_label("bounds", [_format_detectable(run)])]
+    return [*lines, *_label("limits", [_format_detectable(run)])]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[Row]:
@@ -373,7 +373,7 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
 
 
 def _format_detectable(run: RunDiagnosis) -> str:
-    """Upper bounds of effects that were not identified, the tightest first."""
+    """Detection limits of effects that were not identified, the smallest first."""
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
     sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
@@ -382,7 +382,7 @@ def _format_detectable(run: RunDiagnosis) -> str:
         else f"{one.id.replace('_', ' ')} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
-    return f"upper bounds ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
+    return f"detection limits ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
 
 
 def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> list[Row]:

@@ -203,6 +203,15 @@ def test_on_ice_structure_is_left_in_all_channels(asked: Asked, source: str) -> 
     assert run.explained_share < 0.9
 
 
+def test_a_part_of_a_named_effect_has_no_detection_limit(asked: Asked) -> None:
+    """The wider track is part of contact friction: how large another one must be is no question."""
+    run = asked.diagnose("warthog_wheels_ice_2024_7_30_16h30s21", "command")
+    assert "contact_friction" in {effect.id for effect in run.effects}
+    parts = {name for effect in run.effects for name in find_effect(effect.id).contains}
+    assert "effective_track" in parts
+    assert not parts & {one.id for one in run.detectable}
+
+
 def test_the_servo_of_the_warthog_explains_its_turning(asked: Asked) -> None:
     run = asked.diagnose("warthog_wheels_asphalt_2024_8_7_11h30s30", "command")
     named = {effect.id: effect for effect in run.effects}

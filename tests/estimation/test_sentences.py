@@ -10,6 +10,7 @@ from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
 from pipeline.estimation.diagnosis_lines import choose_lines, format_unexplained, list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
+from pipeline.estimation.search import Detectable
 from pipeline.estimation.verdict import FORMULA
 from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression
@@ -134,6 +135,13 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         "reset = 0 1/s (at its bound)",
         "bound = 1.03 m/s [0.91, 1.15]",
     ]
+
+
+def test_sizes_that_would_be_named_are_detection_limits() -> None:
+    seen = (Detectable("yaw_drift", "c", "rad/s", 0.016), Detectable("difference_gain", "g", "1", 0.16))
+    ladder = ({"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},)
+    lines = list_lines(RunDiagnosis("run", "command", detectable=seen, ladder=ladder))
+    assert ("limits", "detection limits (90 %): yaw drift 0.016 rad/s, difference gain 16 %") in lines
 
 
 def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() -> None:
