@@ -350,9 +350,9 @@ def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, obje
         text += f" ({len(vague) - 1} more not known to {_GOAL})" if len(vague) > 1 else ""
         seconds = extrapolate(curve, goal)
         minutes = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
-        more = f"{minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
-        more = more if minutes else "more of such driving does not narrow the interval"
-        sentences.append(text if is_brief else f"{text}; {more}")
+        advice = f"{minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
+        advice = advice if minutes else "more of such driving does not narrow the interval"
+        sentences.append(text if is_brief else f"{text}; {advice}")
     if open_ones:
         sentences.append(f"{open_ones} parameter{'s' * (open_ones > 1)} undetermined")
     idle = 1.0 - needed / driven if driven else 0.0

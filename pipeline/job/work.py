@@ -362,14 +362,14 @@ class Work:
         )
 
     def _aggregate(self) -> StageOutcome:
-        found = {name for findings in self.findings for name in findings["id"]}
+        ids = {name for findings in self.findings for name in findings["id"]}
         made = slip_stage.aggregate_run(
             self._read("slip"),
             self._read("windows"),
             self._read("velocities"),
             vehicle=self.vehicle,
             length=self.setup.configuration.slip.length_scale_m,
-            moves="not_moving" not in found,
+            moves="not_moving" not in ids,
         )
         self.write("aggregates", made)
         return StageOutcome(())

@@ -397,7 +397,7 @@ def aggregate_run(
                     "input": name,
                     "subset": subset,
                     **_summarize_slip(chosen[0], chosen[1]),
-                    **_measure_way(chosen[0], period, moves=moves),
+                    **_measure_distance(chosen[0], period, moves=moves),
                     **split,
                     **motion,
                     "length_scale": length,
@@ -453,7 +453,7 @@ def _split_parts(slip: pl.DataFrame, length: float) -> dict[str, float]:
     }
 
 
-def _measure_way(slip: pl.DataFrame, period: float, *, moves: bool) -> dict[str, float | None]:
+def _measure_distance(slip: pl.DataFrame, period: float, *, moves: bool) -> dict[str, float | None]:
     """Time of samples and distance driven in them; unknown if the vehicle stands, where it is noise alone."""
     speed = np.hypot(slip["v_x"].to_numpy(), slip["v_y"].to_numpy())
     return {"distance": float(speed.sum()) * period if moves else None, "duration": slip.height * period}
