@@ -309,7 +309,9 @@ def _format_budget(run: RunDiagnosis) -> str:
                 f"{one.name.replace('_noise', ' noise')} {format_share(one.share, 0)}"
                 for one in budget.shares
             ]
-            return f"error budget by cause (RMS slip {math.sqrt(budget.total):.3g} m/s): {', '.join(parts)}"
+            signs = "; below zero: it makes slip larger" if any("-" in part for part in parts) else ""
+            total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
+            return f"error budget by cause ({total}): {', '.join(parts)}{signs}"
     return ""
 
 

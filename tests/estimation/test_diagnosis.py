@@ -186,14 +186,16 @@ def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
     assert "expected range between runs: " in describe(skidding, everything=True)
 
 
-def test_a_share_that_rounds_to_nothing_has_no_sign(skidding: Diagnosis) -> None:
+@pytest.mark.parametrize(("share", "shown"), [(-0.004, "0 %"), (-0.1, "-10 %")])
+def test_a_share_has_a_sign_with_a_reason_or_none(skidding: Diagnosis, share: float, shown: str) -> None:
     run = skidding.runs[0]
     budgets = tuple(
-        replace(budget, shares=(replace(budget.shares[0], share=-0.004), *budget.shares[1:]))
+        replace(budget, shares=(replace(budget.shares[0], share=share), *budget.shares[1:]))
         for budget in run.budgets
     )
     text = describe(Diagnosis((replace(run, budgets=budgets),)), everything=True)
-    assert f"m/s): {budgets[0].shares[0].name} 0 %, " in text
+    assert f"m/s): {budgets[0].shares[0].name} {shown}, " in text
+    assert ("below zero: it makes slip larger" in text) is (share == -0.1)
 
 
 def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:
