@@ -21,7 +21,7 @@ from pipeline.estimation.error_regions import (
     format_length,
     format_remaining_error,
 )
-from pipeline.estimation.ladder import ERRORS_OVER_2S
+from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     SEARCH_CUT,
@@ -334,12 +334,14 @@ def _format_values(effect: Named) -> str:
 
 
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:
-    """Error reductions at the ladder step of each effect, in display units."""
+    """Changes of the errors at the ladder step of each effect, and by how much one of them rises."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
         falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
+        visible, rises = ", ".join(filter(None, falling)), format_rises(before, after)
+        text = f"{visible} ({rises})" if visible and rises else visible or rises
         for name in list_added(before, after):
-            falls[name] = ", ".join(filter(None, falling)) or (_UNCHANGED if falling else "")
+            falls[name] = text or (_UNCHANGED if falling else "")
     return falls
 
 

@@ -10,6 +10,7 @@ from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
 from pipeline.estimation.diagnosis_lines import choose_lines, format_unexplained, list_lines
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
+from pipeline.estimation.ladder import format_rises
 from pipeline.estimation.search import Detectable
 from pipeline.estimation.verdict import FORMULA
 from pipeline.models import find_effect
@@ -135,6 +136,25 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         "reset = 0 1/s (at its bound)",
         "bound = 1.03 m/s [0.91, 1.15]",
     ]
+
+
+@pytest.mark.parametrize(
+    ("after", "shown"),
+    [
+        ({"t_mrmse_m": 0.627, "r_mrmse_rad": 0.4}, "60 -> 63 cm, 29 -> 23 degrees ({rises})"),
+        ({"t_mrmse_m": 0.6006, "r_mrmse_rad": 0.5}, "{rises}"),
+        ({"t_mrmse_m": 0.6, "r_mrmse_rad": 0.5}, "no visible change of the error over 2 s"),
+    ],
+)
+def test_a_step_with_which_an_error_rises_says_so_as_the_report(after: dict[str, float], shown: str) -> None:
+    named = Named(
+        "drive_lag", {"tau": Value(0.3, 0.2, 0.4, "s")}, 1.0, (), (), corrected=False, path="command",
+        selected=1.0, motion="Drive lag: time constant 0.30 s",
+    )  # fmt: skip
+    ladder = ({"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5}, {"effects": ["drive_lag"], **after})
+    lines = list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))
+    text = shown.format(rises=format_rises(*ladder))
+    assert any(line.endswith(f"  {text}") for _, line in lines)
 
 
 def test_sizes_that_would_be_named_are_detection_limits() -> None:
