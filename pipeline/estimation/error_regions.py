@@ -302,10 +302,6 @@ def _list_points(curve: Curve, name: str) -> dict[str, Json]:
     }
 
 
-def _format_half(half: float, unit: str) -> str:
-    return f"{half:.2g}" if unit == "1" else f"{half:.2g} {unit}"
-
-
 def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, object]] = ()) -> str:
     """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
 
@@ -337,7 +333,7 @@ def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, obje
                 known.append((since, label))
                 small |= half > INTERVAL_SHARE * abs(value.value)
             else:
-                vague.append((half / goal, f"{label} known to {_format_half(half, value.unit)}", curve, goal))
+                vague.append((half / goal, f"{label} known to {half:.2g}{value.suffix}", curve, goal))
     is_brief = any(one.get("id") == BREVITY for one in findings)
     sentences = []
     if known:
@@ -363,15 +359,12 @@ def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, obje
 
 
 def format_remaining_error(error_m: object, floor_m: object, explained: float | None) -> str:
-    """Sentence on the remaining error of a model relative to the noise floor.
+    """Sentence on the remaining error relative to the noise floor; empty where one of the three is unknown.
 
     Args:
         error_m: held-out position error over 2 s with the model [m].
         floor_m: the noise floor of that error [m].
         explained: share of the error above the floor that the model removes.
-
-    Returns:
-        The sentence; empty where one of the three is not known.
     """
     if not isinstance(error_m, int | float) or not isinstance(floor_m, int | float):
         return ""
@@ -382,9 +375,15 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
         return f"{text}, below the estimated noise floor of {floor}"
     if error_m < ABOVE_FLOOR * floor_m:
         beside = "" if floor == format_length(error_m) else f" ({floor})"
-        return f"{text}, at the noise floor{beside}"
+        return f"{text}, {format_excess(error_m / floor_m)} the noise floor{beside}"
     removed = format_share(max(explained, 0.0), 0)
     return f"{text}, noise floor {floor}: the effects remove {removed} of the error above it"
+
+
+def format_excess(ratio: float) -> str:
+    """A remaining error in times the noise floor: `at`, `1.6 times`."""
+    text = f"{ratio:.2g}" if ratio < 9.95 else f"{ratio:.0f}"  # noqa: PLR2004 - 10 has two digits
+    return f"{text} times" if float(text) >= ABOVE_FLOOR else "at"
 
 
 def format_errors(errors: Mapping[str, object]) -> str:

@@ -414,8 +414,7 @@ def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
     parameters = parameters_as_json(file.model, NOT_FITTED)
     for label, (low, high) in file.intervals.items():
         parameters[label] |= {"low": _round(low), "high": _round(high)}
-    for label, doubt in file.list_doubts().items():
-        parameters[label]["doubt"] = doubt
+    parameters |= {label: parameters[label] | {"doubt": text} for label, text in file.list_doubts().items()}
     for label in file.per_run:
         rows = [row for row in file.own_numbers if row.get("parameter") == label]
         if rows and label in parameters:

@@ -6,7 +6,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors
+from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors, format_excess
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
 from pipeline.run.windows import HORIZON_S
@@ -231,16 +231,15 @@ def name_formula(ladder: Sequence[Content]) -> str:
 
 def _compare(diagnosis: Content, before: str) -> str:
     """The error of the last rung in times the noise floor; empty where it is not known."""
-    times = {ERRORS_OVER_2S[key][0]: max(1, round(one)) for key, one in _list_excess(diagnosis).items()}
+    times = {ERRORS_OVER_2S[key][0]: one for key, one in _list_excess(diagnosis).items()}
     if not times:
         return ""
-    words = {1: "at", 2: "twice"}
-    said = {of: words.get(count, f"{count} times") for of, count in times.items()}
+    said = {of: format_excess(one) for of, one in times.items()}
     (most, first), *rest = sorted(said.items(), key=lambda one: -times[one[0]])
-    if len(times) == len(ERRORS_OVER_2S) and len(set(times.values())) == 1:
+    if len(times) == len(ERRORS_OVER_2S) and len(set(said.values())) == 1:
         return f"{before}{first} the noise floor"
     others = "".join(
-        f" and {other}{' the noise floor' if times[of] == 1 else ''} in {of}" for of, other in rest
+        f" and {other}{' the noise floor' if other == 'at' else ''} in {of}" for of, other in rest
     )
     return f"{before}{first} the noise floor in {most}{others}"
 

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.estimation.error_regions import format_remaining_error
+from pipeline.estimation.error_regions import ABOVE_FLOOR, format_excess, format_remaining_error
 from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main, split_main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -65,7 +65,9 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
         metres, degrees = rung["t_mrmse_m"], math.degrees(rung["r_mrmse_rad"])
         known.add(f"{metres:.3g}" if metres >= 0.995 else f"{100.0 * metres:.2g}")
         known.add(f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}")
-    known |= {str(max(1, round(ladder[-1][key] / floor[key]))) for key in _FLOOR if floor[key]}
+    known |= {
+        format_excess(ladder[-1][key] / floor[key]).removesuffix(" times") for key in _FLOOR if floor[key]
+    }
     # A formula is said as what it is.
     known.add(str(len([name for name in ladder[-1]["effects"] if name != "unexplained"])))
     effects = [
@@ -105,8 +107,8 @@ def test_the_verdict_says_how_far_off_why_and_what_remains() -> None:
     drawn = draw_diagnosis(effects, [(1.06, 0.96), (0.44, 0.14), (0.1, 0.04)])
     assert check_verdict(drawn) == (
         "After 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % of the ideal rate "
-        "and answers turns 1.1 s late; with both in the model 10 cm and 2.3 degrees remain, twice the noise "
-        "floor. No known effect explains the rest."
+        "and answers turns 1.1 s late; with both in the model 10 cm and 2.3 degrees remain, 2 times the "
+        "noise floor. No known effect explains the rest."
     )
 
 
@@ -193,7 +195,7 @@ def test_a_fitted_formula_is_part_of_the_model_and_no_effect() -> None:
     drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)])
     both = {"effects": ["drive_lag", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02}
     drawn["ladder"].append(both)
-    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, twice the noise"
+    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, 2 times the noise"
     assert told in check_verdict(drawn)
     drawn["effects"] = []
     for rung in drawn["ladder"]:
@@ -266,9 +268,17 @@ def test_without_a_noise_floor_nobody_says_that_nothing_is_missing() -> None:
     assert "The noise floor of this run is not known" in verdict
 
 
-@pytest.mark.parametrize(("error", "says"), [(0.074, "at the noise floor"), (0.076, "twice the noise floor")])
+@pytest.mark.parametrize(
+    ("error", "says"),
+    [
+        (0.072, "at the noise floor"),
+        (0.074, "1.5 times the noise floor"),
+        (0.08, "1.6 times the noise floor"),
+    ],
+)
 def test_the_verdict_and_the_line_below_agree_on_the_noise_floor(error: float, says: str) -> None:
     diagnosis = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.2), (error, 0.02 * error / 0.05)])
     assert says in format_verdict(diagnosis)
     line = format_remaining_error(error, _FLOOR["t_mrmse_m"], 0.98)
     assert ("at the noise floor" in line) is (says == "at the noise floor")
+    assert (says in line) or error >= ABOVE_FLOOR * _FLOOR["t_mrmse_m"]

@@ -120,7 +120,7 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
     assert (
         '<p class="verdict">After 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % '
         "of the ideal rate and answers commands 1.1 s late; with both in the model 31 cm and 5.7 degrees "
-        "remain, twice the noise floor in position and at the noise floor in heading. "
+        "remain, 1.6 times the noise floor in position and at the noise floor in heading. "
         "No known effect explains the rest.</p>"
     ) in first
     assert "<b>Turning faster than 1 rad/s</b>: 74 % of the yaw error in 21 % of the time" in first
