@@ -471,7 +471,7 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         cases = [usual[name] for name in one.contains if name in usual]
         starts = [loaded.add(one.change(**values)) for values in one.starts]
         tried, simpler = selection.enter_each([starts[0], loaded.add(*cases)])
-        if selection.loss(tried) > _WHOLE * selection.loss(simpler):
+        if selection.budget.is_spent() or selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
         weights, best = selection.weights, _make_sound(selection, tried)
         for state in starts:

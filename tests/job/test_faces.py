@@ -64,7 +64,7 @@ def test_the_short_screen_has_one_slip_and_one_interval_a_number(run: slip.Run) 
         "expected range between runs",
         "\nwhere ",
         "\nbudget ",
-        "\nbounds ",
+        "\nlimits ",
         "\ntopics ",
     ):
         assert word in whole

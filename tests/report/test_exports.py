@@ -236,7 +236,8 @@ def test_a_model_that_cannot_be_run_leaves_no_file(
     copy = tmp_path / "results"
     shutil.copytree(results, copy)
     (manifest,) = Store(copy).manifests()
-    still = manifest.read("wheels").with_columns(left=pl.lit(0.0), right=pl.lit(0.0))
+    sides = (f"{side}{column}" for side in ("left", "right") for column in ("", "_aligned"))
+    still = manifest.read("wheels").with_columns(pl.lit(0.0).alias(name) for name in sides)
     still.write_parquet(manifest.path("wheels"))
     with pytest.raises(MotionError, match="no measured wheels"):
         write_derived_log(replace(source, manifest=manifest, input="measured"), tmp_path / "out.mcap")
