@@ -169,7 +169,18 @@ def fit_model(
 
 
 def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
-    return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
+    """The fit from a state; if ``exact`` a fit from its values ends at them, with the delays found anew."""
+    fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
+    for _ in range(_REWEIGHTED if exact else 0):
+        before, values = fit, state.hold(fit.state.effects)
+        fit = _finish(part, _fit_part(problem, part, values, per_run), per_run, exact=True)
+        if np.allclose(_list_values(before), _list_values(fit), rtol=_SAME_NUMBER, atol=1e-6):
+            break
+    return fit
+
+
+def _list_values(fit: PartFit) -> Floats:
+    return np.array([fit.state.get(number) for number in fit.free])
 
 
 def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
@@ -225,11 +236,9 @@ def _estimate_delays(part: Part, state: State) -> tuple[Weights, State]:
 def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
     """The fit iterated until neither parameters nor weights change."""
     for _ in range(_SETTLED_ROUNDS):
-        before = np.array([fit.state.get(number) for number in fit.free])
-        weights = make_weights(fit.residual, part)
+        before, weights = _list_values(fit), make_weights(fit.residual, part)
         fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
-        after = np.array([fit.state.get(number) for number in fit.free])
-        if np.allclose(before, after, rtol=_SAME_NUMBER, atol=1e-6):
+        if np.allclose(before, _list_values(fit), rtol=_SAME_NUMBER, atol=1e-6):
             break
     return fit
 

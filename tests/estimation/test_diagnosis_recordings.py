@@ -20,7 +20,7 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.acceptance import find_implausible
 from pipeline.estimation.folds import measure_errors
-from pipeline.estimation.verdict import FORMULA
+from pipeline.estimation.verdict import FORMULA, format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -195,11 +195,12 @@ def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str,
 
 
 @pytest.mark.parametrize("source", ["command", "measured"])
-def test_on_ice_structure_is_left_in_all_channels(asked: Asked, source: str) -> None:
+def test_on_ice_the_rest_is_said_to_be_unexplained(asked: Asked, source: str) -> None:
+    """What is left lasts for a second (correlation .25 to .33), too little to call it a structure."""
     run = asked.diagnose("warthog_wheels_ice_2024_7_30_16h30s21", source)
-    left = run.unexplained
-    assert left is not None
-    assert set(left.channels) == {"x", "y", "w"}
+    verdict = format_verdict(run.to_json())
+    assert "times the noise floor" in verdict
+    assert "no known effect explains the rest" in verdict.casefold()
     assert run.explained_share < 0.9
 
 

@@ -26,8 +26,9 @@ REACHED = {
     ("husky_wheels-deflated_tile_2023_12_12_16h16", C): (0.529, 0.224, 0.133, 0.251, 0.119, 0.119),
     ("husky_snow_boreal", M): (0.667, 0.722, 0.169, 0.361, 0.162, 0.161),
     ("husky_snow_boreal", C): (0.429, 0.735, 0.037, 0.292, 0.113, 0.027),
-    ("husky_wheels_wetgrass", M): (1.000, 0.958, 0.140, 0.800, 0.100, 0.100),
-    ("husky_wheels_wetgrass", C): (0.938, 0.958, 0.099, 0.661, 0.071, 0.071),
+    # Without a gyro nothing dates the poses, and readings that are no longer held do not make up for it.
+    ("husky_wheels_wetgrass", M): (1.000, 0.958, 0.153, 0.801, 0.113, 0.113),
+    ("husky_wheels_wetgrass", C): (0.941, 0.959, 0.107, 0.664, 0.079, 0.079),
     ("warthog_wheels_asphalt_2024_8_7_11h30s30", M): (0.590, 0.320, 0.116, 0.279, 0.103, 0.103),
     ("warthog_wheels_asphalt_2024_8_7_11h30s30", C): (0.369, 0.347, 0.170, 0.195, 0.112, 0.099),
     ("warthog_wheels_asphalt", M): (0.537, 0.240, 0.100, 0.242, 0.083, 0.083),
@@ -42,7 +43,7 @@ REACHED = {
     ("warthog_wheels_sand_2024_9_25_14h32s32", C): (0.419, 0.462, 0.102, 0.248, 0.112, 0.070),
     ("warthog_wheels_ice_2024_7_30_16h30s21", M): (0.471, 0.495, 0.326, 0.341, 0.271, 0.225),
     ("warthog_wheels_ice_2024_7_30_16h30s21", C): (0.404, 0.659, 0.256, 0.267, 0.242, 0.181),
-    ("warthog_wheels_grass_2024_7_29_14h46s15", M): (0.857, 0.752, 0.085, 0.537, 0.063, 0.063),
+    ("warthog_wheels_grass_2024_7_29_14h46s15", M): (0.747, 0.752, 0.093, 0.513, 0.064, 0.064),
     ("warthog_wheels_grass_2024_7_29_14h46s15", C): (0.518, 0.748, 0.213, 0.355, 0.116, 0.116),
     ("warthog_wheels_grass_2024_8_8_16h19s23", M): (0.704, 0.385, 0.086, 0.368, 0.075, 0.075),
     # With the ages of poses from the path; `wheel_servo` in place of the lags reaches .03 in R.
@@ -50,7 +51,6 @@ REACHED = {
 }
 # Channels that stay further than ten percent above the table of METHODS section 5.
 BEYOND = {
-    ("husky_wheels-deflated_tile_2023_12_12_16h16", C): "x",
     ("husky_wheels_wetgrass", M): "R",
     ("husky_wheels_wetgrass", C): "R",
     ("warthog_wheels_asphalt_2024_9_20_8h13s12", M): "x",
