@@ -13,7 +13,7 @@ import polars.selectors as cs
 
 from pipeline.core import pick
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.untrusted import format_csv
+from pipeline.core.untrusted import format_csv, number_in
 from pipeline.fleet import MEASURES
 from pipeline.fleet.confidence import (
     Blocks,
@@ -330,13 +330,10 @@ DIFFERENT, OF_TWO_RUNS, ALIKE, TOO_FEW = "different", "different runs", "alike",
 
 def judge_pair(row: Mapping[str, object]) -> str:
     """What a row of `comparisons` says: `DIFFERENT`, `OF_TWO_RUNS`, `ALIKE` or `TOO_FEW`."""
-    if _number(row["p_adjusted"]) <= LEVEL:
+    adjusted, smallest = (number_in(row, key) for key in ("p_adjusted", "smallest_p"))
+    if adjusted is not None and adjusted <= LEVEL:
         return DIFFERENT if row["unit_of_analysis"] == RUNS else OF_TWO_RUNS
-    return TOO_FEW if _number(row["smallest_p"]) > LEVEL else ALIKE
-
-
-def _number(value: object) -> float:
-    return float(value) if isinstance(value, (int, float)) else 1.0
+    return TOO_FEW if smallest is None or smallest > LEVEL else ALIKE
 
 
 _WORDS = {

@@ -230,11 +230,11 @@ class Effect(ABC):
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers, as a clause of a sentence; see `clause`."""
         if self.clause:
-            return self._fill(self.clause, vehicle) or f"shows signs of {self.id.replace('_', ' ')}"
-        does = self.describe_motion(vehicle, beside).partition(": ")[2].removeprefix("the robot ")
-        return (
-            does.replace("base_link", "the reference point") or f"shows signs of {self.id.replace('_', ' ')}"
-        )
+            does = self._fill(self.clause, vehicle)
+        else:
+            does = self.describe_motion(vehicle, beside).partition(": ")[2].removeprefix("the robot ")
+            does = does.replace("base_link", "the reference point")
+        return does or f"shows signs of {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
         """A template with its numbers, less parts between commas with one that is open or infinite."""
