@@ -67,7 +67,8 @@ class Answer:
         estimates: numbers of effects that were not named.
         detectable: how large numbers would have had to be to be seen.
         rivals: numbers of effects that are one explanation of several, each in the place of the others.
-        unless: by id of an effect that may act, too, its numbers and those of others beside it.
+        unless: by id of an effect that may act, too, its numbers and those of others beside it, and by id of
+            one that is said not to be significant, its estimates.
     """
 
     numbers: Mapping[str, Number]
@@ -134,20 +135,28 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         inputs = ("command", "measured") if both else ("measured",)
         told = diagnose_runs([recording], vehicle, inputs=inputs).runs[0]
     findings = (*recording.list_findings(), *told.findings)
+    estimates = {
+        f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
+        for one in sorted(told.estimates, key=lambda one: one.input)
+    }
     return Answer(
         _list_numbers(told.effects),
         {str(one["id"]): cast("float | None", one.get("value")) for one in findings},
         tuple(name for item in told.undecided for name in item.candidates),
         tuple(item.id for item in told.unobservable),
         _list_numbers(told.immaterial),
-        {
-            f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
-            for one in sorted(told.estimates, key=lambda one: one.input)
-        },
+        estimates,
         {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
         _list_values(pair for item in told.undecided for pair in item.numbers.items()),
-        _list_unless(told.effects),
+        _list_unless(told.effects) | _list_doubted(findings, estimates),
     )
+
+
+def _list_doubted(findings: Iterable[Mapping[str, Any]], estimates: Mapping[str, Number]) -> dict[str, Json]:
+    """Estimates of the effects that are said not to be significant, by id."""
+    ids = [str(one["where"]) for one in findings if one["id"] == "insignificant_effect"]
+    known = {name: {k: v for k, v in estimates.items() if k.startswith(f"{name}.")} for name in ids}
+    return {name: numbers for name, numbers in known.items() if numbers}
 
 
 def _list_unless(effects: Iterable[Named]) -> dict[str, dict[str, Number]]:

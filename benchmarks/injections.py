@@ -66,7 +66,7 @@ def list_injections() -> list[Injection]:
             "left encoder x .95", _on("wheels", lambda t: _scale(t, left=0.95)), ("wheel_scale",),
             {"wheel_asymmetry.e": shift(-0.051)},
             # Wheels that are read slower than they turn are so to their commands, too.
-            along={"side_gain.e": shift(0.051)}, both=True,
+            along={"side_gain.e": shift(0.051), "drive_gain.g": lambda g: 0.975 * g}, both=True,
         ),
         Injection("left encoder backward", _on("wheels", lambda t: _scale(t, left=-1.0)), ("wheel_sign",)),
         Injection(

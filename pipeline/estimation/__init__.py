@@ -8,7 +8,7 @@ what is not observable, and what no effect of the catalogue explains.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
@@ -16,10 +16,10 @@ import numpy as np
 
 from pipeline.core.compute import Budget, both_cores, usual_budget
 from pipeline.estimation import conclude
+from pipeline.estimation.acceptance import NEARLY, NotSignificant
 from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
-from pipeline.estimation.estimates import NotSignificant, list_not_significant
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
@@ -219,7 +219,7 @@ def _gather(search: SearchResult, explainable: Explainable | None) -> Explored:
     return Explored(
         search,
         tuple(undecided),
-        tuple(list_not_significant(search)),
+        tuple(_list_not_significant(search)),
         tuple(unobservable),
         tuple(detectable),
         explainable,
@@ -242,3 +242,17 @@ def _conclude(
             conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)
         )
     )
+
+
+def _list_not_significant(search: SearchResult) -> Iterator[NotSignificant]:
+    """Effects last tried as extensions of the final model of the search, see `NotSignificant`."""
+    final, selection = search.final, search.selection
+    for extended in search.not_significant:
+        added = [effect for effect in extended.state.effects if effect.id not in final.ids]
+        if len(added) != 1 or len(extended.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
+            continue
+        if not selection.may_stay(added[0], extended.state):
+            continue
+        improvement = selection.judge(final, extended)
+        if NEARLY <= improvement.reached < 1.0:
+            yield NotSignificant(added[0], improvement.gain, improvement.reached)

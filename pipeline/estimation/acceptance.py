@@ -159,13 +159,37 @@ class Improvement:
         return min(self.t / LEAST_T, self.t_stable / STABLE_T)
 
     @property
+    def reached(self) -> float:
+        """Evidence and gain, the smaller one as a fraction of what is required."""
+        return min(self.share, self.gain / LEAST_GAIN)
+
+    @property
     def is_significant(self) -> bool:
         """Whether the improvement is significant, stable over the run and large enough to matter."""
-        return self.reaches(1.0)
+        return self.reached >= 1.0
 
     def reaches(self, share: float) -> bool:
         """Whether it matters, with at least this fraction of the required evidence."""
         return self.gain >= LEAST_GAIN and self.share >= share
+
+
+NEARLY = 0.5
+"""Share of the required evidence and gain below which an effect is neither told nor a condition on others."""
+
+
+@dataclass(frozen=True)
+class NotSignificant:
+    """An effect that nearly has the required evidence and gain.
+
+    Attributes:
+        effect: with its values when added to the final model of the search.
+        gain: share of the loss that it removes.
+        evidence: share of the required evidence and gain, see `Improvement.reached`.
+    """
+
+    effect: Effect
+    gain: float
+    evidence: float
 
 
 def compare(

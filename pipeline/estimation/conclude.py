@@ -112,11 +112,10 @@ def summarize(
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
     doubts: list[Mapping[str, Json]] = []
     immaterial: list[Named] = []
-    exceeded = context.conditions.exceeded
     while True:
         judgement = judgements.get(source.value)
         described = _name_all(added, context, paths, judgement)
-        doubted = {one.id: doubt for one in described if (doubt := find_doubt(one, exceeded)) is not None}
+        doubted = {one.id: d for one in described if (d := find_doubt(one, context.conditions.exceeded))}
         new = {name: one for name, one in doubted.items() if not _is_needed(one, judgement)}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
         if not new and not small:
@@ -131,15 +130,17 @@ def summarize(
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
-    hidden = {name for item in undecided for name in item.candidates} | {effect.id for effect in taken}
-    hidden |= set().union(*(effect.searched_as for effect in taken))
+    hidden = {name for item in undecided for name in item.candidates}
+    hidden = hidden.union(*({effect.id, *effect.searched_as} for effect in taken))
     described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
     named = _mark_tentative(described, judgements, doubted)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
         near = (one for path in paths for one in path.not_significant)
-        named, unless = _note_unless(named, find_unless(judgement, named, near, hidden))
-        hidden |= unless
+        conditions = list(find_unless(judgement, named, near, hidden))
+        named = _note_unless(named, conditions)
+        doubts += [one.note for name, one in conditions if not name]
+        hidden.update(one.id for _, one in conditions)
     stated = hidden.union(*(effect.contains for effect in taken))
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
     shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
@@ -413,13 +414,9 @@ def _mark_tentative(
     )
 
 
-def _note_unless(
-    named: Sequence[Named], conditions: Iterable[tuple[str, Unless]]
-) -> tuple[tuple[Named, ...], set[str]]:
-    """Named effects with the insignificant effects that would change their values, and the ids of these."""
-    known = list(conditions)
-    noted = (replace(one, unless=tuple(un for name, un in known if name == one.id)) for one in named)
-    return tuple(noted), {unless.id for _, unless in known}
+def _note_unless(named: Iterable[Named], conditions: Sequence[tuple[str, Unless]]) -> tuple[Named, ...]:
+    """Named effects with the insignificant effects that would change their values."""
+    return tuple(replace(one, unless=tuple(un for n, un in conditions if n == one.id)) for one in named)
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:

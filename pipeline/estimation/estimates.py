@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
 from pipeline.core.arrays import Ints
-from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_beyond, find_exceeded, find_implausible
+from pipeline.estimation.acceptance import HALVES, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.error_regions import BREVITY
@@ -20,7 +20,6 @@ from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_intervals, estimate_part, join_blocks
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import Part, count_seconds
-from pipeline.estimation.search import SearchResult
 from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
 from pipeline.estimation.verdict import SEARCH_CUT
@@ -33,6 +32,7 @@ from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core.compute import Budget
+    from pipeline.estimation.acceptance import NotSignificant
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
@@ -99,34 +99,16 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
     return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}
 
 
-# Share of the required evidence below which an effect is not used as a condition on others.
-_NEARLY = 0.5
-
-
-@dataclass(frozen=True)
-class NotSignificant:
-    """An effect with a sufficient reduction of the held-out loss, but insufficient evidence.
-
-    Attributes:
-        effect: with its values when added to the final model of the search.
-        gain: share of the held-out loss that it removes.
-        evidence: as a share of the required evidence.
-    """
-
-    effect: Effect
-    gain: float
-    evidence: float
-
-
 @dataclass(frozen=True)
 class Unless:
-    """An effect that is not significant, but would change the values of an identified one.
+    """An effect that is not significant, and may change the values of an identified one.
 
     Attributes:
         id: its id.
         parameters: its values.
         gain, evidence: see `NotSignificant`.
         instead: values of the identified effect beside it; their intervals do not overlap those without it.
+            Empty where it changes none.
     """
 
     id: str
@@ -141,22 +123,19 @@ class Unless:
         beside = (
             f"with {self.id} ({format_numbers(self.parameters)}) in the model: {format_numbers(self.instead)}"
         )
+        return f"{beside}; {self.doubt}"
+
+    @property
+    def doubt(self) -> str:
+        """Why it is not reported itself."""
         evidence = math.floor(100.0 * self.evidence)
-        return f"{beside}; {self.id} is not significant: {evidence} % of the required evidence"
+        return f"{self.id} is not significant: {evidence} % of the required evidence and gain"
 
-
-def list_not_significant(search: SearchResult) -> Iterator[NotSignificant]:
-    """Effects last tried as extensions of the final model of the search, see `NotSignificant`."""
-    final, selection = search.final, search.selection
-    for extended in search.not_significant:
-        added = [effect for effect in extended.state.effects if effect.id not in final.ids]
-        if len(added) != 1 or len(extended.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
-            continue
-        if not selection.may_stay(added[0], extended.state):
-            continue
-        improvement = selection.judge(final, extended)
-        if improvement.gain >= LEAST_GAIN and _NEARLY <= improvement.share < 1.0:
-            yield NotSignificant(added[0], improvement.gain, improvement.share)
+    @property
+    def note(self) -> Mapping[str, Json]:
+        """The finding that it may act."""
+        text = f"{self.doubt} ({format_numbers(self.parameters)})"
+        return {"id": "insignificant_effect", "text": text, "where": self.id, "severity": "info"}
 
 
 def find_unless(
@@ -165,7 +144,7 @@ def find_unless(
     not_significant: Iterable[NotSignificant],
     taken: Container[str],
 ) -> Iterator[tuple[str, Unless]]:
-    """Identified effects whose values change beside an insignificant one, all fitted together.
+    """Insignificant effects, by each identified effect whose values change beside them, or by "" if none do.
 
     Args:
         judgement: of the model with the identified effects.
@@ -182,16 +161,18 @@ def find_unless(
         beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
         if explain_values(name, beside[name]):
             continue
-        for effect in named:
-            if effect.by_run or effect.id not in beside:
-                continue
-            instead = {
+        changed = {
+            effect.id: {
                 key: other
                 for key, value in effect.parameters.items()
                 if (other := beside[effect.id][key]).high < value.low or other.low > value.high
             }
-            if instead:
-                yield effect.id, Unless(name, beside[name], one.gain, one.evidence, instead)
+            for effect in named
+            if effect.id in beside and not effect.by_run
+        }
+        moved = {other: values for other, values in changed.items() if values} or {"": {}}
+        for other_id, instead in moved.items():
+            yield other_id, Unless(name, beside[name], one.gain, one.evidence, instead)
 
 
 def list_estimates(

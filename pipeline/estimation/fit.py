@@ -171,7 +171,7 @@ def fit_model(
 def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
     """The fit from a state; if ``exact`` a fit from its values ends at them, with the delays found anew."""
     fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
-    for _ in range(_REWEIGHTED if exact else 0):
+    for _ in range(_REWEIGHTED if exact and part.delays else 0):
         before, values = fit, state.hold(fit.state.effects)
         fit = _finish(part, _fit_part(problem, part, values, per_run), per_run, exact=True)
         if np.allclose(_list_values(before), _list_values(fit), rtol=_SAME_NUMBER, atol=1e-6):

@@ -369,7 +369,7 @@ def _list_doubtful(selection: Selection, current: CandidateModel) -> list[str]:
     names = [name for name in current.ids if name not in selection.given]
     rough = selection.approach_each(current, [current.state.drop([name]) for name in names], 0.0)
     judged = zip(names, (selection.judge(without, current) for without in rough), strict=True)
-    return [name for name, one in judged if one.share < _CLEAR or one.gain < _CLEAR * LEAST_GAIN]
+    return [name for name, one in judged if one.reached < _CLEAR]
 
 
 def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:

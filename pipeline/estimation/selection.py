@@ -338,8 +338,11 @@ class Selection:
     def take_evidence(
         self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
     ) -> Evidence:
-        """Evidence for what could be added to a model, some effects left out; under a noise that is known."""
-        excluded = set(without)
+        """Evidence for what could be added to a model, some effects left out; under a noise that is known.
+
+        Special cases of an effect of the model are left out: beside it they share its work at random.
+        """
+        excluded = {*without}.union(*(effect.contains for effect in base.state.effects))
         candidates = [candidate for candidate in self.candidates if candidate.id not in excluded]
         return Evidence(self.part, base.fit, candidates, self.largest, noise)
 

@@ -16,7 +16,9 @@ from pipeline.estimation import (
     fit_model,
     load_recording,
 )
+from pipeline.estimation.acceptance import LEAST_GAIN, Improvement, NotSignificant
 from pipeline.estimation.diagnosis_lines import describe
+from pipeline.estimation.estimates import find_unless
 from pipeline.estimation.ladder import judge_model, note_fit
 from pipeline.export import export_model
 from pipeline.job import Options
@@ -86,6 +88,36 @@ def test_beside_what_acts_too_a_number_is_the_true_one(diagnosis: Diagnosis) -> 
     assert 0.5 <= unless.evidence < 1.0
     # What may act is neither excluded nor unseen.
     assert "body_inertia" not in {one.id for one in (*found.detectable, *found.unobservable)}
+
+
+def test_what_changes_no_other_number_is_a_finding(
+    diagnosis: Diagnosis, recorded: tuple[Vehicle, Recording]
+) -> None:
+    """Nearly enough evidence is said with the numbers, and by how much it falls short."""
+    vehicle, recording = recorded
+    problem = Problem([load_recording(recording, vehicle)], vehicle, Input.COMMAND)
+    assert diagnosis.runs[0].proposal is not None
+    judgement = judge_model(problem, diagnosis.runs[0].proposal.model)
+    nearly = [NotSignificant(find_effect("body_inertia")(tau=0.06), 0.02, 0.9)]
+    ((name, unless),) = find_unless(judgement, (), nearly, ())
+    assert (name, dict(unless.instead)) == ("", {})
+    assert unless.note["id"] == "insignificant_effect"
+    assert unless.note["where"] == "body_inertia"
+    assert str(unless.note["text"]).startswith(
+        "body_inertia is not significant: 90 % of the required evidence and gain (tau = 0.0"
+    )
+    assert list(find_unless(judgement, (), nearly, ("body_inertia",))) == []
+
+
+def test_evidence_and_gain_are_required_alike() -> None:
+    t = acceptance.LEAST_T
+    for improvement, reached in (
+        (Improvement(2.0 * t, t, 0.5 * LEAST_GAIN), 0.5),
+        (Improvement(0.9 * t, t, 3.0 * LEAST_GAIN), 0.9),
+        (Improvement(2.0 * t, t, LEAST_GAIN), 1.0),
+    ):
+        assert improvement.reached == pytest.approx(reached)
+        assert improvement.is_significant == (reached >= 1.0)
 
 
 def test_what_sampled_wheels_make_of_nothing_is_no_name(diagnosis: Diagnosis) -> None:

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from test_diagnosis import _SCENE, _diagnose
 
+from pipeline.estimation.acceptance import NotSignificant
 from pipeline.estimation.conclude import _find_lead
 from pipeline.estimation.diagnosis_lines import describe
-from pipeline.estimation.estimates import NotSignificant
 from pipeline.estimation.verdict import NOTHING_MISSING
 from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES

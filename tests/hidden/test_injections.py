@@ -217,6 +217,8 @@ def test_what_a_change_makes_besides_is_no_extra_name_where_it_is_right() -> Non
     for gain, extra in ((0.055, []), (0.2, ["side_gain"])):
         after = Answer({"wheel_asymmetry.e": (-0.05, 0.01), "side_gain.e": (gain, 0.01)})
         assert judge(encoder, Answer({}), after) == ("recovered", extra)
+    after = Answer({"wheel_asymmetry.e": (-0.05, 0.01), "drive_gain.g": (0.975, 0.01)})
+    assert judge(encoder, Answer({}), after) == ("recovered", []), "their mean is slower, too"
     commands = BY_NAME["commands x 1.5"]
     assert judge(commands, Answer({}), Answer({"drive_gain.g": (0.66, 0.01)})) == ("recovered", [])
     assert judge(commands, Answer({}), Answer({"drive_gain.g": (0.9, 0.01)})) == ("number", [])

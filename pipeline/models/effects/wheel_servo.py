@@ -146,6 +146,7 @@ class WheelServo(DriveEffect):
             0.07,
             search=Search.STARTS,
             step=2e-3,
+            plausible=Plausible(0.0, 10.0, "wider than the 0.05 to 0.9 s/m of a Warthog"),
             level=Level.TERRAIN,
         ),
     )
