@@ -168,10 +168,6 @@ class Improvement:
         """Whether the improvement is significant, stable over the run and large enough to matter."""
         return self.reached >= 1.0
 
-    def reaches(self, share: float) -> bool:
-        """Whether it matters, with at least this fraction of the required evidence."""
-        return self.gain >= LEAST_GAIN and self.share >= share
-
 
 NEARLY = 0.5
 """Share of the required evidence and gain below which an effect is neither told nor a condition on others."""

@@ -135,7 +135,7 @@ class Unless:
     def note(self) -> Mapping[str, Json]:
         """The finding that it may act."""
         text = f"{self.doubt} ({format_numbers(self.parameters)})"
-        return {"id": "insignificant_effect", "text": text, "where": self.id, "severity": "info"}
+        return _note_insignificant(self.id, text)
 
 
 def find_unless(
@@ -239,7 +239,12 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
     if not all(empty):
         return None
     text = f"{effect.id} is not named: {empty[0]}"
-    return {"id": "insignificant_effect", "text": text, "where": effect.id, "severity": "info"}
+    return _note_insignificant(effect.id, text)
+
+
+def _note_insignificant(name: str, text: str) -> Mapping[str, Json]:
+    """The finding why an effect is not named, though the data may hold it."""
+    return {"id": "insignificant_effect", "text": text, "where": name, "severity": "info"}
 
 
 def format_stand_in(effect: Named) -> str:

@@ -357,7 +357,7 @@ def prune(selection: Selection, current: CandidateModel) -> CandidateModel:
         weak = [
             (one.share, without)
             for name, (one, without) in zip(doubtful, judged, strict=True)
-            if not one.reaches(0.0 if name in expected else 1.0)
+            if (one.gain < LEAST_GAIN if name in expected else not one.is_significant)
         ]
         if not weak:
             return current
