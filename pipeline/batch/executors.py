@@ -100,7 +100,7 @@ class LocalExecutor:
         while True:
             free = [worker for worker in self._workers if not worker.is_busy] or [self._start_worker()]
             worker = min(free, key=lambda worker: not worker.is_ready)
-            worker.wait_until_ready()
+            self._watchdog.watch(worker.wait_until_ready())
             try:
                 if worker.count < _TASKS_PER_WORKER:
                     return worker.begin(self._settings, task)
@@ -176,7 +176,7 @@ class _Worker:
         )
         self._ready = self._pool.submit(load_libraries, None)
         # Its pool may start another process after a death, which gets no task.
-        self._process = context.first
+        self._process = cast("SpawnProcess", context.first)
         self._ending = threading.Thread(target=self._pool.join, name="ending", daemon=True)
 
     @property
@@ -189,8 +189,8 @@ class _Worker:
         """Whether it can start a task immediately."""
         return self._ready.done()
 
-    def wait_until_ready(self) -> None:
-        """Wait until it can start a task.
+    def wait_until_ready(self) -> int:
+        """Wait until it can start a task, and return its process id.
 
         Raises:
             BatchError: ``no_workers``, the process cannot be started.
@@ -203,6 +203,7 @@ class _Worker:
             raise _explain_failed_start(format_exit(exit_code))
         if error is not None:
             raise _explain_failed_start(f"{type(error).__name__}: {error}")
+        return cast("int", self._process.pid)
 
     def begin(self, settings: Settings, task: Task) -> Future[Report]:
         """Start a task.
@@ -231,8 +232,6 @@ class _Worker:
 
     def notify_end(self) -> tuple[int | None, int | None]:
         """Process id and exit code, as far as known."""
-        if self._process is None:
-            return None, None
         self._process.join(_END_S)
         return self._process.pid, self._process.exitcode
 
@@ -246,7 +245,7 @@ class _Worker:
         self._ending.join()
 
     def _is_alive(self) -> bool:
-        return self._process is not None and self._process.is_alive()
+        return self._process.is_alive()
 
 
 def _hand_over(waiting: Future[Report], given: Future[object]) -> None:

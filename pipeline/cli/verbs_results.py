@@ -135,6 +135,7 @@ def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) ->
             process.kill()
 
         timer = threading.Timer(min(timeout_s, threading.TIMEOUT_MAX), give_up)
+        watchdog.watch(process.pid)
         watchdog.start()
         timer.start()
         try:

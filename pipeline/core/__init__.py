@@ -252,12 +252,16 @@ _SLOW_PERIOD_S = 1.0
 class MemoryWatchdog:
     """Kills child processes that exceed a memory limit.
 
+    A child that has not yet started its program shares the memory of this process: only processes known to
+    run are watched.
+
     Args:
         limit_bytes: memory limit of each process.
     """
 
     def __init__(self, limit_bytes: int) -> None:
         self._limit = limit_bytes
+        self._watched: frozenset[int] = frozenset()
         self._killed: dict[int, int] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
@@ -271,13 +275,17 @@ class MemoryWatchdog:
         self._stop.set()
         self._thread.join()
 
+    def watch(self, pid: int) -> None:
+        """Watch a child process, which runs its own program."""
+        self._watched |= {pid}
+
     def held_by(self, pid: int | None) -> int | None:
         """Memory of a process when it was killed for it [bytes]; None if it was not."""
         return None if pid is None else self._killed.get(pid)
 
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            for pid in list_children():
+            for pid in self._watched.intersection(list_children()):
                 held = read_memory(pid)
                 if held > self._limit and pid not in self._killed:
                     self._killed[pid] = held

@@ -126,5 +126,18 @@ def test_a_worker_that_died_is_known_although_the_next_log_was_offered_to_it(tmp
         executor.close()
 
 
+def test_a_process_that_starts_is_not_judged_by_the_memory_of_its_parent(tmp_path: Path) -> None:
+    executor = open_executor("local", Settings(jobs=1, timeout_s=60.0, memory_bytes=1, work=work_poisoned))
+    try:
+        # Any process exceeds this limit, and starts nevertheless.
+        options = Options(out=tmp_path)
+        task = Task(path=tmp_path / "hangs.mcap", log=unseen("hangs"), basis="", options=options)
+        error = executor.submit(task).exception(timeout=60.0)
+        assert isinstance(error, Exception)
+        assert executor.blame(task, error).code == "out_of_memory"
+    finally:
+        executor.close()
+
+
 def unseen(name: str) -> LogSighting:
     return LogSighting(path=name, size=0, mtime_ns=0, inode=0, seen_ns=0)
