@@ -100,7 +100,8 @@ class LocalExecutor:
         while True:
             free = [worker for worker in self._workers if not worker.is_busy] or [self._start_worker()]
             worker = min(free, key=lambda worker: not worker.is_ready)
-            self._watchdog.watch(worker.wait_until_ready())
+            worker.wait_until_ready()
+            self._watchdog.watch(worker.pid)
             try:
                 if worker.count < _TASKS_PER_WORKER:
                     return worker.begin(self._settings, task)
@@ -119,8 +120,8 @@ class LocalExecutor:
             self._end_worker(worker)
         if isinstance(error, TimeoutError):
             return Blame("timed_out", f"it did not end within {self._settings.timeout_s:g} s", 1)
-        pid, exit_code = worker.notify_end()
-        held = self._watchdog.held_by(pid)
+        exit_code = worker.wait_for_exit_code()
+        held = self._watchdog.held_by(worker.pid)
         if held is not None:
             limit = self._settings.memory_bytes / 1e9
             return Blame(
@@ -189,8 +190,13 @@ class _Worker:
         """Whether it can start a task immediately."""
         return self._ready.done()
 
-    def wait_until_ready(self) -> int:
-        """Wait until it can start a task, and return its process id.
+    @property
+    def pid(self) -> int:
+        """Id of its process."""
+        return cast("int", self._process.pid)
+
+    def wait_until_ready(self) -> None:
+        """Wait until it can start a task.
 
         Raises:
             BatchError: ``no_workers``, the process cannot be started.
@@ -199,11 +205,9 @@ class _Worker:
             wait([self._ready], timeout=_LOOK_PERIOD_S)
         error = self._ready.exception() if self._ready.done() else BrokenProcessPool("the process has died")
         if isinstance(error, BrokenProcessPool | ProcessExpired):
-            _, exit_code = self.notify_end()
-            raise _explain_failed_start(format_exit(exit_code))
+            raise _explain_failed_start(format_exit(self.wait_for_exit_code()))
         if error is not None:
             raise _explain_failed_start(f"{type(error).__name__}: {error}")
-        return cast("int", self._process.pid)
 
     def begin(self, settings: Settings, task: Task) -> Future[Report]:
         """Start a task.
@@ -230,10 +234,10 @@ class _Worker:
             with suppress(InvalidStateError):
                 self._future.set_exception(BrokenProcessPool("the process has died"))
 
-    def notify_end(self) -> tuple[int | None, int | None]:
-        """Process id and exit code, as far as known."""
+    def wait_for_exit_code(self) -> int | None:
+        """Exit code of its dead process; None if it is not known soon."""
         self._process.join(_END_S)
-        return self._process.pid, self._process.exitcode
+        return self._process.exitcode
 
     def end(self) -> None:
         """Begin to end the process."""

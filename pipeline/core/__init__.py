@@ -279,9 +279,9 @@ class MemoryWatchdog:
         """Watch a child process, which runs its own program."""
         self._watched |= {pid}
 
-    def held_by(self, pid: int | None) -> int | None:
+    def held_by(self, pid: int) -> int | None:
         """Memory of a process when it was killed for it [bytes]; None if it was not."""
-        return None if pid is None else self._killed.get(pid)
+        return self._killed.get(pid)
 
     def _watch(self) -> None:
         while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
