@@ -26,12 +26,12 @@ from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     SEARCH_CUT,
     format_verdict,
+    is_small,
     list_added,
     measure_excess,
     name_effect,
     name_formula,
     name_group,
-    rank_main,
     split_main,
 )
 from pipeline.models.catalogue import find_effect
@@ -171,9 +171,7 @@ def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
     """Groups with an effect that removes a tenth of the error or with none in the model; smaller groups."""
-    main = rank_main(run.ladder)
-    ids = {name for before, after in pairwise(run.ladder) for name in list_added(before, after)}
-    small = [item for item in run.undecided if (held := run.find_held(item)) in ids and held not in main]
+    small = [item for item in run.undecided if is_small(run.find_held(item) or "", run.ladder)]
     return [item for item in run.undecided if item not in small], small
 
 

@@ -133,6 +133,12 @@ def split_main(
     return main, [effect for effect, chosen in zip(effects, is_main, strict=True) if not chosen]
 
 
+def is_small(name: str, ladder: Sequence[Content]) -> bool:
+    """Whether the ladder contains an effect that `rank_main` does not list."""
+    ids = {added for before, after in pairwise(ladder) for added in list_added(before, after)}
+    return name in ids - set(rank_main(ladder))
+
+
 def _format_nothing(diagnosis: Content) -> list[str]:
     """Sentences on a run of whose errors no effect removes any."""
     corrected = [str(one["clause"]) for one in objects_in(diagnosis, "effects") if one.get("clause")]

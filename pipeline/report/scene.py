@@ -100,12 +100,22 @@ class RunReport:
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """Effects that explain the data equally well, and the manoeuvre that would separate them."""
+        from pipeline.estimation.verdict import name_group  # noqa: PLC0415 - heavy
+
         groups = []
         for entry in objects_in(self.diagnosis, "undecided"):
             names = entry.get("candidates")
-            between = " or ".join(map(str, names)) if isinstance(names, list) else ""
+            between = name_group([*map(str, names)]) if isinstance(names, list) else ""
             groups.append((between, str(entry.get("separate_by", ""))))
         return groups
+
+    @property
+    def small_groups(self) -> int:
+        """Number of undecided groups that count as one smaller effect each."""
+        from pipeline.estimation.verdict import is_small  # noqa: PLC0415 - heavy
+
+        groups = objects_in(self.diagnosis, "undecided")
+        return sum(is_small(str(group.get("in_model")), self.ladder) for group in groups)
 
     @property
     def split(self) -> tuple[float | None, float | None, float | None]:

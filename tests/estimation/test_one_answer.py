@@ -23,6 +23,9 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import read_model_text, view_diagnosis
+from pipeline.report.page import render_report
+from pipeline.report.scene import RunReport
+from pipeline.report.sections_why import format_remaining
 from pipeline.simulate import simulate_case
 from pipeline.web.actions import Editor, RunCache, open_session
 from pipeline.web.session import SessionFile
@@ -77,6 +80,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     write_model(proposal, path)
     file = read_model(path)
     check_written(told, file, describe(diagnosis, everything=True))
+    check_page(told, describe(diagnosis))
     own = check_model_verbs(
         told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
     )
@@ -88,6 +92,16 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
         assert set(view.effects) == set(file.model.ids)
         assert view.ladder == told["ladder"]
     assert hash_results(results) == before
+
+
+def check_page(told: Json, screen: str) -> None:
+    """The report counts the smaller effects as the screen does, and says the same of what remains."""
+    report = RunReport({"run": told["run"]}, diagnosis=told)
+    page, shown = render_report(report), " ".join(screen.split())
+    assert re.findall(r"and (\d+) smaller effect", page) == re.findall(r"(\d+) smaller effect", shown)
+    remaining = format_remaining(report)
+    assert remaining in page
+    assert remaining.replace("remaining error ", "remaining ") in shown
 
 
 def list_numbers(told: Json) -> list[tuple[str, str, Json]]:
@@ -113,9 +127,6 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
     )
     for written, rung in zip(file.list_fitted("ladder"), told["ladder"], strict=True):
         assert {key: written[key] for key in ERRORS} == {key: rung[key] for key in ERRORS}
-    for now, floor in re.findall(r"now ([-+.e\d]+) m, floor ([-+.e\d]+) m", screen):
-        assert now == f"{told['ladder'][-1]['t_mrmse_m']:.3g}"
-        assert floor == f"{told['noise_floor']['t_mrmse_m']:.3g}"
     for effect, name, number in list_numbers(told):
         assert same(file.model.effect(effect).values[name], number["value"], 1e-5)
         shown = re.escape(f"{number['value']:.3g}")

@@ -129,7 +129,7 @@ def test_the_first_screen_answers_all_four_in_short(page: str) -> None:
     )
     assert 'data-figure="trajectory"' in first
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in join_commands(first)
-    assert "To separate lateral_skid or icr_offset: drive circles" in first
+    assert "Undecided: lateral skid or centre of rotation. To separate them: drive circles" in first
     assert "<code>effective_track</code><br>Cause: skidding or a wrong track width" in page
     told = "remaining error 31 cm, noise floor 19 cm: the effects remove 86 % of the error above it"
     assert told not in first
@@ -345,7 +345,7 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     assert "x 13" in told
     assert "held-out squared error without it" in told
     assert "Easily confused with wheel_radius." in told
-    assert "lateral_skid or icr_offset: drive circles" in told
+    assert "lateral skid or centre of rotation: drive circles" in told
     assert "not observable in this log" in told
     assert "off by 1.06 m and 55 degrees; with the named effects 31 cm" in told
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in told
