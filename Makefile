@@ -22,7 +22,8 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
 	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
-	log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms pose-ages reveal rivals samples screenshots serve \
+	late-starts log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms \
+	pose-ages reveal rivals samples screenshots serve \
 	test \
 	test-long trend twin watch-replay wheel
 
@@ -111,6 +112,9 @@ hidden-effect-baselines: $(VENV)/.ready-dev ## the baselines of the public test 
 
 pose-ages: $(VENV)/.ready-dev ## how near the ages of poses are to those of the gyro where it is withheld [ARGS="LOG... --set NAME=VALUE"]
 	@$(BIN)/python benchmarks/pose_ages.py $$ARGS
+
+late-starts: $(VENV)/.ready-dev ## whether starts that the wheels show to be late are late in the gyro, too [ARGS=WORD]
+	@$(BIN)/python benchmarks/late_starts.py $$ARGS
 
 ablate: $(VENV)/.ready-dev ## ablation: each rule of the diagnosis off in turn, on drawn logs and the recordings [SEED=81000-81038, SCORES=file, ARGS=]
 	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS

@@ -14,7 +14,7 @@ from schemas import Table
 class Commands(Table):
     """One row a command message, held until the next one or until it is stale."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     t = schemas.seconds()
     stamp = schemas.stamp()
@@ -37,6 +37,7 @@ class Commands(Table):
         "rad/s", "speed of the wheels that moves to the left after corrections"
     )
     speed_aligned = schemas.body("m/s", "speed after corrections (Ackermann)", nullable=True)
+    followed = schemas.flag("whether the drive followed it at once: models apply no others")
     active = schemas.flag("inside an interval in which commands are live")
 
     @dy.rule()

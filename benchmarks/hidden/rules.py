@@ -31,6 +31,7 @@ from pipeline.estimation import (
 from pipeline.estimation import acceptance as plausibility
 from pipeline.estimation import evidence as noise
 from pipeline.estimation import unexplained as residual_structure
+from pipeline.stages import align
 
 
 def _same(one: Any, other: Any) -> bool:
@@ -156,6 +157,28 @@ def _same_names(one: Any, other: Any) -> bool:
     ]
 
 
+def _forget_companions(prune: Callable[..., Any], of: selection.Selection, current: Any) -> Any:
+    with ExitStack() as stack:
+        for effect in current.state.effects:
+            stack.enter_context(patch.object(type(effect), "companions", ()))
+        return prune(of, current)
+
+
+def _take_all_evidence(original: Callable[..., Any], of: selection.Selection, base: Any, *args: Any) -> Any:
+    with ExitStack() as stack:
+        for kind in {type(effect) for effect in base.state.effects}:
+            stack.enter_context(patch.object(kind, "contains", ()))
+        return original(of, base, *args)
+
+
+def _follow_at_once(_original: Any, commands: Any, _wheels: Any, _vehicle: Any) -> Any:
+    return commands.with_columns(followed=True) if commands.height else commands, []
+
+
+def _same_followed(one: Any, other: Any) -> bool:
+    return bool(one[0].equals(other[0]))
+
+
 def _same_values(one: Any, other: Any) -> bool:
     return bool(np.array_equal(one, other))
 
@@ -231,8 +254,12 @@ RULES: tuple[Rule, ...] = (
          _forget_restarts, _same_verdict),
     Rule("begin_whole", "a search begins with a controller, or contact, and its companions", search,
          "_begin_whole", _second, _same_ids),
-    Rule("expected", "companions stay at three standard errors", search, "prune", _set(search, _EXPECTED=1.0),
-         costly=True),
+    Rule("expected", "companions stay while they take away a share of the loss", search, "prune",
+         _forget_companions, costly=True),
+    Rule("covered", "special cases of an effect are not added beside it", selection.Selection,
+         "take_evidence", _take_all_evidence, costly=True),
+    Rule("late_starts", "commands that the drive followed late act from then on", align, "mark_late_starts",
+         _follow_at_once, _same_followed),
     Rule("pairs", "two effects may be added at once", evidence.Evidence, "rank_pairs", _give([]),
          costly=True),
     Rule("exchange", "one effect may take the place of another", search, "exchange", _second, _same_ids),

@@ -380,6 +380,8 @@ def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:
     if table == "poses":
         return frame.with_columns(pl.lit(0.0).alias("latency"), pl.lit(value=False).alias("outlier"))
     names = ["left", "right", "sideways", "speed", *(["steering"] if table == "wheels" else [])]
+    if table == "commands":
+        frame = frame.with_columns(pl.lit(value=True).alias("followed"))
     if table == "wheels":
         frame = frame.with_columns(pl.lit(0.0).alias("latency"))
     if table in {"wheels", "commands"}:

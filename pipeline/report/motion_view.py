@@ -37,7 +37,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
         *("recorded_modulus_command", "recorded_modulus_measured"),
     ),
-    "commands": ("t", *_ALIGNED, "steering"),
+    "commands": ("t", *_ALIGNED, "steering", "followed"),
     "wheels": ("t", *_ALIGNED, "steering_aligned", "latency"),
     "imu": ("t", "rate_z"),
     "slip": ("t", "input", "step", "suspect"),

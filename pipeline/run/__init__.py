@@ -204,7 +204,7 @@ def make_run(
     Raises:
         MotionError: ``no_poses``.
     """
-    commands = _read_drive(tables.get("commands"), vehicle)
+    commands = _read_drive(_take_followed(tables.get("commands")), vehicle)
     wheels = _read_drive(tables.get("wheels"), vehicle)
     track = _read_track(tables["poses"], wheels, name)
     if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
@@ -360,6 +360,13 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
         attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
         position=position[:, :2],
         active=piece["active"],
+    )
+
+
+def _take_followed(commands: pl.DataFrame | None) -> pl.DataFrame | None:
+    """The commands that the drive followed at their time; the others had no effect yet."""
+    return (
+        commands.filter("followed") if commands is not None and "followed" in commands.columns else commands
     )
 
 

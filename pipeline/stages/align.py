@@ -19,7 +19,12 @@ from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.drive_numbers import find_timeout, interpolate_readings, report_timeout
+from pipeline.stages.drive_numbers import (
+    find_timeout,
+    interpolate_readings,
+    mark_late_starts,
+    report_timeout,
+)
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
@@ -275,8 +280,7 @@ def align_tables(
         )
         events = find_events(velocities, known, vehicle, bad, incidents.spans)
         bad |= incidents.excluded
-        findings += [*contradictions, *incidents.findings]
-        findings += events.findings
+        findings += [*contradictions, *incidents.findings, *events.findings]
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
@@ -285,8 +289,12 @@ def align_tables(
         )
         findings += [*scale.findings, *independent]
         grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
-    corrected = {**tables, "commands": _correct_commands(commands, vehicle, scale)}
     aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+    asked, late_starts = mark_late_starts(
+        _correct_commands(commands, vehicle, scale), wheels, aligned_vehicle
+    )
+    findings += late_starts
+    corrected = {**tables, "commands": asked}
     alignment = Alignment(hold, scale.scale, scale.track_multiplier, recorded_moduli=grid.recorded)
     poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
     imu = tables.get("imu")
@@ -475,5 +483,5 @@ def _report_poses(alignment: Alignment) -> list[Finding]:
 # The align stage: systematic errors of a recording are corrected once, and the corrections stored.
 #
 # Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
-# commands and their hold time: corrections are columns of the stored tables, with findings, and every reader
-# of the run gets corrected data.
+# commands, their hold time and those not followed at once: corrections are columns of the stored tables, with
+# findings, and every reader of the run gets corrected data.

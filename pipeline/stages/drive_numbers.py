@@ -1,7 +1,8 @@
-"""What a log tells of the drive beside slip: electric power, command time-out and encoder periods.
+"""What a log tells of the drive beside slip: power, command time-out, late starts and encoder periods.
 
 Power over time with energy per distance; how long the base moves after its last command, from gaps in the
-command topic; encoder readings that are published repeatedly until the next one.
+command topic; how late the drive follows its first command after a stop or a gap; encoder readings that are
+published repeatedly until the next one.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ import polars as pl
 
 from pipeline.core import NORMAL_95
 from pipeline.core.arrays import (
+    PERIODS,
+    ROUNDING_S,
+    SILENT_S,
+    Flags,
     Floats,
     Ints,
     fit_robustly,
@@ -29,7 +34,7 @@ from pipeline.sources.candidates import PowerSource, Signal
 from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
 from pipeline.stages.incidents import LIVE
-from pipeline.stages.slip_stage import hold_commands
+from pipeline.stages.slip_stage import hold_commands, interpolate_wheels
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -134,7 +139,7 @@ _LONGEST_S = 4.0
 _HOLE_S = 0.15
 """Gap between samples of the grid [s] that may hide a stop."""
 _FEWEST = 3
-"""Least number of silences, and of ordinary stops, for a typical value."""
+"""Least number of silences, and of ordinary stops, for a typical value; and of late starts, to be told."""
 _OBEYED = 0.8
 """Least fraction of long silences in which the base stops: otherwise unrecorded commands drive it."""
 _LATER_S = 0.3
@@ -175,7 +180,7 @@ def find_timeout(
     """
     if "command" not in inputs:
         return None
-    scale = np.array([1.0, 1.0, 0.5 * vehicle.kinematics.turning_width_m(vehicle)])
+    scale = _rims(vehicle)
     velocity = inputs["measured"].velocity if "measured" in inputs else moved
     stamps = commands["t"].to_numpy()
     asked = hold_commands(stamps, commands, vehicle, math.inf)
@@ -291,6 +296,180 @@ class _Run:
             return math.inf, was
         share = (speed[reached - 1] - 0.5 * was) / (speed[reached - 1] - speed[reached])
         return float(times[reached - 1] + share * (times[reached] - times[reached - 1]) - start), was
+
+
+# A drive that was stopped or released follows its next command later than others, each time by another time:
+# a safety switch, a brake or a radio link comes first. That time is no property of the motion.
+
+_STEP_MPS = 0.3
+"""Least change of a command [m/s at the wheels], and of the measured speed, that shows a response."""
+_HELD_S = 1.2
+"""Least time [s] for which the command is held: drives reach most of a new speed in less."""
+_WATCHED_S = 2.0
+"""Time [s] for which a response is observed."""
+_MEAN_S = 0.3
+"""Time [s] for the speeds before a step and at its end; a command as early in a stretch is its first."""
+_FINE_S = 0.02
+"""Step of the integral [s]: the area of a response does not depend on a smaller one."""
+_STANDING_MPS = 0.05
+"""Speed [m/s] below which wheels stand."""
+_LATE_S = 0.15
+"""Least lateness [s] that is corrected: twice the spread of other responses, 0.04 to 0.08 s on recordings."""
+_REGULAR = 0.2
+"""Relative standard deviation of late starts below which they are a property of the drive, to be modelled."""
+_FEWEST_RESPONSES = 12
+"""Least number of responses for the regression of five coefficients."""
+
+
+@dataclass(frozen=True)
+class Responses:
+    """When the drive followed steps of the command.
+
+    Attributes:
+        start: stamp of the step [s], shape (k,).
+        late: mean response time beyond the usual one of a step of its kind [s], shape (k,).
+        is_first: whether it is the first one after a stop or a gap, shape (k,).
+    """
+
+    start: Floats
+    late: Floats
+    is_first: Flags
+
+
+def mark_late_starts(
+    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle
+) -> tuple[pl.DataFrame, list[Finding]]:
+    """Table `commands` with those that the drive did not follow yet, the first ones after a stop or a gap.
+
+    Args:
+        commands: table `commands`, aligned; of commands that are not repeated none is marked.
+        wheels: table `wheels`.
+        vehicle: for the ideal model.
+    """
+    if commands.is_empty():
+        return commands, []
+    steps = measure_responses(commands, wheels, vehicle)
+    at = np.flatnonzero(steps.is_first & (steps.late > _LATE_S))
+    if at.size < _FEWEST or np.std(steps.late[at]) < _REGULAR * np.mean(steps.late[at]):
+        at = at[:0]
+    followed = pl.lit(value=True)
+    for first, seconds in zip(steps.start[at].tolist(), steps.late[at].tolist(), strict=True):
+        followed &= ~pl.col("t").is_between(first, first + seconds, closed="left")
+    marked = commands.with_columns(followed.alias("followed"))
+    if not at.size:
+        return marked, []
+    longest = float(steps.late[at].max())
+    text = (
+        f"after {at.size} of {np.count_nonzero(steps.is_first)} stops or gaps the drive followed the first "
+        f"command later than usual, by up to {longest:.2f} s: models apply these commands from then on"
+    )
+    return marked, [Finding("late_start", "info", text, where="command", value=longest, count=at.size)]
+
+
+def measure_responses(commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle) -> Responses:
+    """Steps whose response is known; see `mark_late_starts`."""
+    none = Responses(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
+    if min(commands.height, wheels.height) < _FEWEST:
+        return none
+    stamps = commands["t"].to_numpy()
+    steps = _list_steps(stamps, hold_commands(stamps, commands, vehicle, math.inf).velocity * _rims(vehicle))
+    if steps.start.size < _FEWEST_RESPONSES:
+        return none
+    before, reached, area = _watch(steps, wheels, vehicle)
+    stands = (np.abs(before) < _STANDING_MPS).all(axis=1)
+    is_first = steps.follows_gap | (steps.follows_stop & stands)
+    late = _measure_lateness(before, reached, area, is_first)
+    known = np.isfinite(late)
+    return Responses(steps.start[known], late[known], is_first[known])
+
+
+def _rims(vehicle: Vehicle) -> Floats:
+    """Factors from the ideal velocity to the speeds at the wheels [1, 1, m]."""
+    return np.array([1.0, 1.0, 0.5 * vehicle.kinematics.turning_width_m(vehicle)])
+
+
+@dataclass(frozen=True)
+class _Steps:
+    """Steps of a command that is held.
+
+    Attributes:
+        start, end: stamp of the step, and end of the observation [s], shape (k,).
+        begin: start of the stretch without a gap [s], shape (k,).
+        follows_gap, follows_stop: whether it comes early in that, or after a command of zero, shape (k,).
+    """
+
+    start: Floats
+    end: Floats
+    begin: Floats
+    follows_gap: Flags
+    follows_stop: Flags
+
+
+def _list_steps(stamps: Floats, asked: Floats) -> _Steps:
+    """Steps of commanded speeds [m/s], shape (n, 3), at stamps [s]; none if commands are not repeated."""
+    period = float(np.median(np.diff(stamps)))
+    is_first = np.append(True, np.diff(stamps) > max(SILENT_S, PERIODS * period))
+    first = np.flatnonzero(is_first)
+    stretch = np.cumsum(is_first) - 1
+    jump = 1 + np.flatnonzero(np.abs(np.diff(asked, axis=0)).max(axis=1) > _STEP_MPS)
+    last = (np.append(first[1:], stamps.size) - 1)[stretch[jump]]
+    start = stamps[jump]
+    end = np.minimum(np.minimum(np.append(start[1:], np.inf), stamps[last]), start + _WATCHED_S)
+    held = (end - start >= _HELD_S) & (period <= _LATE_S)
+    stopped = (asked[jump - 1] == 0.0).all(axis=1)
+    begin = stamps[first[stretch[jump]]]
+    near = start - begin < _MEAN_S
+    return _Steps(start[held], end[held], begin[held], near[held], stopped[held])
+
+
+def _watch(steps: _Steps, wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats, Floats]:
+    """Measured responses, NaN where unknown, shape (k, 3) each.
+
+    Returns:
+        Speed before the step, speed at its end [m/s], and the area [m] between that and the measured one.
+    """
+    at = np.arange(-_MEAN_S, _WATCHED_S, _FINE_S)
+    times = steps.start[:, None] + at
+    seen = interpolate_wheels(times.ravel(), wheels, vehicle).velocity.reshape(*times.shape, 3)
+    seen *= _rims(vehicle)
+    inside = (times >= steps.begin[:, None] - ROUNDING_S) & (times < steps.end[:, None])
+    early, late = inside & (at < 0.5 * _FINE_S), inside & (times > steps.end[:, None] - _MEAN_S)
+    before, reached = (
+        np.where(rows[:, :, None], seen, 0.0).sum(axis=1) / rows.sum(axis=1)[:, None]
+        for rows in (early, late)
+    )
+    missing = np.where((inside & (at >= 0.0))[:, :, None], reached[:, None] - seen, 0.0)
+    return before, reached, _FINE_S * missing.sum(axis=1)
+
+
+def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: Flags) -> Floats:
+    """Mean response time beyond that of a step of the same kind [s], NaN where unknown, shape (k,).
+
+    The mean response time is the area over the change. It depends on the size of the step, on whether it
+    brakes or reverses, and on what changes beside it: robust regression over the steps in between, over all
+    where they are few. Speeds with a larger change count more.
+    """
+    change = reached - before
+    size, known = np.abs(change), np.isfinite(change).all(axis=1)
+    brakes = np.maximum(np.abs(before) - np.abs(reached), 0.0)
+    reverses = np.where(before * reached < 0.0, np.abs(before), 0.0)
+    total, weights = np.zeros(known.size), np.zeros(known.size)
+    for axis in range(3):
+        used = known & (size[:, axis] > _STEP_MPS)
+        if used.sum() < _FEWEST_RESPONSES:
+            continue
+        beside = size.sum(axis=1) - size[:, axis]
+        columns = (np.ones(known.size), size[:, axis], brakes[:, axis], reverses[:, axis], beside)
+        design, seconds = np.column_stack(columns)[used], area[used, axis] / change[used, axis]
+        usual = ~is_first[used]
+        if usual.sum() < _FEWEST_RESPONSES:
+            usual |= True
+        estimates, rest = fit_robustly(design[usual], seconds[usual])
+        late = seconds - design @ estimates
+        weight = 1.0 / ((1.0 + size[used, axis] ** -2.0) * max(robust_spread(rest), _FINE_S) ** 2)
+        total[used] += weight * late
+        weights[used] += weight
+    return np.where(weights > 0.0, total / np.maximum(weights, _FINE_S), np.nan)
 
 
 _FEW_REPEATS = 0.05

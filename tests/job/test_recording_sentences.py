@@ -147,7 +147,10 @@ def test_measured_wheels_keep_the_limits_that_are_told(analyzed: list[Analyzed])
     for one in analyzed:
         numbers, motion = one.numbers, one.read_motion()
         wheels = one.read("wheels").filter(pl.col("active"))
-        times, sides = wheels["t"].to_numpy(), (wheels["left"].to_numpy(), wheels["right"].to_numpy())
+        times, sides = (
+            wheels["t"].to_numpy(),
+            (wheels["left_aligned"].to_numpy(), wheels["right_aligned"].to_numpy()),
+        )
         # Single readings of a Husky's encoders are 6 % off: what lasts half a second counts.
         fastest = np.max([np.abs(average_sustained(times, side)) for side in sides], axis=0)
         turning = {
