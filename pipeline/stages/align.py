@@ -19,12 +19,8 @@ from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.drive_numbers import (
-    find_timeout,
-    interpolate_readings,
-    mark_late_starts,
-    report_timeout,
-)
+from pipeline.stages.drive import interpolate_readings
+from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs

@@ -5,21 +5,18 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
+import polars as pl
 from msgspec import structs
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, interpolate_repeats
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run.signals import LIVE_SHARE
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
 from pipeline.sources.configuration import OwnUnit
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, StageError, reading
-
-if TYPE_CHECKING:
-    import polars as pl
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
@@ -427,3 +424,31 @@ def read_speed(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats] |
         speed = 0.5 * vehicle.wheel_radius_m * (table["left"] + table["right"]).to_numpy()
     known = np.isfinite(speed)
     return (table["t"].to_numpy()[known], speed[known]) if known.sum() >= reading.FEWEST_MESSAGES else None
+
+
+_FEW_REPEATS = 0.05
+"""Share of readings between two others above which their repeats are reported, as of poses."""
+_SIGNALS = ("left", "right", "speed", "steering", "sideways")
+
+
+def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
+    """Table `wheels` with readings that are repeated interpolated, each side between its own readings."""
+    if wheels.is_empty():
+        return wheels, []
+    times = wheels["t"].to_numpy()
+    columns, periods, moved = {}, [0.0], np.zeros(times.size, dtype=bool)
+    for name in (name for name in _SIGNALS if name in wheels.columns):
+        values = wheels[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+        filled, period = interpolate_repeats(times, values)
+        columns[f"{name}_aligned"] = pl.Series(filled).fill_nan(None)
+        periods.append(period)
+        moved |= ~np.isclose(filled, values, equal_nan=True)
+    repeated = wheels.with_columns(**columns)
+    share = float(moved.mean())
+    if share <= _FEW_REPEATS:
+        return repeated, []
+    text = (
+        f"the encoders are read every {max(periods):.2g} s and each reading is repeated until the next one: "
+        "interpolated between readings"
+    )
+    return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]

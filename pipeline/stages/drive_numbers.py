@@ -1,8 +1,7 @@
-"""What a log tells of the drive beside slip: power, command time-out, late starts and encoder periods.
+"""What a log tells of the drive beside slip: power, command time-out and late starts.
 
 Power over time with energy per distance; how long the base moves after its last command, from gaps in the
-command topic; how late the drive follows its first command after a stop or a gap; encoder readings that are
-published repeatedly until the next one.
+command topic; how late the drive follows its first command after a stop or a gap.
 """
 
 from __future__ import annotations
@@ -24,7 +23,6 @@ from pipeline.core.arrays import (
     Floats,
     Ints,
     fit_robustly,
-    interpolate_repeats,
     nearest_indices,
     robust_spread,
 )
@@ -303,6 +301,8 @@ class _Run:
 
 _STEP_MPS = 0.3
 """Least change of a command [m/s at the wheels], and of the measured speed, that shows a response."""
+_STEADY = 0.1
+"""Largest change of a command that is held, relative to that."""
 _HELD_S = 1.2
 """Least time [s] for which the command is held: drives reach most of a new speed in less."""
 _WATCHED_S = 2.0
@@ -411,13 +411,21 @@ def _list_steps(stamps: Floats, asked: Floats) -> _Steps:
     is_first = np.append(True, np.diff(stamps) > max(SILENT_S, PERIODS * period))
     first = np.flatnonzero(is_first)
     stretch = np.cumsum(is_first) - 1
-    jump = 1 + np.flatnonzero(np.abs(np.diff(asked, axis=0)).max(axis=1) > _STEP_MPS)
-    last = (np.append(first[1:], stamps.size) - 1)[stretch[jump]]
-    start = stamps[jump]
+    size = np.abs(np.diff(asked, axis=0)).max(axis=1)
+    at = 1 + np.flatnonzero(size > _STEADY * _STEP_MPS)
+    last, begin = (np.append(first[1:], stamps.size) - 1)[stretch[at]], stamps[first[stretch[at]]]
+    start = stamps[at]
     end = np.minimum(np.minimum(np.append(start[1:], np.inf), stamps[last]), start + _WATCHED_S)
-    held = (end - start >= _HELD_S) & (period <= _LATE_S)
-    stopped = (asked[jump - 1] == 0.0).all(axis=1)
-    begin = stamps[first[stretch[jump]]]
+    before = np.append(-np.inf, start[:-1])
+    # Slow ramps are no change from one command to the next.
+    early = np.searchsorted(stamps, np.maximum(begin, start - _HELD_S) - ROUNDING_S)
+    late = np.searchsorted(stamps, end - ROUNDING_S) - 1
+    drift = np.maximum(
+        np.abs(asked[late] - asked[at]), np.abs(asked[at - 1] - asked[np.minimum(early, at - 1)])
+    )
+    held = (end - start >= _HELD_S) & ((start - before >= _HELD_S) | (before <= begin)) & (period <= _LATE_S)
+    held &= (size[at - 1] > _STEP_MPS) & (drift.max(axis=1) <= _STEADY * _STEP_MPS)
+    stopped = (asked[at - 1] == 0.0).all(axis=1)
     near = start - begin < _MEAN_S
     return _Steps(start[held], end[held], begin[held], near[held], stopped[held])
 
@@ -470,31 +478,3 @@ def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: F
         total[used] += weight * late
         weights[used] += weight
     return np.where(weights > 0.0, total / np.maximum(weights, _FINE_S), np.nan)
-
-
-_FEW_REPEATS = 0.05
-"""Share of readings between two others above which their repeats are reported, as of poses."""
-_SIGNALS = ("left", "right", "speed", "steering", "sideways")
-
-
-def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Finding]]:
-    """Table `wheels` with readings that are repeated interpolated, each side between its own readings."""
-    if wheels.is_empty():
-        return wheels, []
-    times = wheels["t"].to_numpy()
-    columns, periods, moved = {}, [0.0], np.zeros(times.size, dtype=bool)
-    for name in (name for name in _SIGNALS if name in wheels.columns):
-        values = wheels[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
-        filled, period = interpolate_repeats(times, values)
-        columns[f"{name}_aligned"] = pl.Series(filled).fill_nan(None)
-        periods.append(period)
-        moved |= ~np.isclose(filled, values, equal_nan=True)
-    repeated = wheels.with_columns(**columns)
-    share = float(moved.mean())
-    if share <= _FEW_REPEATS:
-        return repeated, []
-    text = (
-        f"the encoders are read every {max(periods):.2g} s and each reading is repeated until the next one: "
-        "interpolated between readings"
-    )
-    return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]

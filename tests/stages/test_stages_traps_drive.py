@@ -12,7 +12,7 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
-from pipeline.stages.drive_numbers import interpolate_readings
+from pipeline.stages.drive import interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
 
