@@ -69,7 +69,8 @@ POSE = {
 DRIVE = {**WHO, **TIMES, "left": 1.0, "right": 1.0, "speed": None, "steering": None, "active": True}
 WHEEL = {**DRIVE, "latency": 0.0}
 COMMAND = {
-    **DRIVE, "body_x": None, "body_w": None, "left_aligned": 1.0, "right_aligned": 1.0, "speed_aligned": None
+    **DRIVE, "body_x": None, "body_w": None, "left_aligned": 1.0, "right_aligned": 1.0, "speed_aligned": None,
+    "followed": True,
 }  # fmt: skip
 SLIP = {
     **WHO, "input": "command", "t": 0.0, "stamp": 1, "segment": 0, "step": 0, "transitory": False,
