@@ -363,7 +363,7 @@ def mark_late_starts(
         f"after {at.size} of {np.count_nonzero(steps.is_first)} stops or gaps the drive followed the first "
         f"command later than usual, by up to {longest:.2f} s: models apply these commands from then on"
     )
-    return marked, [Finding("late_start", "info", text, where="command", value=longest, count=at.size)]
+    return marked, [Finding("late_start", "warning", text, where="command", value=longest, count=at.size)]
 
 
 def measure_responses(commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle) -> Responses:
