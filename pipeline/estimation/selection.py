@@ -340,12 +340,12 @@ class Selection:
     ) -> Evidence:
         """Evidence for what could be added to a model, some effects left out; under a noise that is known.
 
-        Special cases of an effect of the model are left out, and effects that have no others: beside it they
+        Special cases of an effect of the model are left out, and other forms of some of them: beside it they
         share its work at random.
         """
-        cases = set[str]().union(*(effect.contains for effect in base.state.effects))
-        wider = (one.id for one in self.candidates if (own := one().contains) and cases.issuperset(own))
-        excluded = cases.union(without, wider)
+        cases = [{*effect.contains} for effect in base.state.effects]
+        forms = (one.id for one in self.candidates if any(set() < {*one().contains} < own for own in cases))
+        excluded = {*without, *forms}.union(*cases)
         candidates = [candidate for candidate in self.candidates if candidate.id not in excluded]
         return Evidence(self.part, base.fit, candidates, self.largest, noise)
 

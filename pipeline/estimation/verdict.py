@@ -189,7 +189,7 @@ def list_added(before: Content, after: Content) -> list[str]:
 def name_group(candidates: Sequence[str]) -> str:
     """Alternatives in words: `body inertia or lateral skid`; of many the first two, and how many more."""
     names = _list_names(candidates)
-    return " or ".join(filter(None, [", ".join(names[:-1]), names[-1]]))
+    return " or ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
 
 
 def _list_names(candidates: Sequence[str]) -> list[str]:

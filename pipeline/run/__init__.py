@@ -204,7 +204,7 @@ def make_run(
     Raises:
         MotionError: ``no_poses``.
     """
-    commands = _read_drive(_take_followed(tables.get("commands")), vehicle)
+    commands = _read_drive(tables.get("commands"), vehicle)
     wheels = _read_drive(tables.get("wheels"), vehicle)
     track = _read_track(tables["poses"], wheels, name)
     if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
@@ -218,6 +218,7 @@ def make_run(
     streams = np.unique(np.concatenate(stamps))
     if commands is not None and alignment.hold_s is not None:
         commands = _stop_when_silent(commands, alignment.hold_s)
+    commands = _take_followed(commands, tables.get("commands"))
     steps, excluded = _read_steps(tables.get("slip"), streams)
     terrains = tables["poses"]["terrain"] if "terrain" in tables["poses"].columns else None
     return MotionRun(
@@ -363,11 +364,12 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
     )
 
 
-def _take_followed(commands: pl.DataFrame | None) -> pl.DataFrame | None:
-    """The commands that the drive followed at their time; the others had no effect yet."""
-    return (
-        commands.filter("followed") if commands is not None and "followed" in commands.columns else commands
-    )
+def _take_followed(commands: DriveSeries | None, table: pl.DataFrame | None) -> DriveSeries | None:
+    """The commands without those that the drive did not follow yet: what it followed before is held."""
+    if commands is None or table is None or "followed" not in table.columns:
+        return commands
+    mask = ~np.isin(commands.times, table.filter(~table["followed"])["t"].to_numpy())
+    return commands.change(commands.times[mask], lambda signal: signal[mask])
 
 
 def read_wheel_times(table: pl.DataFrame) -> Floats:

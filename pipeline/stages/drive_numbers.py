@@ -296,8 +296,8 @@ class _Run:
         return float(times[reached - 1] + share * (times[reached] - times[reached - 1]) - start), was
 
 
-# A drive that was stopped or released follows its next command later than others, each time by another time:
-# a safety switch, a brake or a radio link comes first. That time is no property of the motion.
+# A drive that was stopped or released may follow its next command late, by a different delay each time: a
+# safety switch, a brake or a radio link comes first. That delay is no property of the motion.
 
 _STEP_MPS = 0.3
 """Least change of a command [m/s at the wheels], and of the measured speed, that shows a response."""
@@ -328,12 +328,25 @@ class Responses:
     Attributes:
         start: stamp of the step [s], shape (k,).
         late: mean response time beyond the usual one of a step of its kind [s], shape (k,).
-        is_first: whether it is the first one after a stop or a gap, shape (k,).
+        is_first: whether it is the first one after a stop or a gap in the commands, shape (k,).
+        size: change of the measured speed [m/s], shape (k,).
     """
 
     start: Floats
     late: Floats
     is_first: Flags
+    size: Floats
+
+    def find_late(self) -> Ints:
+        """Indices of late starts; none if they are alike, or depend on the step's size as by friction."""
+        at = np.flatnonzero(self.is_first & (self.late > _LATE_S))
+        if at.size < _FEWEST:
+            return at[:0]
+        late, rows = self.late[self.is_first], np.ones((np.count_nonzero(self.is_first), 2))
+        rows[:, 1] = 1.0 / self.size[self.is_first]
+        by_size = late - rows @ np.linalg.lstsq(rows, late, rcond=None)[0]
+        spread = min(float(np.std(self.late[at])), float(np.std(by_size)))
+        return at if spread >= _REGULAR * float(np.mean(self.late[at])) else at[:0]
 
 
 def mark_late_starts(
@@ -342,45 +355,46 @@ def mark_late_starts(
     """Table `commands` with those that the drive did not follow yet, the first ones after a stop or a gap.
 
     Args:
-        commands: table `commands`, aligned; of commands that are not repeated none is marked.
+        commands: table `commands`, aligned; of commands that are repeated less often than every 0.15 s, and
+            of vehicles that steer, none is marked.
         wheels: table `wheels`.
         vehicle: for the ideal model.
     """
     if commands.is_empty():
         return commands, []
     steps = measure_responses(commands, wheels, vehicle)
-    at = np.flatnonzero(steps.is_first & (steps.late > _LATE_S))
-    if at.size < _FEWEST or np.std(steps.late[at]) < _REGULAR * np.mean(steps.late[at]):
-        at = at[:0]
-    followed = pl.lit(value=True)
-    for first, seconds in zip(steps.start[at].tolist(), steps.late[at].tolist(), strict=True):
-        followed &= ~pl.col("t").is_between(first, first + seconds, closed="left")
-    marked = commands.with_columns(followed.alias("followed"))
+    at, stamps = steps.find_late(), commands["t"].to_numpy()
+    until = np.append(-np.inf, np.maximum.accumulate(steps.start[at] + steps.late[at]))
+    followed = stamps >= until[np.searchsorted(steps.start[at], stamps, side="right")]
+    marked = commands.with_columns(pl.Series("followed", followed))
     if not at.size:
         return marked, []
     longest = float(steps.late[at].max())
     text = (
-        f"after {at.size} of {np.count_nonzero(steps.is_first)} stops or gaps the drive followed the first "
-        f"command later than usual, by up to {longest:.2f} s: models apply these commands from then on"
+        f"the drive followed the first command after a stop or gap late in {at.size} of "
+        f"{np.count_nonzero(steps.is_first)} starts that could be judged, by up to {longest:.2f} s: models "
+        "apply these commands from then on"
     )
     return marked, [Finding("late_start", "warning", text, where="command", value=longest, count=at.size)]
 
 
 def measure_responses(commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle) -> Responses:
     """Steps whose response is known; see `mark_late_starts`."""
-    none = Responses(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool))
-    if min(commands.height, wheels.height) < _FEWEST:
+    none = Responses(np.zeros(0), np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0))
+    if min(commands.height, wheels.height) < _FEWEST or vehicle.kinematics.has_inputs("steering"):
         return none
-    stamps = commands["t"].to_numpy()
-    steps = _list_steps(stamps, hold_commands(stamps, commands, vehicle, math.inf).velocity * _rims(vehicle))
+    stamps, active = commands["t"].to_numpy(), commands["active"].to_numpy()
+    asked = hold_commands(stamps, commands, vehicle, math.inf).velocity * _rims(vehicle)
+    steps = _list_steps(stamps, asked, active)
     if steps.start.size < _FEWEST_RESPONSES:
         return none
     before, reached, area = _watch(steps, wheels, vehicle)
     stands = (np.abs(before) < _STANDING_MPS).all(axis=1)
-    is_first = steps.follows_gap | (steps.follows_stop & stands)
+    is_first = np.asarray(steps.follows_gap | (steps.follows_stop & stands))
     late = _measure_lateness(before, reached, area, is_first)
     known = np.isfinite(late)
-    return Responses(steps.start[known], late[known], is_first[known])
+    size = np.abs(reached - before).max(axis=1)
+    return Responses(steps.start[known], late[known], is_first[known], size[known])
 
 
 def _rims(vehicle: Vehicle) -> Floats:
@@ -405,10 +419,10 @@ class _Steps:
     follows_stop: Flags
 
 
-def _list_steps(stamps: Floats, asked: Floats) -> _Steps:
-    """Steps of commanded speeds [m/s], shape (n, 3), at stamps [s]; none if commands are not repeated."""
+def _list_steps(stamps: Floats, asked: Floats, active: Flags) -> _Steps:
+    """Steps of active commands [m/s], shape (n, 3), at stamps [s]; none if commands are not repeated."""
     period = float(np.median(np.diff(stamps)))
-    is_first = np.append(True, np.diff(stamps) > max(SILENT_S, PERIODS * period))
+    is_first = np.append(True, (np.diff(stamps) > max(SILENT_S, PERIODS * period)) | np.diff(active))
     first = np.flatnonzero(is_first)
     stretch = np.cumsum(is_first) - 1
     size = np.abs(np.diff(asked, axis=0)).max(axis=1)
@@ -424,8 +438,8 @@ def _list_steps(stamps: Floats, asked: Floats) -> _Steps:
         np.abs(asked[late] - asked[at]), np.abs(asked[at - 1] - asked[np.minimum(early, at - 1)])
     )
     held = (end - start >= _HELD_S) & ((start - before >= _HELD_S) | (before <= begin)) & (period <= _LATE_S)
-    held &= (size[at - 1] > _STEP_MPS) & (drift.max(axis=1) <= _STEADY * _STEP_MPS)
-    stopped = (asked[at - 1] == 0.0).all(axis=1)
+    held &= (size[at - 1] > _STEP_MPS) & (drift.max(axis=1) <= _STEADY * _STEP_MPS) & active[at]
+    stopped = np.abs(asked[at - 1]).max(axis=1) < _STANDING_MPS
     near = start - begin < _MEAN_S
     return _Steps(start[held], end[held], begin[held], near[held], stopped[held])
 
@@ -455,7 +469,7 @@ def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: F
 
     The mean response time is the area over the change. It depends on the size of the step, on whether it
     brakes or reverses, and on what changes beside it: robust regression over the steps in between, over all
-    where they are few. Speeds with a larger change count more.
+    where few of them speed up. Speeds with a larger change count more.
     """
     change = reached - before
     size, known = np.abs(change), np.isfinite(change).all(axis=1)
@@ -470,7 +484,8 @@ def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: F
         columns = (np.ones(known.size), size[:, axis], brakes[:, axis], reverses[:, axis], beside)
         design, seconds = np.column_stack(columns)[used], area[used, axis] / change[used, axis]
         usual = ~is_first[used]
-        if usual.sum() < _FEWEST_RESPONSES:
+        # Brakings alone do not tell how long a start takes.
+        if (usual & (brakes[used, axis] == 0.0)).sum() < _FEWEST_RESPONSES:
             usual |= True
         estimates, rest = fit_robustly(design[usual], seconds[usual])
         late = seconds - design @ estimates

@@ -139,8 +139,8 @@ def compute_velocities(
     table, skipped = differentiate_poses(poses, settings, where=where)
     findings = []
     if skipped:
-        are = "segment is" if skipped == 1 else "segments are"
-        text = f"{skipped} {are} shorter than {SPAN_S} s or hold one pose: left out"
+        are, hold = ("segment is", "holds") if skipped == 1 else ("segments are", "hold")
+        text = f"{skipped} {are} shorter than {SPAN_S} s or {hold} one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
     rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (

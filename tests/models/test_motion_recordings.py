@@ -49,8 +49,8 @@ REACHED = {
     # With the ages of poses from the path; `wheel_servo` in place of the lags reaches .03 in R.
     ("warthog_wheels_grass_2024_8_8_16h19s23", C): (0.292, 0.422, 0.245, 0.205, 0.125, 0.125),
 }
-# Channels that stay further than ten percent above the table of METHODS section 5. Readings of a Husky that are
-# linear in between cost it 3 % in x on tile, and 8 % in w on wet grass, where nothing dates the poses.
+# Channels that stay further than ten percent above the table of METHODS section 5. Readings of a Husky that
+# are linear in between cost it 3 % in x on tile, and 8 % in w on wet grass, where nothing dates the poses.
 BEYOND = {
     ("husky_wheels-deflated_tile_2023_12_12_16h16", M): "x",
     ("husky_wheels-deflated_tile_2023_12_12_16h16", C): "x",
