@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95
+from pipeline.core import NORMAL_95, rigid
 from pipeline.core.arrays import (
     PERIODS,
     ROUNDING_S,
@@ -342,8 +342,8 @@ class Responses:
         at = np.flatnonzero(self.is_first & (self.late > _LATE_S))
         if at.size < _FEWEST:
             return at[:0]
-        late, rows = self.late[self.is_first], np.ones((np.count_nonzero(self.is_first), 2))
-        rows[:, 1] = 1.0 / self.size[self.is_first]
+        late, inverse = self.late[self.is_first], 1.0 / self.size[self.is_first]
+        rows = np.column_stack((np.ones_like(late), inverse))
         by_size = late - rows @ np.linalg.lstsq(rows, late, rcond=None)[0]
         spread = min(float(np.std(self.late[at])), float(np.std(by_size)))
         return at if spread >= _REGULAR * float(np.mean(self.late[at])) else at[:0]
@@ -422,9 +422,8 @@ class _Steps:
 def _list_steps(stamps: Floats, asked: Floats, active: Flags) -> _Steps:
     """Steps of active commands [m/s], shape (n, 3), at stamps [s]; none if commands are not repeated."""
     period = float(np.median(np.diff(stamps)))
-    is_first = np.append(True, (np.diff(stamps) > max(SILENT_S, PERIODS * period)) | np.diff(active))
-    first = np.flatnonzero(is_first)
-    stretch = np.cumsum(is_first) - 1
+    breaks = rigid.find_gaps(stamps, max(SILENT_S, PERIODS * period)) | np.diff(active, prepend=active[:1])
+    first, stretch = np.append(0, np.flatnonzero(breaks)), rigid.number_segments(breaks)
     size = np.abs(np.diff(asked, axis=0)).max(axis=1)
     at = 1 + np.flatnonzero(size > _STEADY * _STEP_MPS)
     last, begin = (np.append(first[1:], stamps.size) - 1)[stretch[at]], stamps[first[stretch[at]]]
@@ -486,10 +485,12 @@ def _measure_lateness(before: Floats, reached: Floats, area: Floats, is_first: F
         usual = ~is_first[used]
         # Brakings alone do not tell how long a start takes.
         if (usual & (brakes[used, axis] == 0.0)).sum() < _FEWEST_RESPONSES:
-            usual |= True
+            usual = np.ones_like(usual)
         estimates, rest = fit_robustly(design[usual], seconds[usual])
         late = seconds - design @ estimates
         weight = 1.0 / ((1.0 + size[used, axis] ** -2.0) * max(robust_spread(rest), _FINE_S) ** 2)
         total[used] += weight * late
         weights[used] += weight
-    return np.where(weights > 0.0, total / np.maximum(weights, _FINE_S), np.nan)
+    late = np.full(known.size, np.nan)
+    np.divide(total, weights, out=late, where=weights > 0.0)
+    return late

@@ -1,4 +1,4 @@
-"""Starts that the drive follows late, by another time each: marked, taken from then on, and told."""
+"""Starts that the drive follows late, by a different delay each: marked, applied late, and reported."""
 
 from __future__ import annotations
 
