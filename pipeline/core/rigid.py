@@ -212,6 +212,23 @@ def select_fresh_poses(times: Floats, held: Flags) -> Ints:
     return np.flatnonzero(~held | (stands & ~old_again)).astype(np.int64)
 
 
+def find_waits(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
+    """Short repeats of a pose while wheels turn: a localization that waits.
+
+    Args:
+        times: stamps of a segment's poses [s], shape (n,).
+        held: whether each pose repeats the previous one, shape (n,).
+        wheel_times: stamps of measured wheels [s], shape (m,).
+        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
+    """
+    waits = np.zeros(times.size, dtype=bool)
+    first, end = np.array(find_runs(held), dtype=np.int64).reshape(-1, 2).T
+    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
+    mostly = 2 * (turned[high] - turned[low]) > high - low
+    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= LONGEST_WAIT_S), end - first)
+    return waits
+
+
 def find_jumps(
     times: Floats, position: Floats, quaternion: Floats, *, metres: float, radians: float
 ) -> Flags:

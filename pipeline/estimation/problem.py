@@ -66,10 +66,13 @@ def predict_from(
     yaw = np.interp(at, index, turned).reshape(start_times.size, since.size)
     path = np.interp(at, index, travelled.real) + 1j * np.interp(at, index, travelled.imag)
     path = path.reshape(yaw.shape)
-    turn = np.exp(1j * (start[:, 2] - yaw[:, 0]))
-    moved = turn[:, None] * (path - path[:, :1])
-    x, y, heading = start[:, :1] + moved.real, start[:, 1:2] + moved.imag, start[:, 2:] + yaw - yaw[:, :1]
-    return Prediction(start_times, np.stack((x, y, heading), axis=-1), since)
+    origin = comparison.run.origin
+    turned = start[:, 2:] + yaw - yaw[:, :1] + origin.heading
+    turn = np.exp(1j * (start[:, 2] - yaw[:, 0] + origin.heading))
+    begin = origin.put_back(start[:, 0] + 1j * start[:, 1])
+    along = begin[:, None] + turn[:, None] * (path - path[:, :1])
+    poses = np.stack((along.real, along.imag, turned), axis=-1)
+    return Prediction(start_times + origin.time_s, poses, since)
 
 
 def predict_at(model: Model, run: MotionRun, source: Input, at: Floats) -> Floats:
@@ -103,6 +106,7 @@ def predict_at_from(comparison: Comparison, effects: Sequence[Effect], timing: T
     """
     velocity = comparison.predict_velocity(effects, timing)
     grid = comparison.grid
+    at = at - comparison.run.origin.time_s
     columns = [np.interp(at, grid.times, values) for values in (velocity.x, velocity.y, velocity.w)]
     predicted = np.column_stack(columns)
     predicted[grid.find_span(at) < 0] = np.nan
@@ -152,7 +156,7 @@ class Problem:
         *,
         heading: HeadingSource = HeadingSource.AUTO,
     ) -> None:
-        self.runs = tuple(runs)
+        self.runs = tuple(run.anchored for run in runs)
         self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source
         self.heading = heading

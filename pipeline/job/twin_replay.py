@@ -452,8 +452,8 @@ class _Replay:
 
     def _draw_paths(self) -> pl.DataFrame:
         timing = self.fitted.state.timing[0]
-        track = self.comparison.run.track
-        frames = [_tabulate_track(track.times, track.path)]
+        track, origin = self.comparison.run.track, self.comparison.run.origin
+        frames = [_tabulate_track(track.times + origin.time_s, origin.put_back(track.path))]
         sides = {"ideal": (), "model": self.effects, "twin": make_twin_effects(self.body)}
         for side, effects in sides.items():
             made = predict_from(self.comparison, effects, timing, rate_hz=10.0)
@@ -464,11 +464,12 @@ class _Replay:
         horizons = self.comparison.horizons
         first = np.unique(horizons.number, return_index=True)[1]
         count = np.maximum(np.bincount(horizons.number), 1)
+        times = horizons.times[first, 0] + self.comparison.run.origin.time_s
         frames = []
         for side in SIDES:
             squares = np.bincount(horizons.number, np.nan_to_num(position[side]) ** 2) / count
             values = np.sqrt(squares)[np.unique(horizons.number)]
-            frames.append(pl.DataFrame({"t": horizons.times[first, 0], "value": values, "series": side}))
+            frames.append(pl.DataFrame({"t": times, "value": values, "series": side}))
         return pl.concat(frames)
 
 

@@ -193,7 +193,7 @@ class MotionStage:
         effects, timing = state.effects_of(0), state.timing[0]
         residuals = pl.DataFrame(
             {
-                "t": comparison.windows.times.mean(axis=1),
+                "t": comparison.windows.times.mean(axis=1) + comparison.run.origin.time_s,
                 **{f"ideal_{name}": ideal[:, i] for i, name in enumerate(COMPONENTS)},
                 **{f"model_{name}": model[:, i] for i, name in enumerate(COMPONENTS)},
                 **self._signals,
@@ -220,7 +220,7 @@ class MotionStage:
         columns = {f"v_{name}": getattr(velocity, name)[picked] for name in COMPONENTS}
         return pl.DataFrame(
             {
-                "t": grid.times[picked],
+                "t": grid.times[picked] + self._comparison.run.origin.time_s,
                 "piece": grid.span[picked].astype(np.int32),
                 **columns,
             }
@@ -234,7 +234,7 @@ class MotionStage:
             return np.asarray(np.sqrt(np.bincount(horizons.number, errors**2) / count), dtype=np.float64)
 
         first = np.unique(horizons.number, return_index=True)[1]
-        times = horizons.times[first, 0]
+        times = horizons.times[first, 0] + self._comparison.run.origin.time_s
         present = np.unique(horizons.number)
         broken = np.diff(times, prepend=times[:1]) > _BROKEN_S
         return pl.DataFrame(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.core import SlipError, arrays, rigid
 from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
-from pipeline.run.signals import DriveSeries, find_fastest_wheel
+from pipeline.run.signals import DriveSeries, find_fastest_wheel, round_off
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -117,6 +117,26 @@ class Alignment:
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Where an anchored run has its zero.
+
+    Attributes:
+        time_s: in the time of the log [s].
+        place: x + iy in the plane of the track as recorded [m].
+        heading: there [rad].
+    """
+
+    time_s: float = 0.0
+    place: complex = 0j
+    heading: float = 0.0
+
+    def put_back(self, path: Complex) -> Complex:
+        """Places of an anchored run [m] in the plane as recorded."""
+        recorded: Complex = self.place + np.exp(1j * self.heading) * path
+        return recorded
+
+
+@dataclass(frozen=True)
 class MotionRun:
     """One run.
 
@@ -136,6 +156,7 @@ class MotionRun:
         repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
             if each is new.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
+        origin: where its zero lies in the recording, see `anchored`.
     """
 
     name: str
@@ -152,6 +173,58 @@ class MotionRun:
     alignment: Alignment
     repeats_s: float = 0.0
     is_on_course: bool = False
+    origin: Origin = Origin()
+
+    @property
+    def anchored(self) -> MotionRun:
+        """The run in times from its start, and in a plane from its first pose, in steps of a millionth.
+
+        A search amplifies rounding. Equal drives give equal answers this way, wherever their map lies and
+        whenever the recorder was started. Yaw and position in the map remain as they are.
+        """
+        track, alignment, gyro = self.track, self.alignment, self.alignment.gyro
+        start, heading = self.start_s, float(track.heading[0])
+        path = (track.path - track.path[0]) * np.exp(-1j * heading)
+        path = round_off(path.real) + 1j * round_off(path.imag)
+        delays = np.array((alignment.heading_delay_s, alignment.wheel_delay_s, alignment.latency_spread_s))
+        late, late_wheels, spread = round_off(delays).tolist()
+        if gyro is not None:
+            gyro = GyroFit(*round_off(np.array([*vars(gyro).values()])).tolist())
+
+        def shift(times: Floats) -> Floats:
+            return round_off(times - start)
+
+        def anchor(series: DriveSeries | None) -> DriveSeries | None:
+            return None if series is None else series.change(shift(series.times), round_off)
+
+        return replace(
+            self,
+            commands=anchor(self.commands),
+            wheels=anchor(self.wheels),
+            gyro=None if self.gyro is None else (shift(self.gyro[0]), self.gyro[1]),
+            track=replace(
+                track,
+                times=shift(track.times),
+                path=path,
+                heading=round_off(track.heading - heading),
+                attitude=np.column_stack((round_off(track.attitude[:, :2]), track.attitude[:, 2])),
+            ),
+            streams=shift(self.streams),
+            step_starts=shift(self.step_starts),
+            excluded=shift(self.excluded),
+            alignment=replace(
+                alignment,
+                gyro=gyro,
+                heading_delay_s=late,
+                wheel_delay_s=late_wheels,
+                latency_spread_s=spread,
+            ),
+            origin=Origin(
+                self.origin.time_s + start,
+                complex(self.origin.put_back(track.path[:1])[0]),
+                self.origin.heading + heading,
+            ),
+        )
 
     @property
     def start_s(self) -> float:
@@ -308,7 +381,7 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
         times, held = piece["t"], piece["held"]
         fresh = rigid.select_fresh_poses(times, held)
         if wheels is not None:
-            fresh = fresh[~_waits_in_motion(times, held, wheels.times, turned)[fresh]]
+            fresh = fresh[~rigid.find_waits(times, held, wheels.times, turned)[fresh]]
         fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
             fresh_columns = {column: values[fresh] for column, values in piece.items()}
@@ -319,23 +392,6 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
     return Track(
         *(np.concatenate([getattr(part, field) for part in parts]) for field in Track.__dataclass_fields__)
     )
-
-
-def _waits_in_motion(times: Floats, held: Flags, wheel_times: Floats, turned: Ints) -> Flags:
-    """Short repeats of a pose while wheels turn: a localization that waits.
-
-    Args:
-        times: stamps of a segment's poses [s], shape (n,).
-        held: whether each pose repeats the previous one, shape (n,).
-        wheel_times: stamps of measured wheels [s], shape (m,).
-        turned: number of samples with turning wheels before each stamp, and in total, shape (m + 1,).
-    """
-    waits = np.zeros(times.size, dtype=bool)
-    first, end = np.array(rigid.find_runs(held), dtype=np.int64).reshape(-1, 2).T
-    low, high = np.searchsorted(wheel_times, (times[np.maximum(first - 1, 0)], times[end - 1]))
-    mostly = 2 * (turned[high] - turned[low]) > high - low
-    waits[held] = np.repeat(mostly & (times[end - 1] - times[first] <= rigid.LONGEST_WAIT_S), end - first)
-    return waits
 
 
 def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:

@@ -28,6 +28,18 @@ Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
+_STEPS = 2.0**20
+"""Steps of a second, a metre, a radian: a millionth is less than any sensor resolves, and a million times
+the rounding of positions in a map."""
+_OFF_TIE = 0.37
+"""Share of a step added before rounding down: with a half, values of few digits might go either way."""
+
+
+def round_off(values: Floats) -> Floats:
+    """Values in steps of a millionth: what differs by the rounding of sums alone becomes equal."""
+    rounded: Floats = np.floor(values * _STEPS + _OFF_TIE) / _STEPS
+    return rounded
+
 
 @dataclass(frozen=True)
 class DriveSeries:
@@ -226,7 +238,7 @@ class RunContext:
         """x, y [m] and yaw [rad] in the frame of the first pose, independent of the map, shape (n, 3)."""
         yaw = self.attitude[:, 2] - self.attitude[0, 2]
         moved = (self.position - self.position[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
-        return np.column_stack((moved.real, moved.imag, yaw))
+        return round_off(np.column_stack((moved.real, moved.imag, yaw)))
 
     @property
     def slope_rad(self) -> float:

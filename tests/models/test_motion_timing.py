@@ -10,8 +10,10 @@ import polars as pl
 import pytest
 from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
 
+from pipeline.core import rigid
 from pipeline.core.arrays import nearest_indices
 from pipeline.estimation import Comparison, Input, Problem, fit_model
+from pipeline.estimation.problem import predict_from
 from pipeline.models import Model, find_effect
 from pipeline.run import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run
@@ -205,3 +207,42 @@ def test_the_delay_of_the_encoders_is_measured_against_the_gyro(
     assert (run.alignment.wheel_delay_s > 0.0) == (late > 0.0)
     assert late - 0.02 < run.alignment.wheel_delay_s + left < late + 0.045
     assert abs(left) < 0.03
+
+
+_MOVED, _TURNED, _LATER_S = 100.0 - 50.0j, 1.2, 12.8
+
+
+def _move(frame: pl.DataFrame) -> pl.DataFrame:
+    """Poses in another map."""
+    place = (frame["x"].to_numpy() + 1j * frame["y"].to_numpy()) * np.exp(1j * _TURNED) + _MOVED
+    quaternion = frame.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    turn = np.tile(rigid.quaternions_from_yaw(np.array([_TURNED])), (frame.height, 1))
+    turned = rigid.multiply_quaternions(turn, quaternion)
+    columns = {f"q_{name}": turned[:, index] for index, name in enumerate("xyzw")}
+    return frame.with_columns(**{"x": place.real, "y": place.imag, **columns})
+
+
+def test_a_fit_is_the_same_to_the_last_bit_wherever_the_map_lies_and_whenever_it_started(
+    tables: Mapping[str, pl.DataFrame],
+) -> None:
+    stamped = {name: tables[name] for name in ("poses", "commands", "wheels", "imu", "slip")}
+    later = {name: frame.with_columns(pl.col("t") + _LATER_S) for name, frame in stamped.items()}
+    moved = {**tables, **later, "poses": _move(later["poses"])}
+    recorded = load_run(tables, HUSKY, name="recorded")
+    problem, other = (
+        Problem([run], HUSKY, Input.COMMAND) for run in (recorded, load_run(moved, HUSKY, name="moved"))
+    )
+    model = Model(HUSKY, tuple(find_effect(name)() for name in SKID))
+    fitted = fit_model(problem, model, exact=True)
+    assert np.array_equal(fit_model(other, model, exact=True).residuals, fitted.residuals)
+    assert np.array_equal(recorded.anchored.anchored.track.path, problem.runs[0].track.path)
+    assert recorded.anchored.anchored.origin == problem.runs[0].origin
+
+    effects, timing = fitted.state.effects, fitted.state.timing[0]
+    one, two = (predict_from(each.comparisons[0], effects, timing) for each in (problem, other))
+    assert np.allclose(one.start_times + _LATER_S, two.start_times)
+    path, beyond = (made.poses[..., 0] + 1j * made.poses[..., 1] for made in (one, two))
+    assert np.allclose(path * np.exp(1j * _TURNED) + _MOVED, beyond)
+    assert np.allclose(one.poses[..., 2] + _TURNED, two.poses[..., 2])
+    plain = predict_from(Comparison(recorded, HUSKY, Input.COMMAND), effects, timing)
+    assert np.allclose(plain.poses, one.poses, atol=1e-4)

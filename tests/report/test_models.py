@@ -13,6 +13,7 @@ from pipeline.core.untrusted import objects_in
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.ladder import format_rises
+from pipeline.estimation.problem import predict_at_from
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
 from pipeline.report.figures.model_figures import list_ladder_steps, list_parts
 from pipeline.report.figures.residual_figures import choose_signal, draw_autocorrelation
@@ -164,15 +165,16 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     run = load_run(tables, vehicle(), name="run")
     model = Model(vehicle(), (find_effect("effective_track")(k=1.7),))
     places = manifest.read("velocities").select("t", "x", "y")
-    view = MotionStage(Problem([run], vehicle(), Input.COMMAND), places).view(
-        State(model.effects, (Timing(),)), (), None
-    )
-    comparison = Comparison(run, vehicle(), Input.COMMAND)
-    velocity = comparison.predict_velocity(model.effects, Timing())
+    problem = Problem([run], vehicle(), Input.COMMAND)
+    view = MotionStage(problem, places).view(State(model.effects, (Timing(),)), (), None)
 
     shown = view.velocity.sort("t")
-    expected = np.interp(shown["t"], comparison.grid.times, velocity.w)
-    assert np.allclose(shown["v_w"], expected, atol=1e-9)
+    at = shown["t"].to_numpy()
+    expected = predict_at_from(problem.comparisons[0], model.effects, Timing(), at)
+    assert np.allclose(shown["v_w"], expected[:, 2], atol=1e-9)
+    # The problem's run is anchored, see `MotionRun.anchored`.
+    recorded = predict_at_from(Comparison(run, vehicle(), Input.COMMAND), model.effects, Timing(), at)
+    assert np.allclose(expected, recorded, atol=1e-4, equal_nan=True)
     starts = view.arcs.group_by("piece", maintain_order=True).first()
     for axis in "xy":
         at = np.interp(starts["t"], places["t"], places[axis])
