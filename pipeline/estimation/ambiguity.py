@@ -1,5 +1,7 @@
 """Explanations that fit as well as the chosen one, and the choice among them."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -9,7 +11,7 @@ import numpy as np
 from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
-from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.fit import Fitted, PartFit, fit_model
 from pipeline.estimation.folds import hold_out
 from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.ladder import Judgement
@@ -88,39 +90,63 @@ def choose_reaching(
         undecided: the groups, the identified effect first in each.
 
     Returns:
-        The effects, and the groups with the chosen one first, without those that predict far worse; a group
-        with no alternative is dropped.
+        The effects, and the groups with the chosen one first, without those that predict far worse, or that
+        another part of the path contradicts (a lag of the body beside late encoders is no alternative where
+        the wheels follow their commands at once); a group with no alternative is dropped.
     """
-    chosen, groups, error = list(effects), list[Undecided](), math.nan
+    chosen, groups, best = list(effects), list[Undecided](), None
     for item in undecided:
         first, *others = item.candidates
         here = next((index for index, effect in enumerate(chosen) if effect.id == first), None)
-        reached = dict[str, float]()
+        reached = dict[str, _Reached]()
         for name in others if here is not None else ():
             if name not in item.numbers or any(effect.id == name for effect in chosen):
                 continue
-            if math.isnan(error):
-                error = _measure_horizon_error(problem, chosen)
-            reached.setdefault(first, error)
+            best = best or _measure_reached(problem, chosen)
+            reached.setdefault(first, best)
             values = {key: value.value for key, value in item.numbers[name].items()}
             swapped = [*chosen[:here], find_effect(name)().change(**values), *chosen[here + 1 :]]  # type: ignore[operator]
-            reached[name] = _measure_horizon_error(problem, swapped)
-            if reached[name] < (1.0 - _REACHES) * error:
-                chosen, error, first = swapped, reached[name], name
-        worse = {name for name, one in reached.items() if one > _FAR_WORSE * error}
+            reached[name] = other = _measure_reached(problem, swapped)
+            is_better = other.error < (1.0 - _REACHES) * best.error or best.is_far_worse(other)
+            if is_better and not other.is_far_worse(best):
+                chosen, best, first = swapped, other, name
+        worse = {name for name, one in reached.items() if best is not None and one.is_far_worse(best)}
         rest = [name for name in item.candidates if name != first and name not in worse]
         if rest:
             groups.append(replace(item, candidates=(first, *rest)))
     return chosen, groups
 
 
-def _measure_horizon_error(problem: Problem, effects: Sequence[Effect]) -> float:
-    """Geometric mean of the held-out errors of position and heading over 2 s; infinite where unknown."""
+@dataclass(frozen=True)
+class _Reached:
+    """How well a model predicts.
+
+    Attributes:
+        error: geometric mean of the held-out errors of position and heading over 2 s; infinite where unknown.
+        fits: its fit to every part of the path.
+    """
+
+    error: float
+    fits: tuple[PartFit, ...] = ()
+
+    def is_far_worse(self, best: _Reached) -> bool:
+        """Whether it predicts far worse than another model, or does so in a part of the path."""
+        if self.error > _FAR_WORSE * best.error:
+            return True
+        # Losses are squares of errors.
+        return any(
+            one.weights.loss(own.residual) > _FAR_WORSE**2 * one.weights.loss(one.residual)
+            for own, one in zip(self.fits, best.fits, strict=False)
+        )
+
+
+def _measure_reached(problem: Problem, effects: Sequence[Effect]) -> _Reached:
     try:
-        errors = hold_out(problem, fit_model(problem, Model(problem.vehicle, tuple(effects)))).pooled
+        fitted = fit_model(problem, Model(problem.vehicle, tuple(effects)))
+        errors = hold_out(problem, fitted).pooled
     except MotionError:
-        return math.inf
-    return math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad)
+        return _Reached(math.inf)
+    return _Reached(math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad), fitted.fits)
 
 
 def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:

@@ -494,7 +494,7 @@ def _make_possible(effect: Effect, conditions: Conditions) -> Effect:
 
 
 def _make_sound(selection: Selection, model: CandidateModel) -> CandidateModel:
-    """The model without effects that may not be named, fitted anew."""
-    while gone := [one.id for one in model.state.effects if not selection.may_stay(one, model.state)]:
-        model = selection.drop(model, gone)
+    """The model with the simpler forms of effects that may not be named, or without them, fitted anew."""
+    while reduced := selection.reduce(model.state):
+        model = selection.enter(reduced)
     return model

@@ -434,25 +434,25 @@ class Selection:
         if set(model.ids) <= set(base.ids) or not self.is_sound(model):
             return False
         rival = models.get(model.ids)
-        if rival is None or self.loss(model) < self.loss(rival):
-            models[model.ids] = model
+        models[model.ids] = model if rival is None else min(rival, model, key=self.loss)
         return True
 
     def _simplify(self, model: CandidateModel, base: CandidateModel) -> CandidateModel:
         """An extension without effects that a new one makes superfluous, or with their simpler forms.
 
         Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
-        at nothing, and the model with both says less than the one without it. Where nothing new would be left
-        the extension stays as it is, and is not named.
+        at nothing. Where nothing new would be left the extension stays as it is, and is not named.
         """
-        gone = [effect for effect in model.state.effects if not self.may_stay(effect, model.state)]
-        if not gone:
-            return model
-        known = {candidate.id for candidate in self.candidates} - set(model.ids)
-        simpler = [one for one in (effect.collapse() for effect in gone) if one is not None]
-        reduced = model.state.drop([effect.id for effect in gone])
-        reduced = reduced.add(*(one for one in simpler if one.id in known))
-        return model if set(reduced.ids) <= set(base.ids) else self.enter(reduced)
+        reduced = self.reduce(model.state)
+        return model if reduced is None or set(reduced.ids) <= set(base.ids) else self.enter(reduced)
+
+    def reduce(self, state: State) -> State | None:
+        """The state with the simpler forms of effects that may not be named; None if all may be."""
+        gone = [effect for effect in state.effects if not self.may_stay(effect, state)]
+        reduced = state.drop([effect.id for effect in gone])
+        known = {candidate.id for candidate in self.candidates} - set(reduced.ids)
+        simpler = (effect.collapse() for effect in gone)
+        return reduced.add(*(one for one in simpler if one and one.id in known)) if gone else None
 
     def is_sound(self, model: CandidateModel) -> bool:
         """Whether every effect is large enough to be named, and no degenerate form of another."""
