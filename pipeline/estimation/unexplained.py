@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.core.arrays import Bytes, Flags, Floats, student_quantile
 from pipeline.core.compute import map_parallel
-from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE
+from pipeline.estimation.acceptance import DECIDED_T, LEAST_TURN_RAD, LEAST_WAY_SHARE, compare_rivals
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
 from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS, format_dependence
@@ -42,8 +42,6 @@ if TYPE_CHECKING:
 
 _MOST_TERMS = 3
 """Most terms of a formula: what needs more is no law."""
-_BETTER = 0.04
-"""Share of the loss by which a formula must be better than an effect whose place it takes."""
 _EXPLAINABLE = 0.1
 """Share of a channel that trees must predict of unseen stretches to be reported."""
 _LAGS_S = (0.0, 0.25, 0.5, 1.0, 2.0, 4.0)
@@ -133,10 +131,15 @@ def _replace(selection: Selection, current: CandidateModel, evidence: Evidence) 
 
 
 def _is_simpler(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
-    """Whether one term does what one effect does, and by much better, or what several do, and no worse."""
+    """Whether one term does what several effects do, or what one does, and significantly better.
+
+    As a term is the best of thousands, it is compared with an effect on data that neither was fitted to.
+    """
     added, dropped = set(rival.ids) - set(current.ids), set(current.ids) - set(rival.ids)
-    least = 1.0 - (_BETTER if len(dropped) == 1 else 0.0)
-    return len(added) == 1 and selection.loss(rival) < least * selection.loss(current)
+    if len(added) != 1 or selection.loss(rival) >= selection.loss(current):
+        return False
+    noise = selection.noise or selection.take_evidence(current).noise
+    return len(dropped) > 1 or compare_rivals(noise, current.held, rival.held) >= DECIDED_T
 
 
 def collect_terms(model: CandidateModel) -> list[FormulaEffect]:
