@@ -249,6 +249,21 @@ def test_uneven_drives_are_named(kind: str, tmp_path: Path) -> None:
     assert is_exact(play(Job("single", 150_500, kind), tmp_path))
 
 
+@pytest.mark.parametrize(
+    "seed",
+    [
+        pytest.param(20, id="a wave across the map took the place of a track in two minutes of stop and go"),
+        pytest.param(44, id="a lag of the body was an alternative, though the wheels' part contradicted it"),
+        pytest.param(998_003, id="the same after stop and go", marks=pytest.mark.long),
+        pytest.param(
+            31, id="a lag was dropped together with two lags that were alike", marks=pytest.mark.long
+        ),
+    ],
+)
+def test_what_was_named_wrongly_once_is_named_rightly(seed: int, tmp_path: Path) -> None:
+    assert is_exact(play(Job("sets", seed), tmp_path))
+
+
 def score_many(jobs: list[Job]) -> list[Record]:
     records: list[Record] = []
     play_all(jobs, records.append, workers=2)
