@@ -427,7 +427,9 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     sentence = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
     return Picture(
-        "causes", "Slip by cause", Drawing(chart, {"causes": frame}, note, f"Rms slip: {sentence}.")
+        "causes",
+        "Rms slip of each dataset by cause",
+        Drawing(chart, {"causes": frame}, note, f"Rms slip: {sentence}."),
     )
 
 
