@@ -139,7 +139,7 @@ def summarize(
         near = (one for path in paths for one in path.not_significant)
         conditions = list(find_unless(judgement, named, near, hidden))
         named = _note_unless(named, conditions)
-        doubts += [one.note for name, one in conditions if not name]
+        doubts += [one.note for name, one in conditions if name is None]
         hidden.update(one.id for _, one in conditions)
     stated = hidden.union(*(effect.contains for effect in taken))
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
@@ -414,7 +414,9 @@ def _mark_tentative(
     )
 
 
-def _note_unless(named: Iterable[Named], conditions: Sequence[tuple[str, Unless]]) -> tuple[Named, ...]:
+def _note_unless(
+    named: Iterable[Named], conditions: Sequence[tuple[str | None, Unless]]
+) -> tuple[Named, ...]:
     """Named effects with the insignificant effects that would change their values."""
     return tuple(replace(one, unless=tuple(un for n, un in conditions if n == one.id)) for one in named)
 

@@ -143,8 +143,8 @@ def find_unless(
     named: Sequence[Named],
     not_significant: Iterable[NotSignificant],
     taken: Container[str],
-) -> Iterator[tuple[str, Unless]]:
-    """Insignificant effects, by each identified effect whose values change beside them, or by "" if none do.
+) -> Iterator[tuple[str | None, Unless]]:
+    """Insignificant effects, by each identified effect whose values change beside them; by None if none do.
 
     Args:
         judgement: of the model with the identified effects.
@@ -170,8 +170,10 @@ def find_unless(
             for effect in named
             if effect.id in beside and not effect.by_run
         }
-        moved = {other: values for other, values in changed.items() if values} or {"": {}}
-        for other_id, instead in moved.items():
+        moved: dict[str | None, dict[str, Value]] = {
+            other: values for other, values in changed.items() if values
+        }
+        for other_id, instead in (moved or {None: {}}).items():
             yield other_id, Unless(name, beside[name], one.gain, one.evidence, instead)
 
 
