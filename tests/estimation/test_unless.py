@@ -100,7 +100,7 @@ def test_what_changes_no_other_number_is_a_finding(
     judgement = judge_model(problem, diagnosis.runs[0].proposal.model)
     nearly = [NotSignificant(find_effect("body_inertia")(tau=0.06), 0.02, 0.9)]
     ((name, unless),) = find_unless(judgement, (), nearly, ())
-    assert (name, dict(unless.instead)) == ("", {})
+    assert (name, dict(unless.instead)) == (None, {})
     assert unless.note["id"] == "insignificant_effect"
     assert unless.note["where"] == "body_inertia"
     assert str(unless.note["text"]).startswith(
