@@ -180,7 +180,8 @@ class MotionRun:
         """The run in times from its start, and in a plane from its first pose, in steps of a millionth.
 
         A search amplifies rounding. Equal drives give equal answers this way, wherever their map lies and
-        whenever the recorder was started. Yaw and position in the map remain as they are.
+        whenever the recorder was started. Yaw and position in the map remain as they are; of what was stamped
+        within one step, the last command and the first pose remain.
         """
         track, alignment, gyro = self.track, self.alignment, self.alignment.gyro
         start, heading = self.start_s, float(track.heading[0])
@@ -195,21 +196,27 @@ class MotionRun:
             return round_off(times - start)
 
         def anchor(series: DriveSeries | None) -> DriveSeries | None:
-            return None if series is None else series.change(shift(series.times), round_off)
+            if series is None:
+                return None
+            times = shift(series.times)
+            mask = np.diff(times, append=np.inf) > 0.0
+            return series.change(times[mask], lambda signal: round_off(signal[mask]))
 
+        moved = replace(
+            track,
+            times=shift(track.times),
+            path=path,
+            heading=round_off(track.heading - heading),
+            attitude=np.column_stack((round_off(track.attitude[:, :2]), track.attitude[:, 2])),
+        )
+        is_later = np.diff(moved.times, prepend=-np.inf) > 0.0
         return replace(
             self,
             commands=anchor(self.commands),
             wheels=anchor(self.wheels),
-            gyro=None if self.gyro is None else (shift(self.gyro[0]), self.gyro[1]),
-            track=replace(
-                track,
-                times=shift(track.times),
-                path=path,
-                heading=round_off(track.heading - heading),
-                attitude=np.column_stack((round_off(track.attitude[:, :2]), track.attitude[:, 2])),
-            ),
-            streams=shift(self.streams),
+            gyro=None if self.gyro is None else _distinct(shift(self.gyro[0]), self.gyro[1]),
+            track=Track(*(values[is_later] for values in vars(moved).values())),
+            streams=np.unique(shift(self.streams)),
             step_starts=shift(self.step_starts),
             excluded=shift(self.excluded),
             alignment=replace(

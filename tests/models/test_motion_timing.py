@@ -246,3 +246,19 @@ def test_a_fit_is_the_same_to_the_last_bit_wherever_the_map_lies_and_whenever_it
     assert np.allclose(one.poses[..., 2] + _TURNED, two.poses[..., 2])
     plain = predict_from(Comparison(recorded, HUSKY, Input.COMMAND), effects, timing)
     assert np.allclose(plain.poses, one.poses, atol=1e-4)
+
+
+def test_stamps_nearer_than_a_step_give_no_stamp_twice(tables: Mapping[str, pl.DataFrame]) -> None:
+    run = load_run(tables, HUSKY, name="dense")
+    assert run.commands is not None
+    later = run.commands.change(run.commands.times + 3e-7, lambda signal: signal + 0.1)
+    times = np.concatenate((run.commands.times, later.times))
+    order = np.argsort(times, kind="stable")
+    dense = run.commands.change(times[order], lambda signal: np.concatenate((signal, signal + 0.1))[order])
+    anchored = replace(run, commands=dense, streams=np.unique(np.concatenate((run.streams, times)))).anchored
+    assert anchored.commands is not None
+    assert (np.diff(anchored.commands.times) > 0.0).all()
+    assert (np.diff(anchored.streams) > 0.0).all()
+    # Two stamps of one step are the later command; some lie on either side of an edge.
+    assert run.commands.times.size <= anchored.commands.times.size < 1.5 * run.commands.times.size
+    assert np.isfinite(Problem([replace(run, commands=dense)], HUSKY, Input.COMMAND).whole.noise).all()
