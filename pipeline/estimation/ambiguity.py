@@ -98,7 +98,7 @@ def choose_reaching(
     for item in undecided:
         first, *others = item.candidates
         here = next((index for index, effect in enumerate(chosen) if effect.id == first), None)
-        reached = dict[str, _Reached]()
+        reached = dict[str, Reached]()
         for name in others if here is not None else ():
             if name not in item.numbers or any(effect.id == name for effect in chosen):
                 continue
@@ -118,7 +118,7 @@ def choose_reaching(
 
 
 @dataclass(frozen=True)
-class _Reached:
+class Reached:
     """How well a model predicts.
 
     Attributes:
@@ -129,7 +129,7 @@ class _Reached:
     error: float
     fits: tuple[PartFit, ...] = ()
 
-    def is_far_worse(self, best: _Reached) -> bool:
+    def is_far_worse(self, best: Reached) -> bool:
         """Whether it predicts far worse than another model, or does so in a part of the path."""
         if self.error > _FAR_WORSE * best.error:
             return True
@@ -140,13 +140,13 @@ class _Reached:
         )
 
 
-def _measure_reached(problem: Problem, effects: Sequence[Effect]) -> _Reached:
+def _measure_reached(problem: Problem, effects: Sequence[Effect]) -> Reached:
     try:
         fitted = fit_model(problem, Model(problem.vehicle, tuple(effects)))
         errors = hold_out(problem, fitted).pooled
     except MotionError:
-        return _Reached(math.inf)
-    return _Reached(math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad), fitted.fits)
+        return Reached(math.inf)
+    return Reached(math.sqrt(errors.t_mrmse_m * errors.r_mrmse_rad), fitted.fits)
 
 
 def _read_numbers(selection: Selection, model: CandidateModel, name: str) -> Mapping[str, Value]:

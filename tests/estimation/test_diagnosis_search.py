@@ -9,7 +9,7 @@ import pytest
 
 from pipeline.core.compute import Budget
 from pipeline.estimation import Input, Problem, ambiguity, fit_model, load_recording
-from pipeline.estimation.ambiguity import Undecided, choose_reaching
+from pipeline.estimation.ambiguity import Reached, Undecided, choose_reaching
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
@@ -434,7 +434,7 @@ def test_alternatives_are_compared_with_the_best_in_any_order(
     order: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     errors = {"drive_lag": 1.0, "deadband": 1.4, "turn_lag": 0.5}
-    monkeypatch.setattr(ambiguity, "_measure_horizon_error", lambda _, effects: errors[effects[0].id])
+    monkeypatch.setattr(ambiguity, "_measure_reached", lambda _, effects: Reached(errors[effects[0].id]))
     numbers = {
         name: {p.name: Value(1.0, 1.0, 1.0, "") for p in find_effect(name).parameters} for name in order
     }
