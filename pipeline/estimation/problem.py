@@ -69,7 +69,7 @@ def predict_from(
     origin = comparison.run.origin
     turned = start[:, 2:] + yaw - yaw[:, :1] + origin.heading
     turn = np.exp(1j * (start[:, 2] - yaw[:, 0] + origin.heading))
-    begin = origin.put_back(start[:, 0] + 1j * start[:, 1])
+    begin = origin.put_back(join_parts(start[:, 0], start[:, 1]))
     along = begin[:, None] + turn[:, None] * (path - path[:, :1])
     poses = np.stack((along.real, along.imag, turned), axis=-1)
     return Prediction(start_times + origin.time_s, poses, since)

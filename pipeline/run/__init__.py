@@ -186,7 +186,7 @@ class MotionRun:
         track, alignment, gyro = self.track, self.alignment, self.alignment.gyro
         start, heading = self.start_s, float(track.heading[0])
         path = (track.path - track.path[0]) * np.exp(-1j * heading)
-        path = round_off(path.real) + 1j * round_off(path.imag)
+        path = arrays.join_parts(round_off(path.real), round_off(path.imag))
         delays = np.array((alignment.heading_delay_s, alignment.wheel_delay_s, alignment.latency_spread_s))
         late, late_wheels, spread = round_off(delays).tolist()
         if gyro is not None:
