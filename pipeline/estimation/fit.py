@@ -169,18 +169,27 @@ def fit_model(
 
 
 def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
-    """The fit from a state; if ``exact`` a fit from its values ends at them, with the delays found anew."""
-    fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=exact)
-    for _ in range(_REWEIGHTED if exact and part.delays else 0):
-        before, values = fit, state.hold(fit.state.effects)
-        fit = _finish(part, _fit_part(problem, part, values, per_run), per_run, exact=True)
-        if np.allclose(_list_values(before), _list_values(fit), rtol=_SAME_NUMBER, atol=1e-6):
+    """The fit from a state; if ``exact``, from values as model files have them, where it ends at them.
+
+    So the fit of a written model is the model: its values are such that no fit from them changes them.
+    """
+    if not exact:
+        return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=False)
+    for _ in range(_REWEIGHTED):
+        state = state.hold([effect.rounded for effect in state.effects])
+        fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=True)
+        if _are_same(state, fit.state, [number for number in fit.free if number.effect]):
             break
-    return fit
+        state = state.hold(fit.state.effects)
+    state = fit.state.add(*(effect.rounded for effect in state.effects))
+    residual = part.find_residuals(state)
+    fit = _enter(part, make_weights(residual, part), state, fit.free, Until(enough=_SETTLED))
+    return replace(fit, loss=measure_loss(part, fit.weights, residual, state, fit.free))
 
 
-def _list_values(fit: PartFit) -> Floats:
-    return np.array([fit.state.get(number) for number in fit.free])
+def _are_same(one: State, other: State, free: Sequence[Free]) -> bool:
+    values, others = ([state.get(number) for number in free] for state in (one, other))
+    return np.allclose(values, others, rtol=_SAME_NUMBER, atol=1e-6)
 
 
 def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
@@ -236,9 +245,9 @@ def _estimate_delays(part: Part, state: State) -> tuple[Weights, State]:
 def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
     """The fit iterated until neither parameters nor weights change."""
     for _ in range(_SETTLED_ROUNDS):
-        before, weights = _list_values(fit), make_weights(fit.residual, part)
+        before, weights = fit.state, make_weights(fit.residual, part)
         fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
-        if np.allclose(before, _list_values(fit), rtol=_SAME_NUMBER, atol=1e-6):
+        if _are_same(before, fit.state, fit.free):
             break
     return fit
 

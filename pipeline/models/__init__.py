@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import tomlkit
 
-from pipeline.core import naming_os_errors
+from pipeline.core import JSON_DIGITS, naming_os_errors
 from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import (
     AddedEffect,
@@ -46,8 +46,6 @@ _GEOMETRY = (
     "max_steering_rad",
     "controller_track_multiplier",
 )
-_DIGITS = 6
-"""Significant digits in a model file: more than the accuracy of any estimate, and still readable."""
 _LEARNED_HEAD = (
     "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
     "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
@@ -140,7 +138,7 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
 
 def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> str:
     label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
-    parts = [] if math.isnan(value) else [f"value = {_round_within(value, parameter)}"]
+    parts = [] if math.isnan(value) else [f"value = {_exactly(parameter.round(value))}"]
     if label in file.intervals:
         low, high = file.intervals[label]
         parts += [f"low = {format_value(low)}", f"high = {format_value(high)}"]
@@ -202,10 +200,4 @@ def _exactly(value: float) -> str:
 
 
 def _round(value: float) -> float:
-    return float(f"{value:.{_DIGITS}g}")
-
-
-def _round_within(value: float, parameter: Parameter) -> str:
-    """A fitted value, rounded to `_DIGITS` unless that moves it out of its bounds."""
-    low, high = parameter.bounds
-    return _exactly(_round(value) if low <= _round(value) <= high and value != parameter.neutral else value)
+    return float(f"{value:.{JSON_DIGITS}g}")

@@ -337,6 +337,11 @@ class Effect(ABC):
         """
         return self._copy({**self.values, **values}, self.fixed)
 
+    @property
+    def rounded(self) -> Self:
+        """The same effect with its values as model files have them."""
+        return self.change(**{p.name: p.round(self.values[p.name]) for p in self.parameters})
+
     def fix(self, *names: str) -> Self:
         """The same effect with parameters that a fit must not change.
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
+from pipeline.core import JSON_DIGITS
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
@@ -359,6 +360,12 @@ class Parameter:
         """Spread between runs: the measured one, or a default from the median of other parameters."""
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
         return self.between_runs or Spread(USUAL_SPREAD * self.usual_size, usual)
+
+    def round(self, value: float) -> float:
+        """A value as model files have it: of six digits, unless that moves it out of its bounds."""
+        low, high = self.bounds
+        rounded = float(f"{value:.{JSON_DIGITS}g}")
+        return rounded if low <= rounded <= high and value != self.neutral else value
 
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""
