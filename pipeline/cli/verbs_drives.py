@@ -295,9 +295,8 @@ def format_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path
     if rest := made.format_rest():
         lines.append(f"then         {rest}")
     lines += [f"not decided  {text}" for text in made.list_impossible()]
-    limits, turn = made.limits, "rad steering" if made.steered else "rad/s"
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    most = f"limits       {limits.speed_mps:g} m/s, {limits.turn:g} {turn}, {limits.acceleration_mps2:g} m/s2"
+    most = f"limits       {made.limits.format(steered=made.steered)}"
     if not made.manoeuvres:
         none = f"no drive on {ground} of level ground answers an open question: no file is written"
         return [f"drive        {none}", most, *lines]

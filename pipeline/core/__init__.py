@@ -139,6 +139,19 @@ def format_recorded(recorded_s: float, compared_s: object = None) -> str:
 NORMAL_95 = 1.959964
 """Half of a normal distribution's 95 % interval, in standard deviations."""
 
+CONFIDENCE = 0.95
+"""Coverage probability of intervals: the convention of the published comparisons."""
+
+FEWEST_OF_SPREAD = 3
+"""Fewest values, runs or stretches for a spread: the difference of two does not determine one."""
+
+FOLDS = 5
+"""Number of folds of a cross-validation: each is fitted to four fifths of the run."""
+
+TIMES_PER_BLOCK = 5.0
+"""Length of a block in integrated autocorrelation times: ten time constants of an exponential correlation, so
+that the correlation of neighbouring blocks is small."""
+
 JSON_DIGITS = 6
 """Significant digits of estimates in JSON, more than any estimate has."""
 

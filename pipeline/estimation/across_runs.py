@@ -32,7 +32,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import format_share
+from pipeline.core import CONFIDENCE, format_share
 from pipeline.core.arrays import Floats, Ints, guarded_spread
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
@@ -254,8 +254,6 @@ def _tie(problem: Problem, priors: list[Prior]) -> Problem:
 # the joint fit with the effect added, and its error includes the uncertainty of the other parameters.
 
 
-LEVEL = 0.95
-"""Nominal coverage of a band."""
 _ROUNDING = 1e-9
 """Tolerance of the sum of all weights for the rounding of doubles."""
 _STEP = 0.5
@@ -362,7 +360,7 @@ def _find_quantile(ratios: Sequence[Ratios], metric: str) -> float:
         return math.nan
     every, weight = np.concatenate(values), np.concatenate(shares) / len(values)
     order = np.argsort(every)
-    level = LEVEL * (1.0 + 1.0 / stretches)
+    level = CONFIDENCE * (1.0 + 1.0 / stretches)
     index = int(np.searchsorted(np.cumsum(weight[order]), level - _ROUNDING))
     return float(every[order][index]) if index < every.size else math.inf
 
@@ -401,5 +399,5 @@ def _follow(ratios: Ratios, metric: str, band: float) -> Floats:
         now = _hold(every[ratios.number == number], band)
         if now.size:
             held.append(now)
-            band *= math.exp(_STEP * (LEVEL - float(now.mean())))
+            band *= math.exp(_STEP * (CONFIDENCE - float(now.mean())))
     return np.concatenate(held) if held else np.zeros(0)

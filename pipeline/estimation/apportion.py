@@ -16,6 +16,7 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.folds import HeldOut, score
@@ -32,8 +33,6 @@ QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
 
 _ALL_ORDERS = 5
 """Largest number of effects for which all orders are used: 120 orders of 32 sets."""
-_FEWEST_STRETCHES = 3
-"""Fewest stretches of ten seconds for an interval: the spread of two is chance."""
 
 
 @dataclass(frozen=True)
@@ -255,7 +254,7 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     if total <= 0.0:
         return 0.0, math.nan
     ratio, count = float(part.sum()) / total, part.size
-    if count < _FEWEST_STRETCHES:
+    if count < FEWEST_OF_SPREAD:
         return ratio, math.nan
     without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
     error = jackknife_deviation(without)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import CLIP, average_windows, locate_windows, number_stretches
@@ -27,8 +27,6 @@ _BINS = 16
 """Most bins of a curve: more are not distinguishable in a figure."""
 _FEWEST = 4
 """Fewest windows per bin."""
-_FEWEST_BLOCKS = 3
-"""Fewest ten-second stretches per bin, since one event is no curve."""
 _FEWEST_BINS = 3
 """Fewest bins of a curve."""
 _NOTHING = 1e-9
@@ -268,11 +266,11 @@ def _merge(met: Ints) -> Ints:
     """
     number, together = np.zeros(met.shape[0], dtype=np.int64), np.zeros(met.shape[1], dtype=np.int64)
     for index, row in enumerate(met):
-        if together.sum() >= _FEWEST and np.count_nonzero(together) >= _FEWEST_BLOCKS:
+        if together.sum() >= _FEWEST and np.count_nonzero(together) >= FEWEST_OF_SPREAD:
             number[index:] += 1
             together = np.zeros_like(together)
         together = together + row
-    if together.sum() < _FEWEST or np.count_nonzero(together) < _FEWEST_BLOCKS:
+    if together.sum() < _FEWEST or np.count_nonzero(together) < FEWEST_OF_SPREAD:
         number = np.minimum(number, max(int(number[-1]) - 1, 0))
     return number
 

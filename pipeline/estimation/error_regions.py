@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING
@@ -14,12 +14,11 @@ from pipeline.core import finite_or_none, format_share
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.estimation.fit import Fitted
 from pipeline.estimation.intervals import narrow_part
-from pipeline.estimation.parts import LAG_S, Part
+from pipeline.estimation.parts import Part
 from pipeline.models.catalogue import find_effect
+from pipeline.run.windows import NODE_S
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
     from pipeline.estimation.diagnosis import Json, Named
 
 
@@ -196,7 +195,7 @@ def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
         regions += _cut_sideways(aside)
     changed = np.abs(lags - lags[:, :1, :]).max(axis=1) > _CHANGE * np.abs(lags).max(axis=(0, 1))
     transitory = changed.any(axis=1)
-    regions.append(("phase", f"within {LAG_S * (lags.shape[1] - 1):g} s of a change of command", transitory))
+    regions.append(("phase", f"within {NODE_S * (lags.shape[1] - 1):g} s of a change of command", transitory))
     regions.append(("phase", "in steady driving", ~transitory & part.live))
     middle = part.times.mean(axis=1)
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite
+from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
 from pipeline.core.compute import map_parallel
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 # Residuals of field data are autocorrelated: stretches are not divided, and gaps separate training windows
 # from test windows.
 
-FOLDS = 5
-"""Number of folds: each is fitted to four fifths of the run."""
 GAP_S = 1.5
 """Gap between training and test windows [s]: residuals are correlated for about a second."""
 _CHORD_STEPS = 3

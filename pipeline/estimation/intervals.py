@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import NORMAL_95
+from pipeline.core import NORMAL_95, TIMES_PER_BLOCK
 from pipeline.core.arrays import Floats, Ints, count_freedom, group_rows, robust_spreads, student_quantile
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.parts import Part, count_seconds
@@ -18,8 +18,7 @@ from pipeline.models.parameter import cut_interval, stands_at_bound
 
 _HUBER = 3.0  # clipping limit of residuals [robust standard deviations] before they are correlated
 _SHORTEST_BLOCK_S = 6.0  # minimum length of a block [s], however short the autocorrelation time
-_TAUS = 5.0  # autocorrelation times per block, as `confidence.TIMES_PER_BLOCK`
-SHORTEST_TIME_S = _SHORTEST_BLOCK_S / _TAUS
+SHORTEST_TIME_S = _SHORTEST_BLOCK_S / TIMES_PER_BLOCK
 """Lower limit of the autocorrelation time of residuals [s]."""
 _ALWAYS_CARRIED = 0.25
 """Share of a clock's error invisible in residuals: lines between readings miss up to an eighth of a bend."""
@@ -370,7 +369,7 @@ def _sum_losses(fit: PartFit, residual: Floats) -> float:
 
 def join_blocks(part: Part, fit: PartFit) -> Ints:
     """Number of the block of every window: command steps, joined if they are too short."""
-    length = max(_SHORTEST_BLOCK_S, _TAUS * integrate_correlation(part, fit))
+    length = max(_SHORTEST_BLOCK_S, TIMES_PER_BLOCK * integrate_correlation(part, fit))
     joined = np.empty(part.block.size, dtype=np.int64)
     number, begin, last_run, last_block = -1, -np.inf, -1, -1
     middle = part.times.mean(axis=1)

@@ -15,13 +15,12 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick_finite
+from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, format_share, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import (
-    FOLDS,
     Errors,
     HeldOut,
     find_in_test,

@@ -20,7 +20,7 @@ from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.model import Timing
 from pipeline.models.parameter import OVERSHOOT, Largest
 from pipeline.run.signals import Velocity
-from pipeline.run.windows import WINDOW_S, average_spans
+from pipeline.run.windows import NODE_S, WINDOW_S, average_spans
 
 CLIP = 6.0
 """Limit at which residuals are clipped or above which their cost is linear [robust standard deviations]:
@@ -130,8 +130,6 @@ def _make_features(part: Part) -> Floats:
     return np.column_stack(columns)
 
 
-LAG_S = 0.25
-"""Step of the lags of `average_lags` [s]: half a window, as its means do not resolve shorter times."""
 _NO_DELAY = Timing()
 _NARROW = 0.1
 """Share of a derivative's step for central differences: with whole steps, two fits of one model to ice differ
@@ -467,6 +465,6 @@ def average_lags(comparison: Comparison, velocity: Velocity, lags: int = 9) -> F
     signals = [velocity.x, velocity.w]
     if comparison.context.vehicle.kinematics.has_inputs("sideways"):
         signals.append(velocity.y)
-    spans = [locate_windows(comparison, LAG_S * lag) for lag in range(lags)]
+    spans = [locate_windows(comparison, NODE_S * lag) for lag in range(lags)]
     means = [[one.average(comparison, signal) for signal in signals] for one in spans]
     return np.moveaxis(np.asarray(means), (0, 1, 2), (1, 2, 0))

@@ -9,12 +9,13 @@ from functools import cached_property
 
 import numpy as np
 
+from pipeline.core import FOLDS
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
 from pipeline.core.compute import Newest
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
 from pipeline.estimation.fit import Fitted, PartFit, fit_model
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.folds import FOLDS, Errors, Fold, HeldOut, find_near, hold_out, make_folds
+from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.models.effect import Effect

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import JSON_DIGITS, SlipError, finite_or_none
+from pipeline.core import CONFIDENCE, JSON_DIGITS, SlipError, finite_or_none
 from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, robust_spreads, student_quantile
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.fit import Fitted, fit_model
@@ -40,10 +40,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.fit import Fitted
     from pipeline.estimation.folds import HeldOut
     from pipeline.estimation.state import State
-
-
-_LEVEL = 0.95
-"""Level of the intervals."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +162,7 @@ def compare_errors(one: Floats, other: Floats, stretches: Ints) -> Difference:
         return Difference(value, -math.inf, math.inf)
     without = np.sqrt((sums.sum(axis=1)[:, None] - sums) / (counts.sum() - counts))
     moved = without[0] - without[1]
-    half = student_quantile(_LEVEL, counts.size - 1) * jackknife_deviation(moved)
+    half = student_quantile(CONFIDENCE, counts.size - 1) * jackknife_deviation(moved)
     return Difference(value, value - half, value + half)
 
 

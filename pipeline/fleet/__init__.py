@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError
+from pipeline.core import FOLDS, SlipError
 from pipeline.core.arrays import STRETCH_S, Floats
 from pipeline.run.signals import MOVING_MPS
 
@@ -28,9 +28,6 @@ class ComparisonError(SlipError):
     """Results, or a table of deployments, that cannot be compared."""
 
 
-_FOLDS = 5
-"""Number of cross-validation folds of a run, as in `folds.FOLDS`; each is predicted by a fit to the other
-four fifths."""
 _RIDGE = 1e-9
 """Ridge as a share of the trace, which makes normal equations solvable: as small as the last digit."""
 _DIGITS = 9
@@ -58,7 +55,7 @@ def measure_unpredictability(slip: pl.LazyFrame) -> pl.LazyFrame:
     Returns:
         ``run``, ``input``, ``unpredictability``; null for runs with fewer than five blocks.
     """
-    fold = ((pl.col("t") / STRETCH_S).floor().cast(pl.Int64) % _FOLDS).alias("fold")
+    fold = ((pl.col("t") / STRETCH_S).floor().cast(pl.Int64) % FOLDS).alias("fold")
     sums = [pl.len().alias("count"), pl.col("length_scale").first()]
     for channel, features in _FEATURES.items():
         target = pl.col(f"g_{channel}")
@@ -78,7 +75,7 @@ def measure_unpredictability(slip: pl.LazyFrame) -> pl.LazyFrame:
 
 
 def _judge_runs(folds: pl.DataFrame) -> pl.DataFrame:
-    whole = pl.col("fold").list.len() == _FOLDS
+    whole = pl.col("fold").list.len() == FOLDS
     judged = folds.filter(whole)
     if judged.is_empty():
         return judged.select("run", "input", pl.lit(None, pl.Float64).alias("unpredictability"))

@@ -19,8 +19,9 @@ from typing import Literal
 
 import numpy as np
 
+from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Flags, Floats, normal_tail
-from pipeline.fleet.levels import FEWEST_OF_SPREAD, weigh_run_spreads
+from pipeline.fleet.levels import weigh_run_spreads
 
 CHANCE = 0.025
 """Probability that a check reports any change where there is none: one of forty checks of the same robot."""

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipeline.core import CONFIDENCE, TIMES_PER_BLOCK
 from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
 from pipeline.fleet.rank_tests import (
-    CONFIDENCE,
     DRAWS,
     PermutationTest,
     check_values,
@@ -25,9 +25,6 @@ advise a quarter)."""
 _WINDOW = 3.0
 """Length of the summation window in tau: six of Sokal's tau, which is half of this one and for which he takes
 4 to 10. An exponential correlation has decayed to 0.25 % there; a longer window adds noise."""
-TIMES_PER_BLOCK = 5.0
-"""Block length in integrated autocorrelation times: ten time constants of an exponential correlation, so that
-the correlation of neighbouring blocks is small."""
 
 
 def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:

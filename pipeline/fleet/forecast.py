@@ -8,11 +8,11 @@ from typing import Literal, cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import Floats
 from pipeline.fleet import UNKNOWN, ComparisonError
 from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
-from pipeline.fleet.levels import FEWEST_OF_SPREAD, LevelFit, draw_run, find_outlier, split_levels
+from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound

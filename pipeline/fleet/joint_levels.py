@@ -18,16 +18,16 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
 from pipeline.fleet.levels import (
-    FEWEST_OF_SPREAD,
     Sample,
     draw_spreads,
     find_outlier,
     make_sample,
     maximize_likelihood,
 )
-from pipeline.fleet.rank_tests import CONFIDENCE, FEWER_DRAWS, LEVEL, TIE, check_values
+from pipeline.fleet.rank_tests import FEWER_DRAWS, LEVEL, TIE, check_values
 
 _VAGUE = 10.0
 """Prior standard deviation of a parameter in usual sizes: keeps unidentified parameters finite."""

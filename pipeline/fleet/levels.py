@@ -18,17 +18,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, Ints, student_quantile
 from pipeline.fleet.confidence import Interval
-from pipeline.fleet.rank_tests import CONFIDENCE, StatisticsError, check_values
+from pipeline.fleet.rank_tests import StatisticsError, check_values
 
 _NORMAL = 1e6
 """Degrees of freedom of a known variance: Student's t is then normal."""
 # Starting spreads of the likelihood search, relative to the scatter: both large, or one of them small.
 _STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
-FEWEST_OF_SPREAD = 3
-"""Minimum number of runs, or degrees of freedom, for estimating a scatter: the difference of two runs does
-not determine a spread."""
 # A variance below this fraction of the total counts as zero.
 _NONE = 1e-8
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core import SlipError
+from pipeline.core import CONFIDENCE, SlipError
 from pipeline.core.arrays import Flags, Floats
 
 # Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
@@ -17,10 +17,8 @@ from pipeline.core.arrays import Flags, Floats
 # Slip is autocorrelated, so the unit is not the sample but the run, or a block of one run if there is only
 # one. This module is independent of logs, tables and vehicles.
 
-LEVEL = 0.05
-"""Significance level: the convention of the published comparisons."""
-CONFIDENCE = 1.0 - LEVEL
-"""Coverage probability of intervals."""
+LEVEL = 1.0 - CONFIDENCE
+"""Significance level."""
 
 
 class StatisticsError(SlipError):

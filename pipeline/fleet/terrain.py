@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import format_share
+from pipeline.core import CONFIDENCE, format_share
 from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, student_quantile
-from pipeline.fleet.rank_tests import CONFIDENCE
 from pipeline.run.signals import MOVING_MPS
 
 CELL_M = 2.0

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
@@ -233,7 +234,9 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         Finding("vehicle_choice", "info", note, where="vehicle")
         for note in (recognized.notes if recognized else ())
     ]
-    findings += _check_contradiction(recognized, vehicle, source)
+    recorded = find_preset(index.deployment.get("vehicle") or "")
+    witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
+    findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
     if sources.command is None and sources.wheels is not None:
         text = "the log holds no command: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
@@ -358,25 +361,23 @@ def _apply_controller(
     return msgspec.structs.replace(vehicle, controller_track_multiplier=multiplier)
 
 
-def _check_contradiction(
-    recognized: Recognized | None, vehicle: Vehicle, source: VehicleSource
-) -> list[Finding]:
-    if recognized is None or source not in {"flag", "configuration", "metadata"}:
-        return []
-    if recognized.vehicle.sideways_preset == vehicle.id:
-        return []
-    differing = list_contradictions(recognized.vehicle, vehicle)
-    if not differing:
-        return []
+def _list_contradictions(
+    witnesses: Sequence[Recognized], vehicle: Vehicle, source: VehicleSource
+) -> Iterator[Finding]:
+    """Findings on a chosen vehicle that what the log shows, or says of itself, contradicts."""
     named = f"{vehicle.name} was given: check --vehicle"
     if source != "flag":
         where = "run.toml or the log's metadata"
         named = f"{where} says {vehicle.name}, which is used: check [vehicle], or --vehicle"
-    text = (
-        f"the log looks like a {recognized.vehicle.name} (by its {recognized.source.replace('_', ' ')}: "
-        f"{', '.join(differing)}), but {named}"
-    )
-    return [Finding("vehicle_contradiction", "warning", text, where="vehicle")]
+    for one in witnesses:
+        differing = list_contradictions(one.vehicle, vehicle)
+        is_given = source in {"flag", "configuration", "metadata"} and source != one.source
+        if is_given and differing and one.vehicle.sideways_preset != vehicle.id:
+            text = (
+                f"the log looks like a {one.vehicle.name} (by its {one.source.replace('_', ' ')}: "
+                f"{', '.join(differing)}), but {named}"
+            )
+            yield Finding("vehicle_contradiction", "warning", text, where="vehicle")
 
 
 def _compare(

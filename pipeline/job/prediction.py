@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import finite_or_none, pick
+from pipeline.core import CONFIDENCE, finite_or_none, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
@@ -241,7 +241,6 @@ def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float |
 
 MOST_RUNS = 8
 """Largest number of runs whose commands represent future runs: more hardly change the result."""
-_LEVEL = 0.95
 _ENDS = (0.025, 0.5, 0.975)
 # Prior spread of log residuals and log speeds between terrains and between runs: a factor of two.
 _USUAL_LOG_RATIOS = (math.log(2.0), math.log(2.0))
@@ -375,7 +374,7 @@ def weigh_runs(there: Flags) -> Floats:
 
 def _bound(draws: Floats) -> Expected:
     low, middle, high = np.quantile(draws, _ENDS).tolist()
-    return Expected(middle, Interval(low, high, _LEVEL))
+    return Expected(middle, Interval(low, high, CONFIDENCE))
 
 
 def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:

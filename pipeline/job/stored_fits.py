@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows, jackknife_deviation, student_quantile
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.comparison import InputChoice, choose_input
@@ -249,8 +249,6 @@ explained by any parameter of the model."""
 USUAL_LOG_RATIO = 0.4
 """Root mean square of the prior of such a logarithm's spread between runs on one terrain: the spread of the
 Warthog recordings (`make bench-check PART=real`)."""
-_LEAST_BLOCKS = 3
-"""Smallest number of stretches to estimate a standard deviation."""
 _LEAST_SQUARE = 1e-12
 """Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
 _LEAST_SLIP = 1e-6
@@ -403,7 +401,7 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
         return 0.5 * np.log(np.maximum(mean[0], _LEAST_SQUARE) / np.maximum(mean[1], _LEAST_SQUARE))
 
     blocks = np.stack((errors[:, rows], ideal[:, rows])).transpose(2, 0, 1)
-    if rows.size < _LEAST_BLOCKS:
+    if rows.size < FEWEST_OF_SPREAD:
         return math.nan, math.nan
     whole = blocks.sum(axis=0)
     without = look(whole - blocks)
@@ -428,5 +426,5 @@ def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
         np.median(modulus[np.concatenate([stretches[index] for index in picked])])
         for picked in rng.integers(len(stretches), size=(_RESAMPLES, len(stretches))).tolist()
     ]
-    known = len(stretches) >= _LEAST_BLOCKS
+    known = len(stretches) >= FEWEST_OF_SPREAD
     return math.log(float(np.median(modulus))), float(np.std(np.log(drawn))) if known else math.nan

@@ -33,14 +33,12 @@ from pipeline.job.compared_runs import find_material
 from pipeline.job.keys import find_recorded_log
 from pipeline.logs import LogIndex, TopicColumns, Wanted, open_log, read_topics
 from pipeline.sources.message_types import find_type
-from pipeline.stages.reading import read_fixes
+from pipeline.stages.reading import FEWEST_MESSAGES, read_fixes
 from pipeline.stages.satellite import from_local_plane, to_local_plane
 
 if TYPE_CHECKING:
     from pipeline.store import Manifest, Store
 
-_FEWEST = 20
-"""Smallest number of fixes of a run."""
 _ROUNDS = 3
 _OUTLIERS = 3.0
 """Multiple of the median distance above which a fix is an outlier (multipath)."""
@@ -188,7 +186,7 @@ def locate_on_earth(
     known = np.isfinite(position).all(axis=1)
     times, position = times[known], position[known]
     inside = (beside.times >= times.min(initial=np.inf)) & (beside.times <= times.max(initial=-np.inf))
-    if np.count_nonzero(inside) < _FEWEST:
+    if np.count_nonzero(inside) < FEWEST_MESSAGES:
         return "its poses and its fixes do not share a time"
     fixes = np.concatenate(([[*anchor, beside.fixes[0, 2]]], beside.fixes[inside]))
     there = to_local_plane(*fixes.T)[1:, :2]

@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import finite_or_none, pick
+from pipeline.core import FOLDS, finite_or_none, pick
 from pipeline.core.arrays import Flags, Floats
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.fit import Fitted, fit_model
-from pipeline.estimation.folds import FOLDS, number_predictions, refit
+from pipeline.estimation.folds import number_predictions, refit
 from pipeline.estimation.problem import Prediction, Problem, fit_as_it_is, predict_from
 from pipeline.estimation.state import State
 from pipeline.export.twin_body import TwinBody, build_twin_body

@@ -65,6 +65,13 @@ class Limits:
     lateral_mps2: float = _LATERAL_MPS2
     yaw_rate_radps: float = math.inf
 
+    def format(self, *, steered: bool) -> str:
+        """All limits with their units; ``steered`` on a car, whose turn is a steering angle."""
+        turn = "rad of steering" if steered else "rad/s"
+        texts = [f"{self.speed_mps:.3g} m/s", f"{self.turn:.3g} {turn}", f"{self.acceleration_mps2:.3g} m/s2"]
+        texts.append(f"{self.turn_rate:.3g} {'rad/s of steering' if steered else 'rad/s2'}")
+        return ", ".join([*texts, f"{self.lateral_mps2:.3g} m/s2 sideways"])
+
 
 def is_steered(vehicle: Vehicle) -> bool:
     """Whether a turn is a steering angle."""

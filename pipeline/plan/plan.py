@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import finite_or_none, format_share, pick
+from pipeline.core import FEWEST_OF_SPREAD, finite_or_none, format_share, pick
 from pipeline.core.arrays import Complex, Floats
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Effect, Excitation, find_effect, list_effects
@@ -28,7 +28,7 @@ from pipeline.plan import (
     list_manoeuvres,
     wait,
 )
-from pipeline.plan.questions import DECIDED_T, STRETCHES, Answerable, Judge, Question, Separation
+from pipeline.plan.questions import DECIDED_T, Answerable, Judge, Question, Separation
 from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
 _MODELS = 12
@@ -480,7 +480,7 @@ def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) 
         enough = bound <= question.goal
         what = f"+- {measured:.2g}, or up to {bound:.2g} (goal {question.goal:.2g})"
     if enough:
-        return f"fewer than {STRETCHES:g} stretches of the plan excite it; {remark}"
+        return f"fewer than {FEWEST_OF_SPREAD:g} stretches of the plan excite it; {remark}"
     return f"the plan reaches {what}; {remark}"
 
 

@@ -160,6 +160,7 @@ def _format_toml(plan: Plan) -> str:
             "max_speed_mps": plan.limits.speed_mps,
             turn: plan.limits.turn,
             "max_acceleration_mps2": plan.limits.acceleration_mps2,
+            "max_steering_rate_radps" if plan.steered else "max_yaw_acceleration_radps2": plan.limits.turn_rate,
             "max_lateral_acceleration_mps2": plan.limits.lateral_mps2,
         }
     )

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core import NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.error_regions import find_goal
@@ -25,8 +25,6 @@ from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, s
 # The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly
 # every drive of a plan must reach a decision.
 DECIDED_T = 5.0
-STRETCHES = 3.0
-"""Least number of stretches of driving that must support a decision: two do not show the spread."""
 # Block length of the jackknife of intervals [s]: command steps are joined to at least six seconds.
 _BLOCK_S = 7.0
 
@@ -182,7 +180,7 @@ class Answerable:
         stretches = np.minimum(
             whole / np.where(power > 0.0, power, np.inf), weight @ self.groups.seconds / STRETCH_S
         )
-        return np.asarray(np.minimum(stretches / (reserve * STRETCHES), 1.0))
+        return np.asarray(np.minimum(stretches / (reserve * FEWEST_OF_SPREAD), 1.0))
 
     def _count_freedom(self, weight: Floats) -> Floats:
         shown = self.groups.seconds

@@ -68,8 +68,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
         plan: what to drive.
         catalogue: relative address of the page over all runs; empty without one.
     """
-    area, limits = plan.area, plan.limits
-    turn = f"{limits.turn:.3g} {'rad of steering' if plan.steered else 'rad/s'}"
+    area = plan.area
     return render_figures(
         "report/templates/plan.html",
         [_draw_ways(plan), _draw_commands(plan)],
@@ -79,7 +78,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             plan.vehicle,
             f"{plan.commands.duration_s:.0f} s",
             f"{area.length_m:g} x {area.width_m:g} m",
-            f"at most {limits.speed_mps:.3g} m/s, {turn}, {limits.acceleration_mps2:.3g} m/s2",
+            f"at most {plan.limits.format(steered=plan.steered)}",
         ],
         safety=SAFETY,
         **_plan_as_view(plan),

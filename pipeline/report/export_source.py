@@ -15,7 +15,7 @@ from pipeline.logs.writer import Given, LogWriter
 from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
 from pipeline.report.motion_view import COLUMNS, make_motion_run
-from pipeline.report.scene import INPUTS
+from pipeline.report.scene import CAP_QUANTILE, INPUTS
 from pipeline.run import MotionError, MotionRun
 from pipeline.store import Manifest
 from pipeline.store.names import name_damage
@@ -355,7 +355,6 @@ _LINE_STRIP, _TEXT = 4, 9
 _LEVELS = {"info": 20, "warning": 30, "error": 40}
 _COLOURS = {"info": theme.ON_COMMAND, "warning": theme.SLIP_RAMP[1], "error": theme.SLIP_RAMP[3]}
 _MOST_POINTS = 20_000
-_CAP_QUANTILE = 0.98
 _LIFT_M = 0.4
 
 
@@ -369,7 +368,7 @@ def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) ->
     """
     if track.is_empty():
         return
-    cap = float(track["modulus"].quantile(_CAP_QUANTILE) or 1.0) or 1.0
+    cap = float(track["modulus"].quantile(CAP_QUANTILE) or 1.0) or 1.0
     for (segment,), rows in track.group_by("segment", maintain_order=True):
         ramp = _ramp(rows["modulus"].fill_null(0.0).to_numpy() / cap)
         fields: dict[str, Given] = {

@@ -24,7 +24,7 @@ from pipeline.fleet.trend import (
 from pipeline.report import MISSING, Cell, Column, Picture, Table, begin_large, format_number, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.scene import format_ends
+from pipeline.report.scene import CAP_QUANTILE, format_ends
 from pipeline.report.theme import (
     Channel,
     Chart,
@@ -280,8 +280,6 @@ def _tabulate_levels(series: Series) -> pl.DataFrame:
 MOST_MAPS = 12
 """Largest number of maps on a page: those with most runs and cells; the table of cells has all."""
 _SIDE = 420
-_TOP = 0.98
-"""Quantile at the upper end of the colours: a few cells of a stuck vehicle would dominate the scale."""
 _DEGREES = 180.0 / math.pi
 _SHOWN = (
     ("slip", "Slip", "share of the motion lost", "%"),
@@ -369,7 +367,7 @@ def _draw_cells(
     extent = [find_extent(pl.concat([rows[f"low_{axis}"], rows[f"high_{axis}"]])) for axis in "xy"]
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1], width=_SIDE)
     known = rows[column].drop_nulls()
-    top = float(known.quantile(_TOP, "linear") or 0.0) or 1.0
+    top = float(known.quantile(CAP_QUANTILE, "linear") or 0.0) or 1.0
     in_unit = f" [{unit}]" if unit else ""
     name = f"cells_{number}"
     drawn = rows.with_columns(pl.col(column).clip(upper_bound=top).alias(f"{column}_shown"))

@@ -272,7 +272,8 @@ _DEFAULT_RATE_HZ = 20.0
 _HOLE_PERIODS = 2.5
 _WIDEST_PIXELS = 1200
 _FAR_M = 10_000.0
-_CAP_QUANTILE = 0.98
+CAP_QUANTILE = 0.98
+"""Quantile at the upper end of colours: a few samples of a stuck vehicle would dominate the scale."""
 _WORST_S = 20.0
 
 
@@ -357,7 +358,7 @@ class Scene:
         sound = self.sound_slip.get(self.report.main_input)
         if sound is None:
             return 1.0
-        top = sound["modulus"].quantile(_CAP_QUANTILE) or 0.0
+        top = sound["modulus"].quantile(CAP_QUANTILE) or 0.0
         return round_up(top) if top > 0.0 else 1.0
 
     @cached_property
