@@ -298,7 +298,8 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
     finally:
         workforce.dismiss()
     problems, removed = _tidy_up(store, mirror, request)
-    growing = [Line(path=str(path), state="growing", reason="still being written") for path in listed.growing]
+    why = f"changed less than {request.settle_s:g} s ago, or still being written: run the batch again"
+    growing = [Line(path=str(path), state="growing", reason=why) for path in listed.growing]
     skipped = [Line(path=str(each.path), state="skipped", reason=each.reason) for each in listed.skipped]
     lines = [*_list_plan(plan), *map(_make_line, result.reports), *_list_remaining(result)]
     return Outcome(

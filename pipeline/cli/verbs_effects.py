@@ -287,6 +287,8 @@ def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415 - heavy
 
+    if not answers:  # the errors were said
+        return
     proposal = next((one.proposal for one in answers if one.proposal is not None), None)
     if proposal is None:
         refusals = [find_refusal(run) for answer in answers for run in answer.runs]

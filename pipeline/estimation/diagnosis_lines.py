@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
@@ -12,6 +13,7 @@ from pipeline.core import INPUT_WORDS, format_share
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
+from pipeline.estimation.apportion import UNEXPLAINED
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
@@ -26,6 +28,7 @@ from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     SEARCH_CUT,
     format_verdict,
+    holds_formula,
     is_small,
     list_added,
     measure_excess,
@@ -58,6 +61,10 @@ _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
 _CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
+_VALUE = re.compile(r'^(\w+) = \{value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
+_IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
+"""Inputs of formulas in words."""
+_CAUSES = {"localization_noise": "localization noise", UNEXPLAINED: "the formula in the model"}
 _FINDINGS_SHOWN = 4
 """Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
 FINDING_LABELS = ("findings", "further", "notes")
@@ -229,18 +236,31 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
-    rows.append(format_unexplained(run.unexplained.to_json()))
-    formula = (run.unexplained.formula or "").splitlines()
-    rows += [f"{name_formula(run.ladder)}: {line}" for line in formula if line.startswith("v_")]
+    rows.append(format_unexplained(run.unexplained.to_json(), run.ladder))
+    rows += [f"{name_formula(run.ladder)}: {line}" for line in _list_formula(run.unexplained.formula or "")]
     return [*rows, *_suggest_next_steps(run)]
 
 
-def format_unexplained(rest: Mapping[str, object]) -> str:
-    """The structure of the residual that nothing explains: its share of the residual, and what it depends on.
+def _list_formula(text: str) -> Iterator[str]:
+    """Each term of a formula as model files have it, with its numbers, and its inputs in words."""
+    numbers = [(name, f"{float(value):.3g} {unit}") for name, value, unit in _VALUE.findall(text)]
+    for line in text.splitlines():
+        if line.startswith("v_"):
+            names = set(re.findall(r"\w+", line))
+            known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
+            known += [f"{name} the {words}" for name, words in _IDEAL.items() if name in names]
+            yield ", ".join([line.replace('"', ""), *known])
 
-    A suggested formula is compared with the whole residual, all else with that of one channel.
+
+def format_unexplained(rest: Mapping[str, object], ladder: Sequence[Mapping[str, object]] = ()) -> str:
+    """The structure of the residual that no effect explains: its share of the residual, and its dependence.
+
+    A formula is compared with the whole residual, all else with that of one channel.
     """
     share = number_in(rest, "share")
+    if holds_formula(ladder):
+        part = "part" if share is None else format_share(share)
+        return f"a formula explains {part} of what the effects leave: {rest.get('where', '')}"
     channel = "" if rest.get("formula") else f" {_CHANNELS.get(str(rest.get('channel')), 'motion')}"
     what = f"{'part' if share is None else format_share(share)} of the residual{channel}"
     return f"{what} has a structure that the model does not explain: {rest.get('where', '')}"
@@ -269,7 +289,8 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
     known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one is not None}
     explained = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
     with_learned = " and ".join(format_share(one["with_learned"]) for one in known.values())
-    return f"physics explains {' and '.join(explained)}, a learned term {with_learned}, without a cause"
+    beyond = f"with a function learned from the data, which gives no cause, {with_learned}"
+    return f"the effects explain {' and '.join(explained)}; {beyond}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:
@@ -304,8 +325,7 @@ def _format_budget(run: RunDiagnosis) -> str:
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [
-                f"{one.name.replace('_noise', ' noise')} {format_share(one.share, 0)}"
-                for one in budget.shares
+                f"{_CAUSES.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.shares
             ]
             signs = "; below zero: it makes slip larger" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"

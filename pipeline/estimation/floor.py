@@ -297,8 +297,7 @@ def estimate_floor(problem: Problem) -> Errors:
     comparisons = problem.parts[0].comparisons
     described = [_list_conditions(comparison) for comparison in comparisons]
     repeats = np.array([_measure_repeats(comparisons, described, gap) for gap in _GAPS_S])
-    # One share for all gaps: their differences distinguish noise from motion.
-    squares = repeats[:, 0] * np.nan_to_num(np.nanmedian(repeats[:, 1], axis=0), nan=1.0)
+    squares = repeats[:, 0] * np.array([_smooth_falling(shares) for shares in repeats[:, 1].T]).T
     # Differences that grow with the time between windows are structure: they have an unknown cause.
     windows = sum(history.shape[0] for history, _ in described)
     x, y, w = (split_differences(np.maximum(row, _LEAST), windows) for row in squares.T)
@@ -399,6 +398,23 @@ def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]
     error = least[:-1] * np.sqrt(2.0 / seen[:-1] + 2.0 / (seen[-1] - seen[:-1]))
     alike = least[:-1][beyond - least[:-1] > _CLEARLY * error]
     return float(least[-1]), float(min([least[-1], *alike]) / max(least[-1], _LEAST))
+
+
+def _smooth_falling(shares: Floats) -> Floats:
+    """Shares by gap as they fall with it: the least squares fit that never rises, one where all are unknown.
+
+    What is not linear grows with the gap; one share for all gaps would make structure of it.
+    """
+    known = np.flatnonzero(np.isfinite(shares))
+    if not known.size:
+        return np.ones(shares.size)
+    values, count = shares[known], known.size
+    fitted = [
+        min(max(values[first:last].mean() for last in range(at + 1, count + 1)) for first in range(at + 1))
+        for at in range(count)
+    ]
+    smooth: Floats = np.interp(np.arange(shares.size), known, fitted)
+    return smooth
 
 
 def _hold(values: Floats) -> Floats:

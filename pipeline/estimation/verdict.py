@@ -77,10 +77,10 @@ def format_verdict(diagnosis: Content) -> str:
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
-        clause = f"{_join_clauses(clauses[:count])}; " if count else ""
-        verdict = _join(
-            opening, f"{clause}with {_name_model(ladder[-1], count)} in the model {remaining}", *rest
-        )
+        said = dict([*clauses.items()][:count])
+        clause = f"{_join_clauses([*said.values()])}; " if count else ""
+        model = _name_model(ladder[-1], len(said.keys() - {FORMULA}))
+        verdict = _join(opening, f"{clause}with {model} in the model {remaining}", *rest)
         if len(verdict) <= _LONGEST:
             break
     return verdict
@@ -123,10 +123,10 @@ def split_main(
         read: the id of one of them, and whether it was corrected.
 
     Returns:
-        Main and smaller effects in their order; without one of `rank_main` all are main.
+        Main and smaller effects in their order; where `rank_main` lists none, nor a formula, all are main.
     """
     first = rank_main(ladder)
-    if not any(read(effect)[0] in first for effect in effects):
+    if not first.keys() & {FORMULA, *(read(effect)[0] for effect in effects)}:
         return list(effects), []
     is_main = [name in first or corrected for name, corrected in map(read, effects)]
     main = [effect for effect, chosen in zip(effects, is_main, strict=True) if chosen]
@@ -160,15 +160,18 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     return [*sentences, "No known effect explains it"]
 
 
-def _list_clauses(diagnosis: Content) -> list[str]:
-    """What the robot does by each main effect of the ladder, the one that removes most first."""
+def _list_clauses(diagnosis: Content) -> dict[str, str]:
+    """What the robot does by each main effect of the ladder, by its id, the one that removes most first."""
     undecided = {one.get("in_model") for one in objects_in(diagnosis, "undecided")}
     known = {
         str(one["id"]): str(one["clause"])
         for one in objects_in(diagnosis, "effects")
         if one.get("clause") and one["id"] not in undecided
     }
-    return [known[name] for name in rank_main(objects_in(diagnosis, "ladder")) if name in known]
+    if where := str(mapping_in(diagnosis, "unexplained").get("where", "")).partition(":")[0]:
+        known[FORMULA] = f"the {where}"
+    main = rank_main(objects_in(diagnosis, "ladder"))
+    return {name: known[name] for name in main if name in known}
 
 
 def _describe_choice(diagnosis: Content) -> str:
@@ -230,9 +233,14 @@ def _name_model(step: Content, shown: int) -> str:
     return " and ".join(filter(None, [words, formula]))
 
 
+def holds_formula(ladder: Sequence[Content]) -> bool:
+    """Whether the written model holds the formula of a structure that no effect explains."""
+    return bool(ladder) and FORMULA in _list_ids(ladder[-1])
+
+
 def name_formula(ladder: Sequence[Content]) -> str:
     """What the formula of an unexplained structure is: a part of the written model, or a proposal."""
-    return "formula in the model" if ladder and FORMULA in _list_ids(ladder[-1]) else "suggested term"
+    return "formula in the model" if holds_formula(ladder) else "suggested term"
 
 
 def _compare(diagnosis: Content, before: str) -> str:

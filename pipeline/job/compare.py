@@ -306,14 +306,13 @@ def choose_input(runs: pl.DataFrame) -> str:
 
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
-    """Warn of runs whose recorded command has a wrong scale: their slip of the command is invalid."""
+    """Warn of runs whose recorded command was rescaled: their slip from commands rests on an estimate."""
     doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
     runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
     if not runs:
         return []
-    return [
-        f"read with care, the recorded command is scaled wrongly (use --input measured): {', '.join(runs)}"
-    ]
+    text = "read with care, the recorded command had another scale, which was estimated and corrected"
+    return [f"{text} (--input measured does without): {', '.join(runs)}"]
 
 
 def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:

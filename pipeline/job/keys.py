@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import SlipError, guess_names
-from pipeline.core.arrays import Ints
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
 from pipeline.logs import (
@@ -269,16 +269,24 @@ def _measure_topic(
         return plain
     periods = np.diff(np.sort(log_time)).astype(np.float64) / 1e9
     median = float(np.median(periods))
+    gaps = periods > max(_GAP_PERIODS * median, _SMALLEST_GAP_S)
     latency = None
     if header_time is not None and header_time.any():
         latency = float(np.median(log_time - header_time)) / 1e9
     return replace(
         plain,
-        rate_hz=1.0 / median if median > 0.0 else None,
+        rate_hz=_measure_rate(periods, gaps),
         largest_gap_s=float(periods.max()),
-        gaps=int((periods > max(_GAP_PERIODS * median, _SMALLEST_GAP_S)).sum()),
+        gaps=int(gaps.sum()),
         latency_s=latency,
     )
+
+
+def _measure_rate(periods: Floats, gaps: Flags) -> float | None:
+    """Messages per second without the gaps [Hz]; with them where they are most of the time; None of none."""
+    between = periods if periods[gaps].sum() > 0.5 * periods.sum() else periods[~gaps]
+    seconds = float(between.sum())
+    return between.size / seconds if seconds > 0.0 else None
 
 
 def _choose(

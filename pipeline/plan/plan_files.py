@@ -142,6 +142,7 @@ def _format_csv(plan: Plan) -> str:
 
 def _format_toml(plan: Plan) -> str:
     turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
+    faster = "max_steering_rate_radps" if plan.steered else "max_yaw_acceleration_radps2"
     lines = ["# What to drive next. `slip plan --check` compares the drive with these expectations."]
     lines += [f"# {line}" for line in (*SAFETY, plan.format_rest()) if line]
     lines += _format_table(
@@ -160,7 +161,7 @@ def _format_toml(plan: Plan) -> str:
             "max_speed_mps": plan.limits.speed_mps,
             turn: plan.limits.turn,
             "max_acceleration_mps2": plan.limits.acceleration_mps2,
-            "max_steering_rate_radps" if plan.steered else "max_yaw_acceleration_radps2": plan.limits.turn_rate,
+            faster: plan.limits.turn_rate,
             "max_lateral_acceleration_mps2": plan.limits.lateral_mps2,
         }
     )

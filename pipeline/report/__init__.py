@@ -345,7 +345,8 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
         .select("run", "input", "median_modulus", "distance", "samples")
         .collect()
     )
-    facts = medians.group_by("run").agg(pl.col("distance").max(), pl.col("samples").max())
+    # Those of the commands where they were recorded, as everywhere.
+    facts = medians.sort("input").group_by("run").agg(pl.col("distance", "samples").first())
     for name in ("command", "measured"):
         one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
         facts = facts.join(one, on="run", how="left")

@@ -291,7 +291,7 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     if rest:
         formula = str(rest.get("formula") or "")
         example = f"; {name_formula(objects_in(diagnosis, 'ladder'))}" if formula else ""
-        yield "unexplained", f"{format_unexplained(rest)}{example}", formula
+        yield "unexplained", f"{format_unexplained(rest, objects_in(diagnosis, 'ladder'))}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]

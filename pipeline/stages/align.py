@@ -83,7 +83,8 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     if abs(np.log(forward)) > _SCALED:
         text = (
             f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded "
-            "command is scaled wrongly (another vehicle's wheel radius, or a unit); it was corrected"
+            "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
+            f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
         )
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))

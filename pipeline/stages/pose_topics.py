@@ -223,7 +223,8 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
     if gaps.any():
         lengths = np.diff(t)[gaps[1:]]
         count, longest = int(lengths.size), float(lengths.max())
-        text = f"{count} gaps in the poses of {topic}, the longest {longest:.3g} s: the run is split there"
+        gap = "1 gap" if count == 1 else f"{count} gaps"
+        text = f"{gap} in the poses of {topic}, the longest {longest:.3g} s: the run is split there"
         findings.append(Finding("pose_gap", "info", text, where=topic, value=longest, count=count))
     if jumps.any():
         count = int(jumps.sum())

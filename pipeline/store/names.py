@@ -42,6 +42,12 @@ _KNOWN = (
         "Choose another folder with --results or give your user the right to this one",
     ),
     (
+        (errno.ENOENT,),
+        "no_folder",
+        "the folder of the results cannot be made",
+        "Choose another folder with --results",
+    ),
+    (
         (errno.ENOTDIR, errno.EEXIST),
         "not_a_folder",
         "there is a file where the folder of the results, or one in it, should be",

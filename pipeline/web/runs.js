@@ -8,13 +8,16 @@ const ORDERS = {
 };
 const ORDER_WORDS = { slip: "most slip first", name: "by name", length: "longest first" };
 
-// How far a run can be trusted: 0 nothing was said against it, 1 something was, 2 it allows no conclusions.
+// How far a run cannot be trusted: the number of losses and warnings; infinite where it allows no conclusions.
 const doubt = (run) => {
-  const worst = run.findings.map((finding) => ({ error: 2, warning: 1 })[finding.severity] ?? 0);
-  return Math.max(run.losses.length ? 1 : 0, Number.isFinite(run.median_modulus) ? 0 : 2, ...worst);
+  const severe = Object.groupBy(run.findings, (finding) => finding.severity);
+  if (severe.error || !Number.isFinite(run.median_modulus)) return Infinity;
+  return run.losses.length + (severe.warning?.length ?? 0);
 };
 
-export const sortBySoundness = (runs) => [...runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
+const compareDoubt = (a, b) => (a === b ? 0 : a - b);
+
+export const sortBySoundness = (runs) => [...runs].sort((a, b) => compareDoubt(doubt(a), doubt(b)) || ORDERS.slip(a, b));
 
 const sayHealth = (run) => {
   const told = [run.losses.length && "losses", run.findings.some((finding) => finding.severity === "error") && "no conclusions"].filter(Boolean).join(", ");

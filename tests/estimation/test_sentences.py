@@ -212,5 +212,23 @@ def test_a_late_encoder_and_the_formula_of_the_model_are_said() -> None:
         timing = {"wheel_delay_s": 0.334}
         run = RunDiagnosis("run", "command", ladder=ladder, unexplained=rest, timing=timing)
         texts = [text for _, text in list_lines(run)]
-        assert f"{words}: v_y = a * v0" in texts
+        assert f"{words}: v_y = a * v0, v0 the ideal forward speed" in texts
         assert "the model takes the encoders as 334 ms late" in texts
+
+
+def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_unexplained() -> None:
+    where = "lateral error depends on forward speed: +0.1 m/s at -1.8 m/s, -0.1 m/s at -0.3 m/s"
+    formula = 'v_y = "k_1 * v0 * v0"\nk_1 = {value = 0.08188, unit = "s/m", bounds = [-50, 50]}\n'
+    rest = Unexplained(0.66, "y", ("y",), where, formula, {}, "measured")
+    ladder = tuple(
+        {"effects": ids, "t_mrmse_m": error, "r_mrmse_rad": 0.04}
+        for ids, error in (([], 0.15), ([FORMULA], 0.054), ([FORMULA, "lateral_drift"], 0.052))
+    )
+    floor = {"t_mrmse_m": 0.05, "r_mrmse_rad": 0.04}
+    run = RunDiagnosis("run", "measured", ladder=ladder, unexplained=rest, noise_floor=floor)
+    texts = [text for _, text in list_lines(run)]
+    assert "The lateral error depends on forward speed; with one effect and a fitted formula" in texts[0]
+    assert f"a formula explains 66 % of what the effects leave: {where}" in texts
+    shown = "formula in the model: v_y = k_1 * v0 * v0, k_1 = 0.0819 s/m, v0 the ideal forward speed"
+    assert shown in texts
+    assert not any("does not explain" in text for text in texts)

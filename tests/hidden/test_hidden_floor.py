@@ -16,6 +16,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model
+from pipeline.simulate import simulate_case
 
 # Random motion of its usual size and three times that, late and repeated poses, cars, fast vehicles.
 _CATEGORIES = ("natural", "late", "cars", "single", "empty")
@@ -67,3 +68,17 @@ def test_gaps_without_pairs_of_windows_do_not_lower_the_noise() -> None:
         gaps = squares.copy()
         gaps[unknown] = np.nan
         assert split_differences(gaps, 2_500).jitter == pytest.approx(whole)
+
+
+def _measure_floor(effects: dict[str, dict[str, float]], folder: Path) -> float:
+    log = simulate_case("ideal_husky", effects, out=folder / "log.mcap", duration_s=180.0, seed=1)
+    options = Options(out=folder / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(log, options).manifest)
+    return Problem([load_recording(recording, vehicle)], vehicle, Input.COMMAND).floor.r_mrmse_rad
+
+
+def test_a_ground_that_changes_half_way_does_not_lower_the_noise_floor(tmp_path: Path) -> None:
+    """It was a seventh of its value: the share of what is linear falls with the gap between windows."""
+    empty = _measure_floor({}, tmp_path / "empty")
+    change = {"terrain_change": {"k_v": 1.0, "k_w": 0.6, "at_s": 60.0}}
+    assert _measure_floor(change, tmp_path / "change") == pytest.approx(empty, rel=0.15)
