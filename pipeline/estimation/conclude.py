@@ -215,7 +215,8 @@ def _describe_rest(unexplained: Unexplained | None, lead: str, room: float) -> s
     if unexplained is not None:
         return "Apart from this dependence, the residual is disturbance and localization noise"
     if not lead and room > ABOVE_FLOOR:
-        return f"The remaining error is {room:.1f} times the noise floor, and no recorded signal predicts it"
+        times = f"{room:.1f} times the noise floor"
+        return f"The remaining error is {times}, and no term that was tried predicts it"
     return lead or "The residual does not depend on any recorded signal: disturbance and localization noise"
 
 

@@ -324,7 +324,7 @@ _WORDS = {
     "wheels": "the wheels deviate from the model for seconds at a time",
     "body": "the motion deviates from the model for seconds at a time",
 }
-_BEYOND = ", and no recorded signal predicts it"
+_BEYOND = ", and no term that was tried predicts it"
 
 
 def describe(paths: Sequence[Explored], lead: str = "") -> Unexplained | None:

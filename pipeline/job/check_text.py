@@ -207,7 +207,8 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         )
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
-    return f"{text}  p = {change.p:.2g}"
+    within = f", {change.p_within:.2g} within these recordings" if change.status == "differs" else ""
+    return f"{text}  p = {change.p:.2g}{within}"
 
 
 def _format_resolution(check: Check, name: str) -> str:

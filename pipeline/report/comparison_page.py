@@ -277,8 +277,10 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
 
 def _format_pair(row: Mapping[str, object]) -> str | Cell:
     verdict = judge_pair(row)
-    if verdict in (DIFFERENT, OF_TWO_RUNS):
+    if verdict == DIFFERENT:
         return Cell("different", tag="b")
+    if verdict == OF_TWO_RUNS:
+        return "different as two single runs"
     return "too few runs for a test" if verdict == TOO_FEW else "no significant difference"
 
 

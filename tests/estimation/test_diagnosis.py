@@ -339,7 +339,7 @@ def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tm
     left = run.unexplained
     assert left is not None
     assert "w" in left.channels
-    assert "no recorded signal predicts it" in left.where
+    assert "no term that was tried predicts it" in left.where
     assert left.formula is None
     assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
 

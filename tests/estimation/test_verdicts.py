@@ -21,7 +21,7 @@ _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
 _CLAIMS = (
     NOTHING_MISSING,
     "not depend on any recorded signal",
-    "no recorded signal predicts",
+    "no term that was tried predicts",
 )
 
 
