@@ -450,6 +450,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
         own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
         runs = slip.points.height
-        latest = f"{slip.quantity} latest {slip.latest:.3g} {slip.unit}"
+        name = slip.quantity.replace("median_modulus", "median slip speed")
+        latest = f"{name} latest {slip.latest:.3g} {slip.unit}"
         lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

@@ -129,7 +129,7 @@ class Unless:
     def doubt(self) -> str:
         """Why it is not reported itself."""
         evidence = math.floor(100.0 * self.evidence)
-        return f"{self.id} is not significant: {evidence} % of the required evidence and gain"
+        return f"{self.id} is not significant: it reaches {evidence} % of the required evidence and gain"
 
     @property
     def note(self) -> Mapping[str, Json]:
