@@ -11,7 +11,7 @@ from pipeline.estimation.diagnosis import CAUSE
 from pipeline.estimation.diagnosis_lines import format_learned_share, format_unexplained
 from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
-from pipeline.estimation.verdict import name_formula
+from pipeline.estimation.verdict import holds_formula, name_formula
 from pipeline.models.catalogue import list_effects
 from pipeline.report import (
     MISSING,
@@ -290,8 +290,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
         formula = str(rest.get("formula") or "")
-        example = f"; {name_formula(objects_in(diagnosis, 'ladder'))}" if formula else ""
-        yield "unexplained", f"{format_unexplained(rest, objects_in(diagnosis, 'ladder'))}{example}", formula
+        example = f"; {name_formula(report.ladder)}" if formula else ""
+        label = "formula" if holds_formula(report.ladder) else "unexplained"
+        yield label, f"{format_unexplained(rest, report.ladder)}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]

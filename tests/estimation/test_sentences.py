@@ -232,3 +232,9 @@ def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_
     shown = "formula in the model: v_y = k_1 * v0 * v0, k_1 = 0.0819 s/m, v0 the ideal forward speed"
     assert shown in texts
     assert not any("does not explain" in text for text in texts)
+    report = RunReport({"run": "a"}, diagnosis=run.to_json())
+    assert report.structure == {"formula": where, "unexplained": None}
+    assert (
+        "formula",
+        f"a formula explains 66 % of what the effects leave: {where}; formula in the model",
+    ) in [(label, text) for label, text, _ in _list_open(report)]
