@@ -183,7 +183,7 @@ class TopicHealth:
         type_name: message type.
         messages: number of messages that can be read; of an encoding that cannot be read, those of the index.
         messages_stated: number of messages that the index of the log states.
-        rate_hz: inverse of the median period of log times; None with fewer than two messages.
+        rate_hz: messages per second without the gaps; None with fewer than two messages.
         largest_gap_s: longest time between two messages.
         gaps: intervals between messages longer than three periods (and 0.12 s).
         latency_s: median of log time minus header stamp; None without stamps.

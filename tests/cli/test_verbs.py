@@ -218,6 +218,7 @@ def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> No
         (("compare", "log.mcap"), "log.mcap: this is not a results folder. Give the folder"),
         (("compare", "folder"), "folder: this is not a results folder. Give the folder"),
         (("diagnose", "no/such"), "there is no run 'no/such': no run has been analyzed yet. Analyze"),
+        (("diagnose", "no/such", "--apply", "model.toml"), "there is no run 'no/such'"),
         (("inspect", "missing.mcap"), "missing.mcap: there is no such file. Check the path."),
         (("plan", "--check", "robot.toml", "log.mcap"), "this is not a plan.toml"),
         (("model", "add", "robot.toml", "drive_lag", "--on"), "--on names no run"),

@@ -5,12 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.keys import _measure_rate
 from pipeline.simulate import write_samples
 
 ROW = re.compile(
@@ -78,3 +80,30 @@ def split_numbers(message: object) -> tuple[object, list[float]]:
     else:
         return message, []
     return [layout for layout, _ in parts], [number for _, numbers in parts for number in numbers]
+
+
+def test_a_vehicle_that_the_metadata_of_the_log_contradict_is_warned_about(
+    samples: Path, tmp_path: Path
+) -> None:
+    """The log names its vehicle, and nothing else in it shows one."""
+    for name in ("husky_a200", "warthog"):
+        options = Options(
+            out=tmp_path / name, report=False, diagnosis=False, overrides={"vehicle": {"preset": name}}
+        )
+        findings = analyze_log(samples / "husky_tile.mcap", options).summary["findings"]
+        texts = [str(one["text"]) for one in findings if one["id"] == "vehicle_contradiction"]
+        assert [text.partition(" (")[0] for text in texts] == (
+            [] if name == "husky_a200" else ["the log looks like a Clearpath Husky A200"]
+        )
+
+
+def test_the_rate_of_a_topic_is_that_of_its_messages_between_gaps() -> None:
+    """A median period would be that within bunches."""
+    steady, bunched = np.full(200, 0.05), np.tile([0.001, 0.099], 100)
+    for periods in (steady, bunched):
+        assert _measure_rate(periods, np.zeros(200, dtype=bool)) == pytest.approx(20.0)
+    with_gap = np.append(steady, 5.0)
+    assert _measure_rate(with_gap, with_gap > 1.0) == pytest.approx(20.0)
+    rare = np.array([0.001, 30.0, 0.001, 30.0])
+    assert _measure_rate(rare, rare > 1.0) == pytest.approx(4.0 / 60.002)
+    assert _measure_rate(np.zeros(3), np.zeros(3, dtype=bool)) is None

@@ -88,7 +88,7 @@ def test_no_manoeuvre_asks_for_more_than_the_limits(vehicle: Vehicle) -> None:
         assert np.abs(speed).max() <= limits.speed_mps + 1e-9
         assert (np.abs(turn) <= limit_yaw_rate(speed, vehicle, limits) + 1e-9).all()
         assert np.abs(np.diff(speed, prepend=0.0)).max() * RATE_HZ <= limits.acceleration_mps2 * (1 + 1e-6)
-        assert np.abs(np.diff(turn, prepend=0.0)).max() * RATE_HZ <= 1.5 * limits.turn_rate
+        assert np.abs(np.diff(turn, prepend=0.0)).max() * RATE_HZ <= limits.turn_rate * (1 + 1e-6)
         assert speed[-1] == turn[-1] == 0.0
 
 
@@ -329,6 +329,9 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     first, limits, why = format_plan(unanswered, None, ())
     assert first.endswith("answers an open question: no file is written")
     assert limits.startswith("limits  ")
+    steepest = float(np.abs(np.diff(plan.commands.turn)).max()) * RATE_HZ
+    (stated,) = re.findall(r"([\d.]+) rad/s2", limits)
+    assert steepest <= 1.001 * float(stated)
     assert why == "not decided  a or b: too small"
 
 
