@@ -25,10 +25,11 @@ from read_task import list_tasks, read_task
 from real_tasks import cut_real_windows, cut_stretch, list_listed, write_tables
 from score_answers import measure_scores, score_ring
 from seal_truth import SealError, open_ring, read_key, unseal
-from task_draws import NAMES, Lengths, draw_task
+from task_draws import NAMES, SIMULATED, Lengths, draw_task
 from test_injections import DRIVE, tables  # noqa: F401 - a fixture
 
 from pipeline.core import SlipError
+from pipeline.simulate import list_effects
 
 HERE = Path(make_rings.__file__).parent
 SHORT = ["--seconds", "30", "--held-out-seconds", "14"]
@@ -242,6 +243,15 @@ def test_the_published_list_is_sound() -> None:
         assert entry["parameters"]
         assert all("unit" in parameter for parameter in entry["parameters"].values())
         assert all(name in NAMES[other]["same_as"] for other in entry.get("same_as", ())), name
+
+
+def test_the_published_list_has_the_parameters_of_every_effect_that_is_simulated() -> None:
+    """One was missing of friction in contact: a task with it could not be written."""
+    for effect in list_effects():
+        if effect.id in SIMULATED:
+            # Tasks have changes in time, none over the map.
+            simulated = {parameter.name for parameter in effect.parameters} - {"at_x"}
+            assert simulated <= set(NAMES[SIMULATED[effect.id]]["parameters"]), effect.id
 
 
 def test_an_effect_put_into_a_recording_becomes_a_task(tables: Any, tmp_path: Path) -> None:  # noqa: F811, ANN401
