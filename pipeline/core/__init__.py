@@ -156,11 +156,16 @@ JSON_DIGITS = 6
 """Significant digits of estimates in JSON, more than any estimate has."""
 
 
+def round_digits(value: float, digits: int = JSON_DIGITS) -> float:
+    """A number of that many significant digits."""
+    return float(f"{value:.{digits}g}")
+
+
 def finite_or_none(value: float, digits: int | None = None) -> float | None:
     """A number, rounded to ``digits`` significant digits if given; None if it is not finite."""
     if not math.isfinite(value):
         return None
-    return value if digits is None else float(f"{value:.{digits}g}")
+    return value if digits is None else round_digits(value, digits)
 
 
 def pick(item: object, *names: str) -> dict[str, Any]:

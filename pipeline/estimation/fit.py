@@ -182,9 +182,9 @@ def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *
             break
         state = state.hold(fit.state.effects)
     state = fit.state.add(*(effect.rounded for effect in state.effects))
-    residual = part.find_residuals(state)
-    fit = _enter(part, make_weights(residual, part), state, fit.free, Until(enough=_SETTLED))
-    return replace(fit, loss=measure_loss(part, fit.weights, residual, state, fit.free))
+    fit = _enter(part, fit.weights, state, fit.free, Until(enough=_SETTLED))
+    weights = make_weights(fit.residual, part)
+    return replace(fit, weights=weights, loss=measure_loss(part, weights, fit.residual, state, fit.free))
 
 
 def _are_same(one: State, other: State, free: Sequence[Free]) -> bool:

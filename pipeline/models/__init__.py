@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import tomlkit
 
-from pipeline.core import JSON_DIGITS, naming_os_errors
+from pipeline.core import naming_os_errors, round_digits
 from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import (
     AddedEffect,
@@ -187,7 +187,7 @@ def format_value(value: object) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "[" + ", ".join(format_value(item) for item in value) + "]"
     if isinstance(value, float):
-        value = _round(value)
+        value = round_digits(value)
     return str(tomlkit.item(value).as_string())
 
 
@@ -197,7 +197,3 @@ def _key(name: str) -> str:
 
 def _exactly(value: float) -> str:
     return str(tomlkit.item(float(value)).as_string())
-
-
-def _round(value: float) -> float:
-    return float(f"{value:.{JSON_DIGITS}g}")

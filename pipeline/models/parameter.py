@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from pipeline.core import JSON_DIGITS
+from pipeline.core import round_digits
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
@@ -364,7 +364,7 @@ class Parameter:
     def round(self, value: float) -> float:
         """A value as model files have it: of six digits, unless that moves it out of its bounds."""
         low, high = self.bounds
-        rounded = float(f"{value:.{JSON_DIGITS}g}")
+        rounded = round_digits(value)
         return rounded if low <= rounded <= high and value != self.neutral else value
 
     def is_one_sided(self, low: float, high: float) -> bool:

@@ -10,14 +10,11 @@ const ORDER_WORDS = { slip: "most slip first", name: "by name", length: "longest
 
 // How far a run cannot be trusted: the number of losses and warnings; infinite where it allows no conclusions.
 const doubt = (run) => {
-  const severe = Object.groupBy(run.findings, (finding) => finding.severity);
-  if (severe.error || !Number.isFinite(run.median_modulus)) return Infinity;
-  return run.losses.length + (severe.warning?.length ?? 0);
+  const count = (severity) => run.findings.filter((finding) => finding.severity === severity).length;
+  return count("error") || !Number.isFinite(run.median_modulus) ? Infinity : run.losses.length + count("warning");
 };
 
-const compareDoubt = (a, b) => (a === b ? 0 : a - b);
-
-export const sortBySoundness = (runs) => [...runs].sort((a, b) => compareDoubt(doubt(a), doubt(b)) || ORDERS.slip(a, b));
+export const sortBySoundness = (runs) => [...runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
 
 const sayHealth = (run) => {
   const told = [run.losses.length && "losses", run.findings.some((finding) => finding.severity === "error") && "no conclusions"].filter(Boolean).join(", ");
