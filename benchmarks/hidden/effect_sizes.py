@@ -68,6 +68,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
             "scrub": 0.4 * size * rim,
             "creep": 0.07,
         },
+        "torque_limit": {"tau": 0.3 * size, "limit": wheel / (1.5 * size)},
         "brake_lag": {"tau_drive": 0.6 * size, "tau_brake": 0.2 * size},
         "body_acceleration_limit": {"limit": speed / (2.0 * size)},
         "turn_acceleration_limit": {"limit": turn / (2.0 * size)},

@@ -201,6 +201,7 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
+    from pipeline.fleet.deployments import ZONES  # noqa: PLC0415 - heavy
     from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -237,6 +238,9 @@ def draw(  # noqa: D417 - arguments document themselves
         f"{drawn.measure.name} {_format_value(row['value'], drawn.measure.unit)}   {row['zone']} risk"
         for row in drawn.own.sort("energy", descending=True).iter_rows(named=True)
     ]
+    if lines:
+        bounds = ", ".join(f"{name} below {end:g}" for name, end in ZONES[:-1])
+        lines.append(f"risk    by log10(energy / J) + complexity / 10: {bounds}, {ZONES[-1][0]} above")
     placed = f"{drawn.points.height} of {drawn.deployments.height} deployments placed"
     lines += [f"! {note}" for note in drawn.notes]
     lines.append(f"page    {page}    ({placed}; {drawn.measure.name} {INPUT_WORDS[drawn.input]})")

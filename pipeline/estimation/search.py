@@ -373,21 +373,21 @@ def _list_doubtful(selection: Selection, current: CandidateModel) -> list[str]:
 
 
 def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
-    """The model with one effect replaced by its special cases, if the data do not distinguish them."""
+    """The model with one effect replaced by its special cases or one of them, if the data allow it."""
     most = (1.0 + LEAST_GAIN) * selection.sum_losses(current)
     usual = {one.id: one().make_usual(selection.largest) for one in selection.candidates}
     for effect in current.state.effects:
         cases = [usual[name] for name in effect.contains if name in usual and name not in current.ids]
-        if not cases or effect.id in selection.given or excluded & {case.id for case in cases}:
+        if effect.id in selection.given or excluded & {case.id for case in cases}:
             continue
-        simpler = selection.enter(current.state.drop([effect.id]).add(*cases))
-        if selection.sum_losses(simpler) >= most:
-            continue
-        simpler = _make_sound(selection, simpler)
-        if simpler.numbers >= current.numbers:
-            continue
-        if selection.sum_losses(simpler) < most and selection.judge(simpler, current).share < 1.0:
-            return simpler
+        for some in dict.fromkeys([tuple(cases), *((case,) for case in cases)]) if cases else ():
+            simpler = selection.enter(current.state.drop([effect.id]).add(*some))
+            if selection.sum_losses(simpler) < most:
+                simpler = _make_sound(selection, simpler)
+            if simpler.numbers >= current.numbers or selection.sum_losses(simpler) >= most:
+                continue
+            if selection.judge(simpler, current).share < 1.0:
+                return simpler
     return current
 
 

@@ -139,7 +139,7 @@ def write_sdf(file: ModelFile, current: Current) -> str:
 
 
 def _is_limit(effect: Effect) -> bool:
-    return any(_LIMITS.intersection(parameter.quantities) for parameter in effect.parameters)
+    return all(_LIMITS.intersection(parameter.quantities) for parameter in effect.parameters)
 
 
 def _add_ground(world: ET.Element) -> None:

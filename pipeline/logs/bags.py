@@ -10,7 +10,7 @@ import os
 import re
 from collections.abc import Callable, Iterator
 from collections.abc import Set as AbstractSet
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import cache, partial
 from io import BufferedReader, FileIO
@@ -250,9 +250,13 @@ def _refuse_damage(path: Path, container: str) -> Iterator[None]:
         raise
     except Exception as error:
         hint = f"Copy it from its origin again, or repair it there with {_REPAIRS[container]}"
+        why = _format_error(error)
+        with suppress(OSError), path.open("rb") as file:
+            if not is_whole(file.read(LONGEST_HEAD), path.stat().st_size):
+                why = "its end is missing"
         raise LogError(
             "log_unreadable",
-            f"the {container} cannot be opened ({_format_error(error)})",
+            f"the {container} cannot be opened ({why})",
             where=str(path),
             hint=hint,
         ) from error

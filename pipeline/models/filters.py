@@ -124,6 +124,61 @@ def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
     return state + 0.5 * step, state + step
 
 
+def lag_within(
+    signal: Floats, tau: float, limit: float, step_s: float, resets: Resets, start: Floats
+) -> Floats:
+    """First-order lag as `lag_signal` whose rate stays within ``limit`` per second.
+
+    Args:
+        signal: cell means of the input, shape (n,).
+        tau: time constant [s].
+        limit: largest rate [unit/s]; infinity is a lag.
+        step_s: width of a cell [s].
+        resets: where the state is reset.
+        start: the state there; the input's own value where it is NaN, shape (k,).
+    """
+    if not math.isfinite(limit):
+        return lag_signal(signal, tau, step_s, resets, start)
+    states, lagged = set_states(signal, resets, start), np.empty(signal.size)
+    _lag_within(np.ascontiguousarray(signal), states, max(tau, _INSTANT_S), limit, step_s, lagged)
+    return lagged
+
+
+@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+def _lag_within(
+    signal: Floats, states: Floats, tau: float, limit: float, step_s: float, lagged: Floats
+) -> None:
+    """See `lag_within`; ``states`` as in `_lag`. The time of a step within a cell is that of `_limit`."""
+    state, last = signal[0], signal.size - 1
+    for cell in range(signal.size):
+        asked = signal[cell]
+        if not math.isnan(states[cell]):
+            state = states[cell]
+        elif 0 < cell < last and math.isnan(states[cell + 1]):
+            before, after = signal[cell - 1], signal[cell + 1]
+            if (asked - before) * (after - asked) > 0.0:
+                until = (after - asked) / (after - before) * step_s
+                first, state = _pull(before, state, tau, limit, until)
+                second, state = _pull(after, state, tau, limit, step_s - until)
+                lagged[cell] = (first + second) / step_s
+                continue
+        passed, state = _pull(asked, state, tau, limit, step_s)
+        lagged[cell] = passed / step_s
+        if abs(state) < _TINY:
+            state = 0.0
+
+
+@compiled()
+def _pull(goal: float, state: float, tau: float, limit: float, time: float) -> tuple[float, float]:
+    """Integral and last value of a state that approaches its goal for some time: a ramp, then a lag."""
+    gap = state - goal
+    ramp = min(max(abs(gap) / limit - tau, 0.0), time)
+    gone = limit * ramp if gap > 0.0 else -limit * ramp
+    left = gap - gone
+    grown = -math.expm1((ramp - time) / tau)
+    return goal * time + ramp * (gap - 0.5 * gone) + tau * left * grown, goal + left * (1.0 - grown)
+
+
 def lag_unevenly(
     signal: Floats, taus: tuple[float, float], step_s: float, resets: Resets, start: Floats
 ) -> Floats:

@@ -156,7 +156,7 @@ class Plan:
             asked.append(one.question)
         texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            texts.append(f"the manoeuvres above do not fit into these limits and this time: {_ROOM}")
+            texts.append(f"what would observe them does not fit into these limits and this time: {_ROOM}")
         return texts
 
     def to_json(self) -> dict[str, object]:

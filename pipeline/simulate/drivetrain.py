@@ -139,9 +139,9 @@ def drive_wheels(
         if pitch is not None:
             wheel = _load(wheel, pitch, vehicle.wheel_radius_m, effects.value("grade_load", "k"))
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)
-        if effects.is_active("brake_lag"):
-            wheel = _brake(wheel, effects, step_s)
-        return _swing(wheel, effects, step_s) if effects.is_active("drive_overshoot") else wheel
+        for name, loop in (("torque_limit", _pull), ("brake_lag", _brake), ("drive_overshoot", _swing)):
+            wheel = loop(wheel, effects, step_s) if effects.is_active(name) else wheel
+        return wheel
 
     if vehicle.moves_sideways:
         corners = invert_corners(vehicle, speed, commands.sideways, turn)
@@ -181,6 +181,22 @@ def _rest_at_reversal(asked: Floats, rest_s: float, step_s: float) -> Floats:
         direction = speed or direction
         speeds.append(0.0 if cell < until else speed)
     return np.array(speeds)
+
+
+def _pull(asked: Floats, effects: Effects, step_s: float) -> Floats:
+    """A wheel that a motor of limited torque pulls towards what it is asked for, by Euler's method."""
+    short = step_s / _STEPS
+    rate, most = (
+        short / max(effects.value("torque_limit", "tau"), short),
+        short * effects.value("torque_limit", "limit"),
+    )
+
+    def step(now: float, goal: float) -> float:
+        for _ in range(_STEPS):
+            now += min(max(rate * (goal - now), -most), most)
+        return now
+
+    return follow(asked, step)
 
 
 def _brake(asked: Floats, effects: Effects, step_s: float) -> Floats:

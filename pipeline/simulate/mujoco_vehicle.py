@@ -25,7 +25,6 @@ from pipeline.simulate.facts import Effects, SimulateError, Vehicle, resolve_eff
 from pipeline.simulate.messages import SimulatedRun, Truth, ask_wheels, record_truth
 from pipeline.simulate.path import BodyMotion, Path
 from pipeline.simulate.scenario import Scenario
-from pipeline.simulate.surface import tilt_quaternion
 
 _STEP_S = 0.002
 _SETTLE_STEPS = 500
@@ -101,7 +100,7 @@ def simulate_skid_steer(scenario: Scenario, machine: SkidSteer) -> SimulatedRun:
     _refuse_formulas(scenario, effects)
     commands, asked = ask_wheels(scenario, effects, _STEP_S)
     position, quaternion, wheels = _step_world(scenario, machine, asked)
-    tilt = tilt_quaternion(scenario.ground)
+    tilt = scenario.ground.tilt
     count = position.shape[0]
     position = rotate(tilt, position)
     quaternion = multiply_quaternions(np.broadcast_to(tilt, (count, 4)), quaternion)
@@ -162,9 +161,7 @@ def _step_world(scenario: Scenario, machine: SkidSteer, asked: Drive) -> tuple[F
 
 def _write_world(scenario: Scenario, machine: SkidSteer) -> str:
     vehicle = scenario.vehicle
-    down = rotate(
-        invert_quaternions(tilt_quaternion(scenario.ground)), np.array([0.0, 0.0, -GRAVITY_MPS2])
-    ).tolist()
+    down = rotate(invert_quaternions(scenario.ground.tilt), np.array([0.0, 0.0, -GRAVITY_MPS2])).tolist()
     radius = vehicle.wheel_radius_m
     wheels = "".join(_write_wheel(name, vehicle, machine) for name in _WHEELS)
     pairs = "".join(

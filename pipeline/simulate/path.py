@@ -24,14 +24,6 @@ from pipeline.simulate.programs import (
     walk_in_plane,
 )
 from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
-from pipeline.simulate.surface import (
-    Surface,
-    Vector,
-    cross,
-    make_surface,
-    slide_onto_plane,
-    tilt_quaternion,
-)
 
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #
@@ -238,6 +230,55 @@ class Path:
     velocity: Floats
 
 
+Vector = tuple[float, float, float]
+
+_WAVES = 6
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Height h(x, y) = slope_x x + slope_y y + sum of a sin(p x + q y + c).
+
+    Attributes:
+        slope_x, slope_y: gradient of the plane.
+        waves: (a [m], p [1/m], q [1/m], c [rad]) of each wave.
+    """
+
+    slope_x: float
+    slope_y: float
+    waves: tuple[tuple[float, float, float, float], ...]
+
+    def height_at(self, x: float, y: float) -> float:
+        """Height [m] of the ground at a place [m]."""
+        hills = sum(size * math.sin(p * x + q * y + phase) for size, p, q, phase in self.waves)
+        return self.slope_x * x + self.slope_y * y + hills
+
+    def normal_at(self, x: float, y: float) -> Vector:
+        """Unit normal of the ground at a place [m], pointing up."""
+        slope_x, slope_y = self.slope_x, self.slope_y
+        for size, p, q, phase in self.waves:
+            change = size * math.cos(p * x + q * y + phase)
+            slope_x += change * p
+            slope_y += change * q
+        scale = 1.0 / math.sqrt(1.0 + slope_x * slope_x + slope_y * slope_y)
+        return -slope_x * scale, -slope_y * scale, scale
+
+
+def make_surface(ground: Ground, generator: np.random.Generator) -> Surface:
+    """Draw the hills of a ground; wavelengths spread by a factor of two about the asked one."""
+    up_x, up_y, up_z = rotate(ground.tilt, np.array([0.0, 0.0, 1.0])).tolist()
+    waves: list[tuple[float, float, float, float]] = []
+    if ground.hill_m > 0.0:
+        size = ground.hill_m * math.sqrt(2.0 / _WAVES)
+        directions = generator.uniform(0.0, math.pi, _WAVES).tolist()
+        stretches = (2.0 ** generator.uniform(-0.5, 0.5, _WAVES)).tolist()
+        phases = generator.uniform(0.0, 2.0 * math.pi, _WAVES).tolist()
+        for direction, stretch, phase in zip(directions, stretches, phases, strict=True):
+            number = 2.0 * math.pi / (ground.hill_length_m * stretch)
+            waves.append((size, number * math.cos(direction), number * math.sin(direction), phase))
+    return Surface(-up_x / up_z, -up_y / up_z, tuple(waves))
+
+
 def integrate_path(
     motion: BodyMotion,
     drive: Drive,
@@ -269,7 +310,7 @@ def integrate_path(
 def _cross_plane(
     motion: BodyMotion, step_s: float, slope_gain: float, ground: Ground, start: tuple[float, float, float]
 ) -> Path:
-    tilt = tilt_quaternion(ground)
+    tilt = ground.tilt
     velocity = motion.velocity
     heading = start[2] + integrate_cells(velocity[:, 2], step_s=step_s)
     if slope_gain != 0.0:
@@ -318,7 +359,7 @@ class _Walk:
 
 def _cross_surface(walk: _Walk, surface: Surface, ground: Ground, start: tuple[float, float, float]) -> Path:
     step = walk.step_s
-    tilt = tilt_quaternion(ground)
+    tilt = ground.tilt
     x, y, _ = rotate(tilt, np.array([start[0], start[1], 0.0])).tolist()
     ahead_x, ahead_y, ahead_z = rotate(tilt, np.array([math.cos(start[2]), math.sin(start[2]), 0.0])).tolist()
     normal = surface.normal_at(x, y)
@@ -440,3 +481,20 @@ class CompactedGround:
         wave = math.sin(12.9898 * patch[0] + 78.233 * patch[1])
         loss = self.first * (1.0 + self.rough * wave) * self.ratio ** self._passes.get(patch, 0)
         return -loss * state.v0, 0.0, -loss * state.w0
+
+
+def cross(first: Vector, second: Vector) -> Vector:
+    """Cross product of two vectors, in plain floats because it runs at every step."""
+    return (
+        first[1] * second[2] - first[2] * second[1],
+        first[2] * second[0] - first[0] * second[2],
+        first[0] * second[1] - first[1] * second[0],
+    )
+
+
+def slide_onto_plane(vector: Vector, normal: Vector) -> Vector:
+    """The unit vector nearest to ``vector`` that lies in the plane of ``normal``."""
+    lift = vector[0] * normal[0] + vector[1] * normal[1] + vector[2] * normal[2]
+    x, y, z = (vector[i] - lift * normal[i] for i in range(3))
+    scale = 1.0 / math.sqrt(x * x + y * y + z * z)
+    return x * scale, y * scale, z * scale

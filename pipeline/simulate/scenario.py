@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
+from pipeline.core.rigid import quaternions_from_euler
 from pipeline.simulate.facts import VEHICLES, Layout, SimulateError, Vehicle
 
 if TYPE_CHECKING:
@@ -221,6 +222,13 @@ class Ground:
     roll_rad: float = 0.0
     hill_m: float = 0.0
     hill_length_m: float = 25.0
+
+    @property
+    def tilt(self) -> Floats:
+        """Attitude of the plane as a quaternion, shape (4,)."""
+        angles = (np.array([angle]) for angle in (self.roll_rad, self.pitch_rad, 0.0))
+        tilt: Floats = quaternions_from_euler(*angles)[0]
+        return tilt
 
 
 @dataclass(frozen=True)

@@ -244,7 +244,9 @@ def test_what_a_drive_remembers_is_flagged_though_no_effect_takes_it(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", ["brake_lag", "reversal_pause", "side_lag", "steering_play", "wheel_servo"])
+@pytest.mark.parametrize(
+    "kind", ["brake_lag", "reversal_pause", "side_lag", "steering_play", "torque_limit", "wheel_servo"]
+)
 def test_uneven_drives_are_named(kind: str, tmp_path: Path) -> None:
     assert is_exact(play(Job("single", 150_500, kind), tmp_path))
 

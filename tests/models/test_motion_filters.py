@@ -15,6 +15,7 @@ from pipeline.models.filters import (
     follow_with_play,
     lag_signal,
     lag_unevenly,
+    lag_within,
     limit_rate,
     swing_signal,
     wait_at_reversal,
@@ -204,6 +205,42 @@ def test_an_uneven_lag_agrees_with_stepping_through_it(
             value = moved
         expected.append(sum(inside) / fine)
     assert np.allclose(lagged, expected, atol=0.02)
+
+
+@given(
+    st.lists(st.floats(-5.0, 5.0), min_size=2, max_size=12),
+    st.tuples(st.floats(0.0, 1.0), st.floats(0.5, 50.0)),
+    st.floats(-5.0, 5.0),
+)
+@settings(max_examples=40, deadline=None)
+def test_a_lag_within_a_rate_agrees_with_stepping_through_it(
+    levels: list[float], numbers: tuple[float, float], start: float
+) -> None:
+    (tau, limit), fine = numbers, 400
+    share, most = min(STEP / fine / max(tau, 1e-9), 1.0), limit * STEP / fine
+    signal = np.repeat(levels, 20)
+    resets = resets_at([0], signal.size, [start])
+    lagged = lag_within(signal, tau, limit, STEP, resets, np.array([start]))
+    value, expected = start, []
+    for target in signal.tolist():
+        inside = []
+        for _ in range(fine):
+            moved = value + float(np.clip((target - value) * share, -most, most))
+            inside.append(0.5 * (value + moved))
+            value = moved
+        expected.append(sum(inside) / fine)
+    assert np.allclose(lagged, expected, atol=0.02)
+
+
+def test_a_lag_within_a_rate_is_a_lag_or_a_ramp() -> None:
+    signal = np.repeat(np.random.default_rng(1).uniform(-3.0, 3.0, 30), 25)
+    signal[100:110] += 0.3
+    resets = resets_at([0, 300], signal.size, [0.5, np.nan])
+    start = resets.start[:, 0]
+    plain = lag_signal(signal, 0.3, STEP, resets, start)
+    assert np.array_equal(lag_within(signal, 0.3, math.inf, STEP, resets, start), plain)
+    ramp = limit_rate(signal, 10.0, STEP, resets, start)
+    assert np.allclose(lag_within(signal, 0.0, 10.0, STEP, resets, start), ramp, atol=1e-6)
 
 
 def test_with_equal_time_constants_an_uneven_lag_is_a_lag() -> None:

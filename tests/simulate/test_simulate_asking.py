@@ -46,7 +46,7 @@ CATALOGUE_IDS = {
     *("turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew"),
     *("yaw_misalignment", "lever_arm", "clock_offset"),
     *("lateral_scale", "roller_slip", "speed_track"),
-    *("brake_lag", "reversal_pause", "side_lag", "steering_play", "wheel_servo"),
+    *("torque_limit", "brake_lag", "reversal_pause", "side_lag", "steering_play", "wheel_servo"),
     *("drive_gain", "difference_gain", "side_gain", "drive_overshoot", "grade_load"),
     *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling", "contact_friction"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),

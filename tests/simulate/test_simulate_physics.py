@@ -232,6 +232,20 @@ def test_a_braked_wheel_slows_down_fast_and_speeds_up_slowly() -> None:
     np.testing.assert_allclose(left[back], np.exp((stands - time[back]) / 0.5) - 1.0, atol=5e-3)
 
 
+def test_a_motor_of_limited_torque_ramps_and_then_lags() -> None:
+    tau, limit = 0.2, 3.0 * V0 / 0.165
+    drive = simulate_run(
+        replace(THERE_AND_BACK, effects={"torque_limit": {"tau": tau, "limit": limit}})
+    ).truth.drive
+    left, time = drive.left * 0.165 / V0, (np.arange(drive.left.size) + 1.0) * drive.step_s
+    ramp = 1.0 / 3.0 - tau
+    first = np.where(time < ramp, 3.0 * time, 1.0 - 3.0 * tau * np.exp((ramp - time) / tau))
+    np.testing.assert_allclose(left[time < 4.0], first[time < 4.0], atol=2e-3)
+    ramp, since = 2.0 / 3.0 - tau, time - 4.0
+    back = np.where(since < ramp, 1.0 - 3.0 * since, 3.0 * tau * np.exp((ramp - since) / tau) - 1.0)
+    np.testing.assert_allclose(left[since > 0.01], back[since > 0.01], atol=2e-3)
+
+
 def test_a_wheel_rests_before_it_reverses() -> None:
     drive = simulate_run(replace(THERE_AND_BACK, effects={"reversal_pause": 0.3})).truth.drive
     time = (np.arange(drive.left.size) + 0.5) * drive.step_s
