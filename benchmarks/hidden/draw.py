@@ -61,6 +61,7 @@ MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
     "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
+    "effective_wheelbase",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")

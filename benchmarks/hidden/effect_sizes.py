@@ -56,6 +56,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "steering_sensor_offset": {"o": sign * 0.04 * size},
         "steering_gain": {"g": 1.0 - 0.15 * size},
         "steering_lag": {"tau": 0.4 * size},
+        "effective_wheelbase": {"k": 1.0 + sign * 0.12 * size},
         "understeer": {"K": 0.035 * size},
         "steering_play": {"g": 0.05 * size},
         "reversal_pause": {"d": 0.4 * size},

@@ -270,6 +270,10 @@ class Facts:
         """Effective track width [m]."""
         return combine(operator.mul, self.measure("track_width_m"), self.take(Quantity.TRACK))
 
+    def find_wheelbase(self) -> Amount:
+        """Effective wheelbase [m]."""
+        return combine(operator.mul, self.measure("wheelbase_m"), self.take(Quantity.WHEELBASE))
+
     def find_largest_steering(self) -> Amount:
         """Steering angle at the largest command [rad]."""
         return combine(operator.mul, self.measure("max_steering_rad"), self.take(Quantity.STEERING_GAIN))
@@ -278,7 +282,7 @@ class Facts:
         """Smallest turning radius that a car reaches to both sides [m]."""
         gain, offset = self.take(Quantity.STEERING_GAIN), self.take(Quantity.STEERING_OFFSET)
         angle = self.measure("max_steering_rad").change(lambda a, g, o: g * a - abs(o), gain, offset)
-        return self.measure("wheelbase_m").change(_find_circle, angle)
+        return self.find_wheelbase().change(_find_circle, angle)
 
     def find_speed_delay(self) -> Amount:
         """Delay of the speed behind a smooth command [s]: sum of dead time and time constants."""

@@ -130,7 +130,7 @@ def _add_differential(facts: Facts, sheet: Sheet) -> None:
 
 def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
     node = "ackermann_steering_controller.ros__parameters"
-    sheet.add(f"{node}.wheelbase", facts.measure("wheelbase_m"))
+    sheet.add(f"{node}.wheelbase", facts.find_wheelbase())
     sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
     sheet.add(f"{node}.traction_wheels_radius", facts.find_radius())
     sheet.head.append(
@@ -149,7 +149,7 @@ ROS2_CONTROL = Target(
 _FILTER = "ekf_filter_node.ros__parameters"
 _CONTROLLERS = {
     "differential": ("diff_drive_controller", {Quantity.RADIUS, Quantity.RADIUS_DIFFERENCE, Quantity.TRACK}),
-    "ackermann": ("ackermann_steering_controller", {Quantity.RADIUS}),
+    "ackermann": ("ackermann_steering_controller", {Quantity.RADIUS, Quantity.WHEELBASE}),
 }
 _UNSEEN = {Quantity.STEERING_GAIN, Quantity.STEERING_OFFSET}
 """Quantities that encoders on the steering do not measure: their own offset and scale."""
@@ -260,7 +260,7 @@ def write_autoware(file: ModelFile, current: Current) -> str:
     """
     facts, sheet = start_sheet(file, AUTOWARE, "ackermann")
     sheet.add(f"{_ALL}.wheel_radius", facts.find_radius(), _INFO)
-    sheet.add(f"{_ALL}.wheel_base", facts.measure("wheelbase_m"), _INFO)
+    sheet.add(f"{_ALL}.wheel_base", facts.find_wheelbase(), _INFO)
     sheet.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
     sheet.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
     delay, lag = facts.take(Quantity.COMMAND_DELAY), facts.take(Quantity.STEERING_LAG)
@@ -318,7 +318,7 @@ def write_px4(file: ModelFile, current: Current) -> str:
         sheet.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
         sheet.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
     else:
-        sheet.add("RA_WHEEL_BASE", facts.measure("wheelbase_m"))
+        sheet.add("RA_WHEEL_BASE", facts.find_wheelbase())
         sheet.add("RA_MAX_STR_ANG", facts.find_largest_steering())
     sheet.add(_FULL_SPEED, _find_full_speed(facts, current))
     _add_limits(facts, sheet)
@@ -413,7 +413,7 @@ def write_vesc(file: ModelFile, current: Current) -> str:
     sheet.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
     straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
     sheet.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
-    sheet.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.measure("wheelbase_m"))
+    sheet.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.find_wheelbase())
     limit = facts.find_speed_acceleration()
     sheet.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
     return write_yaml(facts, sheet)

@@ -242,7 +242,7 @@ class _Builder:
         """Distance between the sides and between the axles of the contacts [m]; zero for one axle."""
         nominal, wheelbase = self.vehicle.track_width_m, self.vehicle.wheelbase_m
         if self.is_car:
-            wheelbase = wheelbase or 1.0
+            wheelbase = (wheelbase or 1.0) * (self._value(TwinRole.WHEELBASE) or 1.0)
             if nominal is None:
                 nominal = 0.6 * wheelbase
                 self.notes.append(f"track width {nominal:.3g} m is assumed: the motion does not depend on it")

@@ -37,7 +37,7 @@ def write_gazebo(file: ModelFile, current: Current) -> str:
         sheet.add("plugin.wheel_separation", facts.find_track(), note)
     else:
         sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
-        sheet.add("plugin.wheel_base", facts.measure("wheelbase_m"))
+        sheet.add("plugin.wheel_base", facts.find_wheelbase())
         angle = facts.measure("max_steering_rad").change(operator.mul, facts.take(Quantity.STEERING_GAIN))
         sheet.add("plugin.steering_limit", angle)
     _add_limits_of_gazebo(facts, sheet)
@@ -93,7 +93,7 @@ _LIMITS = {
     Quantity.WHEEL_SPEED_LIMIT,
     Quantity.WHEEL_ACCELERATION_LIMIT,
 }
-_OF_GROUND = {Quantity.RADIUS, Quantity.TRACK}
+_OF_GROUND = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
 _BESIDE_PLUGINS = {
     TwinRole.DELAY,
     TwinRole.SPEED_LAG,

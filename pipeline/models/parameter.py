@@ -57,6 +57,7 @@ class Quantity(enum.Enum):
     RADIUS = ("effective over nominal wheel radius", "1", math.prod)
     RADIUS_DIFFERENCE = ("right radius less left radius over their mean", "1", math.fsum)
     TRACK = ("effective over nominal track", "1", math.prod)
+    WHEELBASE = ("effective over nominal wheelbase", "1", math.prod)
     COMMAND_DELAY = ("dead time of a command", "s", math.fsum)
     SPEED_LAG = ("time constant of the speed", "s", math.fsum)
     TURN_LAG = ("time constant of turning by the difference of wheel speeds", "s", math.fsum)
@@ -94,6 +95,7 @@ class TwinRole(enum.Enum):
     RADIUS = "effective over nominal wheel radius"
     RADIUS_DIFFERENCE = "right radius less left radius over their mean"
     TRACK = "effective over nominal track"
+    WHEELBASE = "effective over nominal wheelbase"
     CREEP = "time constant by which the body follows its wheels"
     CREEP_ASIDE = "time constant of creep along the axles"
     SLIDING = "creep, friction and turning inertia of wheels that slide"

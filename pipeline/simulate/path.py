@@ -120,7 +120,10 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
         v0, s0, w0 = move_by_corners(vehicle, rims)
         s0, w0 = s0 * effects.value("lateral_scale", "k"), w0 / effects.value("effective_track", "k")
     elif vehicle.kind == "ackermann":
-        span = vehicle.wheelbase_m + effects.value("understeer", "K") * v0**2
+        span = (
+            vehicle.wheelbase_m * effects.value("effective_wheelbase", "k")
+            + effects.value("understeer", "K") * v0**2
+        )
         tyres = drive.steering + effects.value("steering_sensor_offset", "o")
         w0 = v0 * np.tan(tyres) / span
     else:

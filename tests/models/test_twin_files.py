@@ -167,6 +167,8 @@ def test_a_car_steers_late_off_centre_and_understeers() -> None:
     )
     turn = drive(rounded, told)[-1, 2]
     assert turn == pytest.approx(speed * math.tan(0.2) / (length + 0.05 * speed**2), rel=0.02)
+    turn = drive(make(CAR, effective_wheelbase=1.2), told)[-1, 2]
+    assert turn == pytest.approx(speed * math.tan(0.2) / (1.2 * length), rel=0.02)
 
 
 @pytest.mark.parametrize("to", ["mjcf", "sdf"])
@@ -186,7 +188,7 @@ def test_every_effect_is_in_the_twin_or_said_not_to_be(vehicle: Vehicle, to: str
     inside = {
         "transport_delay", "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral",
         "lateral_skid", "body_inertia", "understeer", "steering_sensor_offset", "steering_offset",
-        "side_gain", "drive_gain", "contact_friction",
+        "side_gain", "drive_gain", "contact_friction", "effective_wheelbase",
     }  # fmt: skip
     assert set(file.model.ids) - outside <= inside
     # Creep and track of wheels that slide are those of the contact.

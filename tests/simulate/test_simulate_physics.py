@@ -166,6 +166,7 @@ DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
         ({"steering_sensor_offset": 0.05}, SPEED * math.tan(DELTA + 0.05) / 2.6),
         ({"steering_gain": 0.8}, SPEED * math.tan(0.8 * DELTA) / 2.6),
         ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2)),
+        ({"effective_wheelbase": 1.2}, SPEED * math.tan(DELTA) / (1.2 * 2.6)),
         ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 2.6),
         ({"body_turn_limit": 0.5}, 0.5),
     ],

@@ -21,12 +21,13 @@ from pipeline.models.effect import (
     Parameter,
     Plausible,
     Search,
+    Spread,
 )
 from pipeline.models.effects.acceleration_limit import AccelerationLimit
 from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S
 from pipeline.models.effects.drive_lag import TIME_CONSTANT, DriveLag
 from pipeline.models.filters import lag_within
-from pipeline.models.parameter import Conditions, Largest, Quantity
+from pipeline.models.parameter import WARTHOG_LAGS, Conditions, Largest, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -44,6 +45,7 @@ class TorqueLimit(DriveEffect):
             search=Search.STARTS,
             least=Least(0.015, Least.STAMPS, sampled=1.0),
             plausible=Plausible(0.0, 3.0, "as of a drive lag"),
+            between_runs=Spread(0.125, WARTHOG_LAGS),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
         Parameter(
