@@ -194,7 +194,7 @@ def _format_error(seen: Content) -> str:
     """Error of the last model, held out over the log and in the last seconds."""
     error = cast("Content", seen["knowledge"]).get("error")
     now = _format_medians(cast("Mapping[str, float]", seen["error_mps"]), "now")
-    return "; ".join(filter(None, [f"{error} after 2 s with the model so far" if error else "", now]))
+    return "; ".join(filter(None, [f"{error} over 2 s with the model so far" if error else "", now]))
 
 
 def _format_knowledge(knowledge: Content) -> list[tuple[str, str]]:

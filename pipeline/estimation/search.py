@@ -17,7 +17,6 @@ from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_i
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.parts import make_weights
-from pipeline.estimation.proposals import Candidate
 from pipeline.estimation.selection import USEFUL, CandidateModel, Context, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
 from pipeline.models.effect import Effect, Excitation, Place, Search
@@ -94,7 +93,8 @@ def find_unobservable(
     for candidate in selection.candidates:
         if final.state.find(candidate.id) is not None:
             continue
-        shift = _shift(selection, final, candidate)
+        with_it = final.state.add(candidate().make_usual(selection.largest))
+        shift = final.fit.residual - selection.part.find_residuals(with_it)
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
         separate = _project_out(own, column)
         independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
@@ -152,11 +152,6 @@ def suggest_manoeuvre(*effects: Effect) -> str:
     for effect in effects:
         needs += [need for need in effect.needs if need not in needs]
     return "; ".join(MANOEUVRES[need] for need in needs[:3])
-
-
-def _shift(selection: Selection, final: CandidateModel, candidate: Candidate) -> Floats:
-    changed = selection.part.find_residuals(final.state.add(candidate().make_usual(selection.largest)))
-    return final.fit.residual - changed
 
 
 _MOST_EFFECTS = 8
@@ -255,7 +250,8 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
     free = [effect for effect in current.state.effects if effect.id not in selection.given]
     simple = [effect for effect in free if len(effect.values) == 1]
     # Of effects that are linear in their parameter, an extension finds the common cause.
-    pairs = [pair for pair in combinations(simple, 2) if not all(map(_is_linear, pair))]
+    curved = {one.id for one in simple if any(p.search is not Search.DIRECT for p in one.parameters)}
+    pairs = [pair for pair in combinations(simple, 2) if not curved.isdisjoint(one.id for one in pair)]
     for names in (*((effect.id,) for effect in free), *((one.id, two.id) for one, two in pairs)):
         if selection.budget.is_spent():
             break
@@ -265,10 +261,6 @@ def exchange(selection: Selection, current: CandidateModel, excluded: set[str]) 
         if best is not current:
             return best
     return current
-
-
-def _is_linear(effect: Effect) -> bool:
-    return all(parameter.search is Search.DIRECT for parameter in effect.parameters)
 
 
 def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
@@ -328,7 +320,7 @@ def _fit_rivals(
         evidence = evidence.leave_out(name)
     # A rival must also reduce the loss by the minimum for naming.
     useful = min(USEFUL * selection.loss(current), (1.0 - LEAST_GAIN) * selection.loss(without))
-    models = selection.fit_hypotheses(without, evidence, least, useful, pairs=len(names) == 1)
+    models = selection.fit_hypotheses(without, evidence, least, useful)
     # Contact friction may collapse to the track that it replaces. Rough fits are many: no derivatives.
     models = [one for one in models if set(names).isdisjoint(one.ids)]
     return [replace(one, fit=one.fit.without_derivatives) if one.is_rough else one for one in models]
@@ -430,8 +422,8 @@ def search_body(context: Context, source: Input, known: Sequence[Effect], budget
     candidates = context.list_candidates(source)
     problem = context.problem.behind_wheels if source is Input.MEASURED else context.problem
     selection, first = open_selection(problem.whole, start, candidates, context.conditions, budget)
-    begin = _begin_whole(selection, first) if source is Input.MEASURED else first
-    return SearchResult(source.value, selection, first, *search_effects(selection, begin))
+    search = _search_both if source is Input.MEASURED else search_effects
+    return SearchResult(source.value, selection, first, *search(selection, first))
 
 
 def search_wheels(
@@ -454,8 +446,22 @@ def search_wheels(
     ]
     delayed = selection.enter_each([first.state.add(effect) for effect in late if effect.id not in first.ids])
     begin = choose(selection, first, [model for model in delayed if selection.is_sound(model)])
-    begin = _begin_whole(selection, begin)
-    return SearchResult("wheels", selection, first, *search_effects(selection, begin))
+    return SearchResult("wheels", selection, first, *_search_both(selection, begin))
+
+
+def _search_both(
+    selection: Selection, first: CandidateModel
+) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
+    """Search from a whole effect and without it: no single step exchanges it for several simple ones."""
+    final, near = search_effects(selection, _begin_whole(selection, first))
+    whole = {effect.id for effect in final.state.effects if effect.companions} - {*first.ids}
+    if not whole or selection.budget.is_spent():
+        return final, near
+    simple = tuple(one for one in selection.candidates if one.id not in whole)
+    without = replace(selection, candidates=simple, rivals={}, _dropped={})
+    other, _ = search_effects(without, without.reweight(first))
+    best = choose(selection, final, [selection.enter(other.fit)])
+    return (final, near) if best is final else search_effects(selection, selection.reweight(best))
 
 
 def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:

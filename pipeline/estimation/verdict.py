@@ -61,7 +61,7 @@ def format_verdict(diagnosis: Content) -> str:
     if not ladder:
         why = (str(one["text"]).rstrip(".") for one in findings if one.get("where") == "diagnosis")
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
-    opening = f"After {HORIZON_S:g} s the ideal model is {format_errors(ladder[0])} off"
+    opening = f"Over {HORIZON_S:g} s the ideal model is {format_errors(ladder[0])} off"
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)

@@ -327,14 +327,15 @@ class Facts:
         return rim, self._turn(rim)
 
     def list_unmapped(self, sheet: Sheet) -> list[str]:
-        """Effects that no parameter of a sheet covers, one line each with their parameters."""
-        used = frozenset[str]().union(*(setting.effects for setting in sheet.settings))
-        return [
-            "; ".join(self._format_source(effect, p) for p in effect.parameters if effect.is_used(p))
-            or effect.id
-            for effect in self.file.model
-            if effect.id not in used
-        ]
+        """Parameters of effects that a sheet does not cover, one line for each effect."""
+        used = {source for setting in sheet.settings for source in setting.sources}
+        lines = []
+        for effect in self.file.model:
+            texts = [self._format_source(effect, p) for p in effect.parameters if effect.is_used(p)]
+            missing = [text for text in texts if text not in used]
+            if missing or not texts:
+                lines.append("; ".join(missing) or effect.id)
+        return lines
 
     def format_fit(self) -> str:
         """Data that the model was fitted to; empty before a fit."""

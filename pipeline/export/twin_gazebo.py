@@ -125,7 +125,7 @@ def write_sdf(file: ModelFile, current: Current) -> str:
         *body.controller,
         *(e for e in file.model.effects if e.twin in _BESIDE_PLUGINS and e not in body.controller),
     ]
-    for line in [*list_head(file, SDF), *list_notes(body, [e for e in outside if not _is_limit(e)])]:
+    for line in [*list_head(file, SDF), *list_notes(body, filter(None, map(_take_off_limits, outside)))]:
         root.append(ET.Comment(write_comment(line)))
     world = ET.SubElement(root, "world", {"name": "twin"})
     physics = ET.SubElement(world, "physics", {"name": "1ms", "type": "ignored"})
@@ -138,8 +138,10 @@ def write_sdf(file: ModelFile, current: Current) -> str:
     return ET.tostring(root, encoding="unicode") + "\n"
 
 
-def _is_limit(effect: Effect) -> bool:
-    return all(_LIMITS.intersection(parameter.quantities) for parameter in effect.parameters)
+def _take_off_limits(effect: Effect) -> Effect | None:
+    """The effect without the limits that the plugin has; None where nothing else is left."""
+    limits = {p.name: p.neutral for p in effect.parameters if _LIMITS.intersection(p.quantities)}
+    return effect.change(**limits) if len(limits) < len(effect.parameters) else None
 
 
 def _add_ground(world: ET.Element) -> None:

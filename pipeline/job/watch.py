@@ -24,6 +24,7 @@ from pipeline.job.keys import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
+from pipeline.run import read_drive
 from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
@@ -299,6 +300,7 @@ class Watch:
         speeds = velocity.compute_velocities(
             tables["poses"], tables.get("imu", made.tables["imu"]), alignment.gyro,
             setup.configuration.velocity, where=where,
+            wheels=read_drive(tables.get("wheels"), aligned.vehicle),
         ).table  # fmt: skip
         slip = slip_stage.compute_slip(
             speeds,

@@ -15,7 +15,7 @@ from pipeline.core.compute import return_freed_memory
 from pipeline.job import STAGES, JobError, Options
 from pipeline.job.keys import EXTRACTED, TABLES, LogSetup
 from pipeline.logs import LogData, Loss, read_topics
-from pipeline.run import Alignment, read_alignment
+from pipeline.run import Alignment, read_alignment, read_drive
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velocity
 from pipeline.stages.align import align_tables
@@ -322,6 +322,7 @@ class Work:
             self.alignment.gyro,
             self.setup.configuration.velocity,
             where=str(self.setup.path),
+            wheels=read_drive(self._read("wheels"), self.vehicle),
         )
         self.write("velocities", made.table)
         return StageOutcome(made.findings)

@@ -284,8 +284,8 @@ def make_run(
     Raises:
         MotionError: ``no_poses``.
     """
-    commands = _read_drive(tables.get("commands"), vehicle)
-    wheels = _read_drive(tables.get("wheels"), vehicle)
+    commands = read_drive(tables.get("commands"), vehicle)
+    wheels = read_drive(tables.get("wheels"), vehicle)
     track = _read_track(tables["poses"], wheels, name)
     if wheels is not None and find_fastest_wheel(wheels).max() < _DEAD:
         wheels = None
@@ -381,15 +381,9 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
 
 def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> Track:
     parts: list[Track] = []
-    turned = np.zeros(0, dtype=np.int64)
-    if wheels is not None:
-        turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
     for piece in rigid.cut_segments(poses):
-        times, held = piece["t"], piece["held"]
-        fresh = rigid.select_fresh_poses(times, held)
-        if wheels is not None:
-            fresh = fresh[~rigid.find_waits(times, held, wheels.times, turned)[fresh]]
-        fresh = fresh[np.diff(times[fresh], prepend=-np.inf) > 0.0]
+        fresh = select_fresh(piece, wheels)
+        fresh = fresh[np.diff(piece["t"][fresh], prepend=-np.inf) > 0.0]
         if fresh.size > 1:
             fresh_columns = {column: values[fresh] for column, values in piece.items()}
             parts.append(_unroll(fresh_columns, parts[-1] if parts else None))
@@ -401,6 +395,15 @@ def _read_track(poses: pl.DataFrame, wheels: DriveSeries | None, name: str) -> T
     )
 
 
+def select_fresh(piece: Mapping[str, NDArray[Any]], wheels: DriveSeries | None) -> Ints:
+    """Indices of a segment's poses that carry information; no repeats while measured wheels turn."""
+    fresh = rigid.select_fresh_poses(times := piece["t"], held := piece["held"])
+    if wheels is not None:
+        turned = np.append(0, np.cumsum(find_fastest_wheel(wheels) > _ROLLS))
+        fresh = fresh[~rigid.find_waits(times, held, wheels.times, turned)[fresh]]
+    return fresh
+
+
 def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
     """Poses of one segment in the plane of motion; headings continue from the previous segment.
 
@@ -410,7 +413,7 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
     roll, pitch, yaw = rigid.euler_from_quaternions(quaternion)
     if before is not None:
         yaw = yaw + 2.0 * np.pi * np.round((before.heading[-1] - yaw[0]) / (2.0 * np.pi))
-    _, turn = rigid.measure_increments(position, quaternion)
+    turn = rigid.measure_increments(position, quaternion)[1]
     middle = rigid.slerp(quaternion[:-1], quaternion[1:], np.full(turn.shape[0], 0.5))
     moved = rigid.rotate(rigid.invert_quaternions(middle), np.diff(position, axis=0))
     heading = yaw[0] + np.concatenate(([0.0], np.cumsum(turn[:, 2])))
@@ -441,7 +444,8 @@ def read_wheel_times(table: pl.DataFrame) -> Floats:
     return times - table["latency"].to_numpy() if "latency" in table.columns else times
 
 
-def _read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+def read_drive(table: pl.DataFrame | None, vehicle: Vehicle) -> DriveSeries | None:
+    """Commands or measured wheels; None where there are none."""
     if table is None or table.is_empty():
         return None
     times = read_wheel_times(table)
@@ -472,11 +476,9 @@ def _distinct(times: Floats, values: Floats) -> tuple[Floats, Floats]:
 
 
 def _stop_when_silent(commands: DriveSeries, hold_s: float) -> DriveSeries:
-    times = commands.times
-    silent = np.flatnonzero(np.diff(times, append=np.inf) > hold_s)
-    at = silent + 1
-    stopped = np.insert(times, at, times[silent] + hold_s)
-    return commands.change(stopped, lambda signal: np.insert(signal, at, 0.0))
+    silent = np.flatnonzero(np.diff(commands.times, append=np.inf) > hold_s)
+    stopped = np.insert(commands.times, silent + 1, commands.times[silent] + hold_s)
+    return commands.change(stopped, lambda signal: np.insert(signal, silent + 1, 0.0))
 
 
 def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Floats]:
@@ -487,14 +489,12 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     rows = slip.filter(slip["input"] == leading).sort("t")
     step, times = rows["step"].to_numpy(), rows["t"].to_numpy()
     starts = times[np.concatenate(([True], np.diff(step) != 0))]
-    excluded = [slip.filter(slip["suspect"])["t"].to_numpy()]
+    excluded = [slip.filter(slip["suspect"])["t"].to_numpy(), times[[0, -1]] + (-1e-3, 1e-3)]
     # Motion without a live command has no rows: such stretches are not scored either. Commands before the
     # first one are unknown.
-    known = np.concatenate(
-        ([min(float(streams[0]), times[0]) - 0.05], times, [max(streams[-1], times[-1]) + 0.05])
-    )
+    ends = min(float(streams[0]), times[0]) - 0.05, max(streams[-1], times[-1]) + 0.05
+    known = np.concatenate((ends[:1], times, ends[1:]))
     holes = np.flatnonzero(np.diff(known) > 0.2 + ROUNDING_S)
     for hole in holes.tolist():
         excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - ROUNDING_S, 0.05))  # noqa: PERF401
-    excluded.append(np.array([times[0] - 1e-3, times[-1] + 1e-3]))
     return starts, np.unique(np.concatenate(excluded))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.core import NORMAL_95, arrays
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, tabulate_alignment
+from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, read_drive, tabulate_alignment
 from pipeline.run.heading import fit_gyro
 from pipeline.run.signals import STILL_MPS
 from pipeline.run.windows import WINDOW_S
@@ -256,7 +256,7 @@ def align_tables(
     hold = None
     if not commands.is_empty():
         hold = arrays.usual_hold(commands["t"].to_numpy()) if hold_s is None else hold_s
-    velocities, _ = differentiate_poses(tables["poses"], _GRID, where=where)
+    velocities, _ = differentiate_poses(tables["poses"], _GRID, read_drive(wheels, vehicle), where=where)
     times = velocities["t"].to_numpy()
     inputs = read_inputs(times, commands, wheels, vehicle, hold)
     moved = velocities.select("v_x", "v_y", "v_w").to_numpy()

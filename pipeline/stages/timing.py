@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from pipeline.core.arrays import (
     ROUNDING_S,
@@ -210,6 +211,8 @@ With 0.002 the error over 2 s on ice is 0.334 m instead of 0.311 m, on asphalt, 
 _NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
 """Least time between two poses after the correction [s], so that stamps stay in order."""
+_FASTEST_S = 2.0
+"""Time over which the largest speed of a run is measured [s]: the ages of its poses are short against it."""
 _LEAST_OF_USUAL = 0.5
 """Least fraction of the usual time between two poses after the correction: those at 100 Hz must not shift
 each other."""
@@ -278,8 +281,7 @@ def estimate_latency(run: MotionRun) -> tuple[Floats, float]:
         if seen.telling.sum() < _FEWEST:
             return nothing
         ages, spread = _estimate(track, seen, ages)
-        # Nor where it is not a number.
-        if not spread >= _LEAST_SPREAD:
+        if not spread >= _LEAST_SPREAD:  # nor where it is not a number
             return nothing
     return track.times - _take_off(track, ages), spread
 
@@ -310,9 +312,8 @@ def _estimate(track: Track, seen: _Seen, ages: Floats) -> tuple[Floats, float]:
     rows = pattern[seen.telling] * weight[seen.telling, None]
     normal = rows.T @ pattern[seen.telling]
     limited = np.clip(seen.age[seen.telling], -0.35, 0.35)
-    usual = pattern @ np.linalg.solve(
-        normal + 1e-6 * np.trace(normal) * np.eye(normal.shape[0]), rows.T @ limited
-    )
+    ridge = 1e-6 * np.trace(normal) * np.eye(normal.shape[0])
+    usual = pattern @ np.linalg.solve(normal + ridge, rows.T @ limited)
     beside = seen.age - usual
     spread = max(robust_spread(beside[seen.telling]), 1e-3)
     # A part of the spread is the heading's own noise.
@@ -357,8 +358,8 @@ def _smooth(track: Track, seen: _Seen, ages: Floats, usual: Floats, spread: floa
     ]
     known, noise = np.flatnonzero(seen.good & (seen.rate != 0.0)), _measure_position_noise(track)
     by_heading = (seen.noise / seen.rate[known]) ** 2 + _GYRO_CLOCK_S**2
-    moved, shortest = np.diff(track.path)[linked], _find_shortest_step(track)
-    step = np.maximum(wait - np.diff(ages), shortest)[linked]
+    moved, least = np.diff(track.path)[linked], _find_least_waits(track)
+    step = np.maximum(wait - np.diff(ages), least)[linked]
     pace: Complex = moved / step
     rough = np.ones(linked.size)
     for _ in range(_SMOOTHED):
@@ -367,8 +368,9 @@ def _smooth(track: Track, seen: _Seen, ages: Floats, usual: Floats, spread: floa
         motion = _list_motion(moved, pace, wait[linked] - step, step, linked, first, noise**2 * rough)
         states = _solve_equations([*by_wait, heard, *motion], track.times.size)
         ages = np.clip(states[:, _AGE], -_OLDEST, _OLDEST)
-        step = np.maximum(wait - np.diff(ages), shortest)[linked]
-        pace = _average_velocity(states, linked)
+        step = np.maximum(wait - np.diff(ages), least)[linked]
+        velocity = join_parts(states[:, 0], states[:, 1])
+        pace = 0.5 * (velocity[linked] + velocity[linked + 1])
         curve = np.diff(join_parts(states[:, 2], states[:, 3]))[linked] * step**2 / 12.0
         rest = np.abs(moved - pace * step + curve) / (_HUBER * noise * np.sqrt(2.0))
         # A position far off has no weight: even a bounded force of it would move the ages about it.
@@ -445,13 +447,6 @@ def _solve_equations(equations: Iterable[_Equations], poses: int) -> Floats:
     return solve_banded(matrix, right).reshape(poses, _STATES)
 
 
-def _average_velocity(states: Floats, linked: Ints) -> Complex:
-    """Mean velocity from each pose to the next one [m/s], shape (k,)."""
-    velocity = join_parts(states[:, 0], states[:, 1])
-    mean: Complex = 0.5 * (velocity[linked] + velocity[linked + 1])
-    return mean
-
-
 def _measure_position_noise(track: Track) -> float:
     """Noise of a position [m], from its spread across straight stretches of the path."""
     before, times, path = slice(None, -2), track.times, track.path
@@ -484,13 +479,23 @@ def _list_terms(track: Track) -> Floats:
 
 
 def _take_off(track: Track, ages: Floats) -> Floats:
-    """Stamps minus the ages, in their original order."""
-    count = _find_shortest_step(track) * np.arange(ages.size)
-    ordered: Floats = np.maximum.accumulate(track.times - ages - count) + count
+    """Stamps minus the ages, changed as little as their order and the way between poses require."""
+    least = np.append(0.0, np.cumsum(_find_least_waits(track)))
+    ordered: Floats = isotonic_regression(track.times - ages - least).x + least
     return ordered
 
 
-def _find_shortest_step(track: Track) -> float:
-    """Least time between two poses after the correction [s]: poses at 100 Hz must not shift each other."""
-    usual = float(np.median(np.diff(track.times))) if track.times.size > 1 else 0.0
-    return min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual)
+def _find_least_waits(track: Track) -> Floats:
+    """Least times between poses after the correction [s], shape (n - 1,).
+
+    The way to the next pose takes its time at the run's largest speed. It counts up to the usual wait, for
+    the pose may have jumped.
+    """
+    times, path, segment = track.times, track.path, track.segment
+    later = np.minimum(np.searchsorted(times, times + _FASTEST_S), times.size - 1)
+    whole = (segment[later] == segment) & (times[later] >= times + _FASTEST_S)
+    speed = np.abs(path[later] - path)[whole] / (times[later] - times)[whole]
+    usual = float(np.median(np.diff(times))) if times.size > 1 else 0.0
+    way = np.where(np.diff(segment) == 0, np.abs(np.diff(path)), 0.0)
+    waits = np.minimum(way / float(speed.max(initial=_DRIVING_MPS)), usual)
+    return np.maximum(waits, min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual))

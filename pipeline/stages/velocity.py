@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats
-from pipeline.run import Alignment, GyroFit
+from pipeline.run import Alignment, GyroFit, select_fresh
 from pipeline.run.heading import SPAN_S
-from pipeline.run.signals import ANSWERS_S, Limits, find_limits, trace_traction
+from pipeline.run.signals import ANSWERS_S, DriveSeries, Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
 from pipeline.stages.incidents import LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
@@ -123,6 +123,7 @@ def compute_velocities(
     settings: VelocitySection,
     *,
     where: str,
+    wheels: DriveSeries | None = None,
 ) -> VelocityResult:
     """Differentiate aligned poses into body velocities.
 
@@ -132,11 +133,12 @@ def compute_velocities(
         gyro: fit of the gyro to the poses; None without a good one.
         settings: grid rate [Hz], width of the fit [s], source of the yaw rate.
         where: the run, for error messages.
+        wheels: measured wheels, which tell a localization that waits from a vehicle at rest.
 
     Raises:
         StageError: no segment is long enough, or the gyro is requested and none is usable.
     """
-    table, skipped = differentiate_poses(poses, settings, where=where)
+    table, skipped = differentiate_poses(poses, settings, wheels, where=where)
     findings = []
     if skipped:
         are, hold = ("segment is", "holds") if skipped == 1 else ("segments are", "hold")
@@ -162,13 +164,14 @@ def compute_velocities(
 
 
 def differentiate_poses(
-    poses: pl.DataFrame, settings: VelocitySection, *, where: str
+    poses: pl.DataFrame, settings: VelocitySection, wheels: DriveSeries | None, *, where: str
 ) -> tuple[pl.DataFrame, int]:
     """Body velocities on the uniform grid of every segment, without those of a gyro.
 
     Args:
         poses: table `poses`; if it is not aligned yet, its stamps are used unchanged.
         settings: grid rate [Hz] and width of the fit [s].
+        wheels: see `compute_velocities`.
         where: the run, for error messages.
 
     Returns:
@@ -177,7 +180,7 @@ def differentiate_poses(
     Raises:
         StageError: ``no_segment``.
     """
-    pieces = [_differentiate_segment(piece, settings) for piece in rigid.cut_segments(poses)]
+    pieces = [_differentiate_segment(piece, settings, wheels) for piece in rigid.cut_segments(poses)]
     made = [piece for piece in pieces if piece is not None]
     if not made:
         what = "the poses hold no stretch of half a second without a gap or a jump"
@@ -188,11 +191,11 @@ def differentiate_poses(
 
 
 def _differentiate_segment(
-    piece: dict[str, NDArray[Any]], settings: VelocitySection
+    piece: dict[str, NDArray[Any]], settings: VelocitySection, wheels: DriveSeries | None
 ) -> dict[str, NDArray[Any]] | None:
     """Velocities of one segment, by column; None if it is too short."""
     times = piece["t"]
-    fresh = rigid.select_fresh_poses(times, piece["held"])
+    fresh = select_fresh(piece, wheels)
     aligned = times
     if "latency" in piece:
         aligned = np.maximum.accumulate(times - piece["latency"])

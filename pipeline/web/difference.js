@@ -4,7 +4,7 @@ import { h, inAngle, inLength, say, sayShare } from "./parts.js";
 const LINES = "reach";
 let apart = null;
 
-const ERRORS = [["t", "position error after 2 s", inLength], ["r", "heading error after 2 s", inAngle]];
+const ERRORS = [["t", "position error over 2 s", inLength], ["r", "heading error over 2 s", inAngle]];
 
 export const showDifference = (place, one, other) => {
   const [a, b] = [one?.state?.session, other?.state?.session];

@@ -275,8 +275,10 @@ def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> di
 
 def find_range(parameter: Parameter, value: float) -> tuple[float, float]:
     """Ends of a slider within the bounds; they include the neutral, the usual and the present value."""
-    neutral = parameter.neutral if math.isfinite(parameter.neutral) else value
-    usual = abs(parameter.typical - neutral) or 1.0
+    is_finite = math.isfinite(parameter.neutral)
+    neutral = parameter.neutral if is_finite else value
+    usual = abs(parameter.typical - neutral) if is_finite else max(abs(value), abs(parameter.typical))
+    usual = usual or 1.0
     low = min(neutral - usual, neutral - 2.0 * (neutral - value), value - 0.5 * usual)
     high = max(neutral + usual, neutral + 2.0 * (value - neutral), value + 0.5 * usual)
     return max(low, parameter.bounds[0]), min(high, parameter.bounds[1])

@@ -106,7 +106,7 @@ def test_the_verdict_says_how_far_off_why_and_what_remains() -> None:
     effects = {"effective_track": {"k": 1.79}, "turn_lag": {"tau_mean": 0.4, "tau_diff": 1.08}}
     drawn = draw_diagnosis(effects, [(1.06, 0.96), (0.44, 0.14), (0.1, 0.04)])
     assert check_verdict(drawn) == (
-        "After 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % of the ideal rate "
+        "Over 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % of the ideal rate "
         "and answers turns 1.1 s late; with both in the model 10 cm and 2.3 degrees remain, 2 times the "
         "noise floor. No known effect explains the rest."
     )
@@ -153,7 +153,7 @@ def test_alternatives_stand_in_and_doubts_are_named() -> None:
     undecided = [{"candidates": ["body_inertia", "lateral_skid"], "in_model": "body_inertia"}]
     drawn = draw_diagnosis({"body_inertia": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)], undecided=undecided)
     assert check_verdict(drawn) == (
-        "After 2 s the ideal model is 1 m and 29 degrees off. With one effect in the model 30 cm and 11 "
+        "Over 2 s the ideal model is 1 m and 29 degrees off. With one effect in the model 30 cm and 11 "
         "degrees remain, 10 times the noise floor in heading and 6 times in position. This log does not "
         "decide between body inertia and lateral skid; no known effect explains the rest."
     )

@@ -28,7 +28,7 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
     results = run.manifest.folder.parents[3]
     stored = json.loads(run.manifest.path("diagnosis.json").read_text())
     verdict = format_verdict(stored)
-    assert verdict.startswith("After 2 s the ideal model is ")
+    assert verdict.startswith("Over 2 s the ideal model is ")
     assert "The robot turns at 5" in verdict
     told = run_verb("analyze", run.summary["log"]["path"], "--out", results, "--json")  # type: ignore[index]
     (shown,) = json.loads(told.stdout)["runs"]

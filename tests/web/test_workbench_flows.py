@@ -130,7 +130,7 @@ def test_two_models_and_their_difference(
     chrome.wait(SETTLED)
     cells = "[...document.querySelectorAll('#difference tbody tr')].map((row) => row.innerText)"
     rows = cast("list[str]", chrome.run(cells))
-    assert rows[1].startswith("heading error after 2 s [\u00b0]")
+    assert rows[1].startswith("heading error over 2 s [\u00b0]")
     first, second, apart = (text.split()[0] for text in rows[1].split("\t")[1:])
     assert float(apart) == pytest.approx(float(second) - float(first), rel=0.01)
     assert "effective_track.k" in rows[2]

@@ -2,8 +2,8 @@
 
     w0 = w0 / k    (l_eff = k l)
 
-k is a plain number, off one by a few percent where the sheet has the wrong length, a rear axle steers along or
-tyres give way. Steer to both sides at several angles.
+k is a plain number, off one by a few percent where the sheet has the wrong length, a rear axle steers along
+or tyres give way. Steer to both sides at several angles.
 
 Source: kinematic bicycle; Gillespie, Fundamentals of Vehicle Dynamics, low-speed turning.
 """

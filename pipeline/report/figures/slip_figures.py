@@ -402,7 +402,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
     if not panels:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
-    note = "Median over steps of the command that are held for three seconds; 1 is the command."
+    note = "Change since the step, median over commands held for three seconds; 1 is the change of the command."
     return Drawing(chart, rows, note, _format_step_response(rows))
 
 
@@ -425,7 +425,8 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
         frames = []
         for series, (times, values) in lines.items():
             at = np.interp((starts[:, None] + since).ravel(), times, values).reshape(starts.size, -1)
-            middle = np.median((at - low[:, None]) / (high - low)[:, None], axis=0)
+            before = at[:, [np.searchsorted(since, 0.0) - 1]]
+            middle = np.median((at - before) / (high - low)[:, None], axis=0)
             frames.append(pl.DataFrame({"t": since, "value": middle}).with_columns(series=pl.lit(series)))
         tables[f"response_{component}"] = pl.concat(frames)
     return tables
