@@ -13,7 +13,15 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, cast, overload
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.api.fitted_model import Fit, Model, effect, tabulate_ladder, tabulate_parameters, write_html
+from pipeline.api.fitted_model import (
+    Fit,
+    Model,
+    effect,
+    tabulate_ladder,
+    tabulate_parameters,
+    take_file,
+    write_html,
+)
 from pipeline.batch.recordings import list_named
 from pipeline.core import SlipError, format_recorded
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
@@ -220,7 +228,7 @@ class Run:
                 content = diagnose_stored(
                     [run.manifest for run in (self, *others)],
                     INPUTS if input == "both" else (input,),
-                    None if model is None else model.file.model,
+                    None if model is None else take_file(model).model,
                     vehicle_of,
                     None if budget is None else parse_budget(budget),
                 )
@@ -246,7 +254,7 @@ class Run:
             A row a model: ``model numbers t_mrmse_m r_mrmse_rad t_is_best r_is_best fit_s``. The best is the
             smallest error, and what is larger by no more than chance.
         """
-        files = {name: model.file for name, model in (models or {}).items()}
+        files = {name: take_file(model) for name, model in (models or {}).items()}
         known = next((file.model.vehicle for file in files.values()), None)
         vehicle, runs = read_runs([self.manifest], known, vehicle_of)
         with threadpool_limits(1):

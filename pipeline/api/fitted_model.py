@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self
+from typing import TYPE_CHECKING, Literal, Self, cast
 
 import polars as pl
 from threadpoolctl import threadpool_limits
@@ -21,7 +21,7 @@ from pipeline.estimation.ladder import format_ladder
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
 from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs
-from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
+from pipeline.models import Effect, ModelFile, find_effect, list_effects, read_model, write_model
 from pipeline.models import Model as MotionModel
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.page import ShownFigure, show_figures
@@ -33,6 +33,7 @@ from pipeline.sources.configuration import VehicleSection
 if TYPE_CHECKING:
     from pipeline.api import Run
     from pipeline.job.keys import Owner
+    from pipeline.store import Manifest
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
 _DIGITS = 4
@@ -113,6 +114,13 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if not name.isidentifier():
         hint = "Use letters, digits and _, a letter first."
         raise MotionError("bad_value", f"{name!r} cannot be the id of an effect", where="effect", hint=hint)
+    if name in {known.id for known in list_effects()}:
+        what = f"an effect of the catalogue is called {name!r}"
+        raise MotionError("bad_value", what, where="effect", hint="Choose another name.")
+    for key, (_, low, high) in tuples.items():
+        if not low < high:
+            what = f"bounds of {key} must be two numbers, not {low} and {high}"
+            raise MotionError("bad_value", what, where=f"effect {name}", hint=f'Write {key}=("m/s", -1, 1).')
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
 
@@ -156,8 +164,7 @@ class Model:
         return tabulate_parameters(list_parameters(self.file))
 
     def __add__(self, other: str | Effect) -> Self:
-        added = other if isinstance(other, Effect) else effect(other)
-        return self.of(replace(self.file, model=self.file.model + added))
+        return self.of(replace(self.file, model=self.file.model + _take_effect(other)))
 
     def __sub__(self, other: str | Effect) -> Self:
         return self.of(replace(self.file, model=self.file.model - other))
@@ -216,8 +223,7 @@ class Model:
         return export_model(self.file, to, None if current is None else read_current(Path(current), to))
 
     def _read(self, runs: Run | Sequence[Run], owner: Owner | None) -> tuple[ModelFile, list[MotionRun]]:
-        opened = runs if isinstance(runs, Sequence) else [runs]
-        vehicle, read = read_runs([run.manifest for run in opened], self.file.model.vehicle, owner)
+        vehicle, read = read_runs(_list_manifests(runs), self.file.model.vehicle, owner)
         return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
 
     def __repr__(self) -> str:
@@ -227,6 +233,32 @@ class Model:
     def _repr_html_(self) -> str:
         ids = ", ".join(self.file.model.ids) or "the ideal model, no effect"
         return write_html(f"{self.file.model.vehicle.name}: {ids}", self.parameters)
+
+
+def _take_effect(given: object) -> Effect:
+    if isinstance(given, str):
+        return effect(given)
+    if not isinstance(given, Effect):
+        hint = 'Add slip.effect("drive_lag") or the id of an effect.'
+        raise MotionError("bad_value", f"{given!r} is no effect", where="Model", hint=hint)
+    return given
+
+
+def _list_manifests(runs: object) -> list[Manifest]:
+    opened = runs if isinstance(runs, Sequence) and not isinstance(runs, str) else [runs]
+    manifests = [getattr(run, "manifest", None) for run in opened]
+    if not manifests or None in manifests:
+        hint = "Give what slip.analyze or slip.load returns."
+        raise MotionError("bad_value", f"{runs!r} is no run", where="Model", hint=hint)
+    return cast("list[Manifest]", manifests)
+
+
+def take_file(model: object) -> ModelFile:
+    """The file of a model; an error for anything else."""
+    if not isinstance(model, Model):
+        hint = "Read a model file with slip.Model.read."
+        raise MotionError("bad_value", f"{model!r} is no model", where="model", hint=hint)
+    return model.file
 
 
 class Fit:

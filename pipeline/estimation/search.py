@@ -76,13 +76,10 @@ class Detectable:
 def find_unobservable(
     selection: Selection, final: CandidateModel
 ) -> tuple[list[Unobservable], list[Detectable]]:
-    """Candidates that would not be named in this log at their typical size.
-
-    Effects that show only once are also unobservable: a single event would look the same.
+    """Candidates that would not be named in this log at their typical size, nor if they show only once.
 
     Returns:
-        The unobservable effects, and the detection thresholds of the other effects that are linear in one
-        parameter.
+        These, and the detection thresholds of the other effects that are linear in one parameter.
     """
     noise = selection.noise or selection.take_evidence(final).noise
     rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
@@ -141,17 +138,14 @@ def _find_detectable(usual: Effect, standard_errors: float, share: float) -> lis
     if others or parameter.search is not Search.DIRECT or not math.isfinite(distance):
         return []
     size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
-    if parameter.least is not None:
-        size = max(size, parameter.least.size)
-    return [Detectable(usual.id, parameter.name, parameter.unit, size)]
+    least = 0.0 if parameter.least is None else parameter.least.size
+    return [Detectable(usual.id, parameter.name, parameter.unit, max(size, least))]
 
 
 def suggest_manoeuvre(*effects: Effect) -> str:
     """Manoeuvres that excite effects."""
-    needs: list[Excitation] = []
-    for effect in effects:
-        needs += [need for need in effect.needs if need not in needs]
-    return "; ".join(MANOEUVRES[need] for need in needs[:3])
+    needs = dict.fromkeys(need for effect in effects for need in effect.needs)
+    return "; ".join(MANOEUVRES[need] for need in [*needs][:3])
 
 
 _MOST_EFFECTS = 8

@@ -407,7 +407,8 @@ class Scene:
             columns = [pl.lit(None, pl.Float64).alias(name) for name in ("f_x", "f_w", "modulus")]
             joined = places.with_columns(columns)
         else:
-            asked = self.main_slip.select("stamp", "segment", "f_x", "f_w", "modulus")
+            sound = pl.when(~pl.col("suspect")).then("modulus").alias("modulus")
+            asked = self.main_slip.select("stamp", "segment", "f_x", "f_w", sound)
             asked = asked.unique(["stamp", "segment"], maintain_order=True)
             joined = places.join(asked, on=["stamp", "segment"], how="left", maintain_order="left")
         joined = joined.drop("stamp", "segment")

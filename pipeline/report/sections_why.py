@@ -210,6 +210,7 @@ def view_why(page: Page) -> dict[str, object]:
         "diagnosed": bool(report.diagnosis),
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
         "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in minor],
+        "groups": report.small_groups,
         "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),

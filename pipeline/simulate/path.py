@@ -488,11 +488,8 @@ class CompactedGround:
 
 def cross(first: Vector, second: Vector) -> Vector:
     """Cross product of two vectors, in plain floats because it runs at every step."""
-    return (
-        first[1] * second[2] - first[2] * second[1],
-        first[2] * second[0] - first[0] * second[2],
-        first[0] * second[1] - first[1] * second[0],
-    )
+    (a, b, c), (d, e, f) = first, second
+    return b * f - c * e, c * d - a * f, a * e - b * d
 
 
 def slide_onto_plane(vector: Vector, normal: Vector) -> Vector:

@@ -211,8 +211,7 @@ With 0.002 the error over 2 s on ice is 0.334 m instead of 0.311 m, on asphalt, 
 _NOISE = (0.002, 0.02)  # bounds of a heading's noise [rad]: scan matchers are within
 _SHORTEST_STEP = 0.01
 """Least time between two poses after the correction [s], so that stamps stay in order."""
-_FASTEST_S = 2.0
-"""Time over which the largest speed of a run is measured [s]: the ages of its poses are short against it."""
+_FASTEST_S = 2.0  # time over which the largest speed is measured [s]: ages are short against it
 _LEAST_OF_USUAL = 0.5
 """Least fraction of the usual time between two poses after the correction: those at 100 Hz must not shift
 each other."""

@@ -7,6 +7,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, format_share
 from pipeline.core.arrays import Floats
+from pipeline.estimation.error_regions import format_length
 from pipeline.report import figures, format_number, theme
 from pipeline.report.figures import Drawing, Figure, Section, draw_shares, format_events, list_events
 from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series, thin_to_peaks
@@ -134,8 +135,8 @@ def format_map(scene: Scene) -> str:
     if scene.track is None:
         return "There are no poses to draw."
     frame = scene.track.frame
-    x, y = find_extent(frame["x"]), find_extent(frame["y"])
-    sentence = f"Map of the trajectory, {x[1] - x[0]:.0f} m by {y[1] - y[0]:.0f} m, coloured by slip speed."
+    sizes = [float(np.ptp(frame[name].to_numpy())) for name in "xy"]
+    sentence = f"Map of the trajectory, {' by '.join(map(format_length, sizes))}, coloured by slip speed."
     known = frame.filter(pl.col("modulus").is_not_null())
     if known.is_empty():
         return sentence
@@ -402,7 +403,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
     if not panels:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
-    note = "Change since the step, median over commands held for three seconds; 1 is the change of the command."
+    note = "Change since the step, median over commands held for three seconds; 1 is what was asked."
     return Drawing(chart, rows, note, _format_step_response(rows))
 
 
