@@ -90,6 +90,23 @@ def test_a_delay_beside_limits_is_found_from_the_wrong_hollow_of_the_loss(tmp_pa
     assert {e.id: next(iter(e.values.values())) for e in found.effects} == pytest.approx(true, rel=0.05)
 
 
+def test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp(tmp_path: Path) -> None:
+    """Two effects for two, in a minute of driving: no exchange of one of them is better."""
+    effects = {
+        "transport_delay": 0.2,
+        "torque_limit": {"tau": 0.3, "limit": 3.0},
+        "effective_track": 1.8,
+    }
+    scenario = Scenario(vehicle=VEHICLES["husky"], effects=effects, duration_s=60.0, seed=112)
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.whole, context.problem.start_state()
+    candidates = context.list_candidates(Input.COMMAND)
+    selection, ideal = open_selection(part, begin, candidates, context.conditions, Budget())
+    found = search_effects(selection, ideal)[0].state
+    assert {effect.id for effect in found.effects} == set(effects)
+
+
 def test_one_effect_takes_the_place_of_the_two_that_imitate_it(tmp_path: Path) -> None:
     """A gain and a limit of the speed explain wheels that are slowed alike."""
     scenario = replace(

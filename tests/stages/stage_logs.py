@@ -12,6 +12,7 @@ import polars as pl
 
 from pipeline.job.work import as_recorded
 from pipeline.logs import open_log, read_topics
+from pipeline.run import read_drive
 from pipeline.simulate import (
     Disturbance,
     Encoders,
@@ -129,7 +130,12 @@ def take(
     )
     tables = aligned.tables
     motion = compute_velocities(
-        tables["poses"], tables["imu"], aligned.alignment.gyro, configuration.velocity, where=log.name
+        tables["poses"],
+        tables["imu"],
+        aligned.alignment.gyro,
+        configuration.velocity,
+        where=log.name,
+        wheels=read_drive(tables["wheels"], aligned.vehicle),
     )
     result = compute_slip(
         motion.table,

@@ -11,10 +11,13 @@ import pytest
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import rigid
+from pipeline.run import Track
+from pipeline.run.signals import DriveSeries
 from pipeline.simulate import VEHICLES, Ground, Imu, Program, Recording
 from pipeline.sources import Configuration
 from pipeline.stages.pose_topics import cut_track, normalize_quaternions, to_base_link
 from pipeline.stages.reading import PoseArrays
+from pipeline.stages.timing import _take_off
 from pipeline.stages.velocity import compute_velocities
 
 SETTINGS = Configuration().velocity
@@ -208,6 +211,59 @@ def make_windowed_poses(steps: int = 5, *, speed: float = 1.0) -> pl.DataFrame:
             "held": track.held,
         }
     )
+
+
+def test_repeats_of_a_localization_that_waits_are_no_rest_while_the_wheels_turn() -> None:
+    """Rests between jumps had velocities of 20 m/s and more on recordings of a vehicle that reaches 5 m/s."""
+    times = np.arange(0.0, 20.0, 0.05)
+    updates = np.concatenate((np.arange(0.0, 6.0, 0.15), [6.0, 6.6, 7.3], np.arange(7.45, 20.0, 0.15)))
+    last = updates[np.searchsorted(updates, times + 1e-9, side="right") - 1]
+    place = np.stack((last, 0.0 * last, 0.0 * last), axis=-1)
+    quaternion = rigid.quaternions_from_yaw(0.0 * times)
+    poses = pl.DataFrame(
+        {
+            "t": times,
+            "stamp": np.round(times * 1e9).astype(np.int64),
+            "segment": np.zeros(times.size, dtype=np.int32),
+            **{name: place[:, i] for i, name in enumerate("xyz")},
+            **{f"q_{name}": quaternion[:, i] for i, name in enumerate("xyzw")},
+            "held": rigid.find_held(place, quaternion),
+        }
+    )
+    turns = np.full(times.size, 1.0 / 0.165)
+    wheels = DriveSeries(times, turns, turns, 0.0 * turns, None)
+
+    def find_fastest(measured: DriveSeries | None) -> float:
+        made = compute_velocities(poses, pl.DataFrame(), None, SETTINGS, where="x", wheels=measured)
+        inner = made.table.filter(pl.col("t").is_between(1.0, 18.0))
+        return float(inner["v_x"].abs().max() or 0.0)  # type: ignore[arg-type]
+
+    assert find_fastest(wheels) == pytest.approx(1.0, abs=0.05)
+    assert find_fastest(None) > 1.5
+
+
+def test_corrected_stamps_keep_the_time_of_the_way_between_poses() -> None:
+    generator = np.random.default_rng(3)
+    times = np.cumsum(generator.uniform(0.1, 0.3, 300))
+    path = (4.0 * times).astype(np.complex128)
+    zeros = np.zeros(times.size)
+    track = Track(
+        times=times,
+        segment=zeros.astype(np.int64),
+        path=path,
+        heading=zeros,
+        attitude=np.zeros((times.size, 3)),
+        position=np.column_stack((path.real, zeros)),
+        active=np.ones(times.size, dtype=bool),
+    )
+    ages = generator.normal(0.0, 0.15, times.size)
+    assert np.array_equal(_take_off(track, zeros), times)
+    corrected = _take_off(track, ages)
+    assert np.diff(corrected).min() > 0.0
+    pace = 4.0 * np.diff(times) / np.diff(corrected)
+    # The way is driven in the usual time at least, where that is shorter.
+    assert pace[np.diff(times) < 0.19].max() < 4.0 * 1.01
+    assert np.abs(corrected - (times - ages)).mean() < 0.15
 
 
 def test_trap_20_steps_with_holes_between_are_segments_of_their_own() -> None:
