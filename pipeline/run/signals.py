@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from pipeline.sources import Vehicle
 
     Drive: TypeAlias = "DriveSeries | Wheels"
+    ChangeWheel: TypeAlias = "Callable[[Floats, Resets, Floats], Floats]"
 
 
 Floats = NDArray[np.float64]
@@ -101,16 +102,24 @@ class Wheels:
         sideways = np.zeros_like(self.left) if self.sideways is None else self.sideways
         return np.column_stack((self.left, self.right, sideways))
 
-    def change_each_wheel(self, change: Callable[[Floats, Floats], Floats], start: Floats) -> Wheels:
+    def change_each_wheel(self, change: ChangeWheel, context: RunContext) -> Wheels:
         """The output with the speed of every wheel changed, each from its own state.
 
+        Four wheels may also turn against each other. That moves nothing, and measured sides do not show it:
+        predictions take it over from a run without resets.
+
         Args:
-            change: function of the speed of a wheel, shape (n,), and its state at every reset, shape (k,).
-            start: left, right and sideways at every reset, shape (k, 3).
+            change: function of the speed of a wheel, shape (n,), resets, and its state at each, shape (k,).
+            context: of the run; left, right and sideways are the states of its resets, shape (k, 3).
         """
-        sideways = None if self.sideways is None else start[:, 2]
-        states = split_wheels(Wheels(start[:, 0], start[:, 1], np.zeros(0), sideways))
-        changed = [change(*wheel) for wheel in zip(split_wheels(self), states, strict=True)]
+        asked, resets = split_wheels(self), context.wheels
+        left, right, sideways = resets.start.T
+        states = split_wheels(Wheels(left, right, np.zeros(0), None if self.sideways is None else sideways))
+        if self.sideways is not None and resets is not context.spans:
+            free = [change(wheel, context.spans, context.spans.start[:, 0]) for wheel in asked]
+            against = 0.25 * (free[0] + free[1] - free[2] - free[3])[np.maximum(resets.at - 1, 0)]
+            states = [state + sign * against for state, sign in zip(states, (1, 1, -1, -1), strict=True)]
+        changed = [change(wheel, resets, state) for wheel, state in zip(asked, states, strict=True)]
         return replace(self, **_join_wheels(changed))
 
 

@@ -11,6 +11,7 @@ from pipeline.estimation.parts import WheelPart
 from pipeline.estimation.problem import average_sustained, measure_exceeded
 from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.parameter import OVERSHOOT
+from pipeline.simulate import VEHICLES
 
 HUSKY = vehicle_of("husky_a200")
 
@@ -29,6 +30,30 @@ def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
 def test_of_several_runs_the_fastest_counts() -> None:
     slow, fast = (simulate({"wheel_speed_limit": limit}, duration_s=40.0) for limit in (3.0, 4.0))
     assert measure_exceeded([fast, slow], HUSKY)["wheel"] == pytest.approx(4.0, rel=0.03)
+
+
+def test_four_wheels_are_said_to_exceed_no_more_than_their_sides_prove() -> None:
+    """A limit of 10 rad/s was refused: wheels made of the sides and the sideways speed reached 14."""
+    run = simulate({"wheel_speed_limit": 10.0}, vehicle=VEHICLES["youbot"], duration_s=60.0)
+    assert 5.0 < measure_exceeded([run], vehicle_of("youbot"))["wheel"] <= 10.2
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("acceleration_limit", {"limit": 6.0}), ("torque_limit", {"tau": 0.4, "limit": 6.0})]
+)
+def test_four_wheels_that_turn_against_each_other_go_on_where_a_prediction_begins(
+    name: str, values: dict[str, float]
+) -> None:
+    """Errors of the heading over 2 s were 36 times as large as without the limit."""
+    youbot, errors = vehicle_of("youbot"), []
+    for effects in ({}, {name: values}):
+        run = simulate(effects, vehicle=VEHICLES["youbot"], duration_s=60.0)
+        problem = Problem([run], youbot, Input.COMMAND)
+        (comparison,), state = problem.comparisons, problem.start_state()
+        known = [find_effect(key)(**numbers) for key, numbers in effects.items()]
+        found = comparison.find_horizon_errors(known, state.timing[0])
+        errors.append(float(np.sqrt(np.mean(found.yaw**2))))
+    assert errors[1] < 1.5 * errors[0]
 
 
 def test_one_wrong_reading_is_no_speed_that_lasts() -> None:

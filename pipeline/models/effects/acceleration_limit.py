@@ -49,11 +49,11 @@ class AccelerationLimit(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        limit, resets, step = self.values["limit"], context.wheels, context.step_s
+        limit, step = self.values["limit"], context.step_s
         if self.is_neutral:
             return wheels
         ramped = wheels.change_each_wheel(
-            lambda speed, start: limit_rate(speed, limit, step, resets, start), resets.start
+            lambda speed, resets, start: limit_rate(speed, limit, step, resets, start), context
         )
         return replace(ramped, idle=None)
 

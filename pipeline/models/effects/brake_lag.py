@@ -42,7 +42,7 @@ class BrakeLag(TwoLags):
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        taus, resets = self.taus, context.wheels
+        taus = self.taus
         return wheels.change_each_wheel(
-            lambda speed, start: lag_unevenly(speed, taus, context.step_s, resets, start), resets.start
+            lambda speed, resets, start: lag_unevenly(speed, taus, context.step_s, resets, start), context
         )

@@ -88,10 +88,10 @@ class DriveOvershoot(DriveEffect):
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        (tau, damping), resets = self.numbers, context.wheels
+        tau, damping = self.numbers
         return wheels.change_each_wheel(
-            lambda speed, start: swing_signal(speed, tau, damping, context.step_s, resets, start),
-            resets.start,
+            lambda speed, resets, start: swing_signal(speed, tau, damping, context.step_s, resets, start),
+            context,
         )
 
     def can_show(self, conditions: Conditions) -> bool:

@@ -8,8 +8,6 @@ forward and backward, and turn on the spot to both sides.
 Source: Nordin and Gutman, Automatica 38 (2002): mechanical systems with backlash.
 """
 
-import numpy as np
-
 from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.filters import wait_at_reversal
 from pipeline.run.signals import RunContext, Wheels
@@ -49,10 +47,9 @@ class ReversalPause(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        d, resets = self.values["d"], context.spans
+        d, spans = self.values["d"], context.spans
         if d <= 0.0:
             return wheels
-        unknown = np.full((resets.first.size, 3), np.nan)
         return wheels.change_each_wheel(
-            lambda speed, _: wait_at_reversal(speed, d, context.step_s, resets), unknown
+            lambda speed, *_: wait_at_reversal(speed, d, context.step_s, spans), context
         )

@@ -81,9 +81,9 @@ class TorqueLimit(DriveEffect):
         """See the formula above."""
         if self.is_neutral:
             return wheels
-        (tau, limit), resets = self.values.values(), context.wheels
+        tau, limit = self.values.values()
         return wheels.change_each_wheel(
-            lambda speed, start: lag_within(speed, tau, limit, context.step_s, resets, start), resets.start
+            lambda speed, resets, start: lag_within(speed, tau, limit, context.step_s, resets, start), context
         )
 
     def is_degenerate(self, conditions: Conditions) -> bool:

@@ -52,7 +52,7 @@ class WheelSpeedLimit(DriveEffect):
         limit = self.values["limit"]
         if self.is_neutral:
             return wheels
-        return wheels.change_each_wheel(lambda speed, _: np.clip(speed, -limit, limit), context.wheels.start)
+        return wheels.change_each_wheel(lambda speed, *_: np.clip(speed, -limit, limit), context)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether no wheel reaches the limit."""
