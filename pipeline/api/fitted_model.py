@@ -240,7 +240,7 @@ def _take_effect(given: object) -> Effect:
         return effect(given)
     if not isinstance(given, Effect):
         hint = 'Add slip.effect("drive_lag") or the id of an effect.'
-        raise MotionError("bad_value", f"{given!r} is no effect", where="Model", hint=hint)
+        raise MotionError("bad_value", f"{given!r} is not an effect", where="Model", hint=hint)
     return given
 
 
@@ -249,7 +249,7 @@ def _list_manifests(runs: object) -> list[Manifest]:
     manifests = [getattr(run, "manifest", None) for run in opened]
     if not manifests or None in manifests:
         hint = "Give what slip.analyze or slip.load returns."
-        raise MotionError("bad_value", f"{runs!r} is no run", where="Model", hint=hint)
+        raise MotionError("bad_value", f"{runs!r} is not a run", where="Model", hint=hint)
     return cast("list[Manifest]", manifests)
 
 
@@ -257,7 +257,7 @@ def take_file(model: object) -> ModelFile:
     """The file of a model; an error for anything else."""
     if not isinstance(model, Model):
         hint = "Read a model file with slip.Model.read."
-        raise MotionError("bad_value", f"{model!r} is no model", where="model", hint=hint)
+        raise MotionError("bad_value", f"{model!r} is not a model", where="model", hint=hint)
     return model.file
 
 

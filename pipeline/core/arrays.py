@@ -193,38 +193,20 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
     return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
 
 
-_LONGEST_REPEAT_S = 1.0
-"""Longest period of readings [s]: encoders of the recordings are read every 0.1, 0.15 or 0.25 s."""
-_ALMOST = 0.9
-"""Share of the period before a new reading at which the one before was still right: stamps vary."""
+def fit_rising(values: Floats) -> Floats:
+    """Least squares fit that never falls, shape (n,), by pooling adjacent violators.
 
-
-def interpolate_repeats(times: Floats, values: Floats) -> tuple[Floats, float]:
-    """Readings that are published repeatedly until the next one, linear between one and the next.
-
-    A reading that repeats its value at a later period, as at rest, is left until one period before a change.
-
-    Args:
-        times: increasing [s], shape (n,).
-        values: NaN where unknown, shape (n,).
-
-    Returns:
-        The values, and the median period of the readings [s]; zero if none is periodic.
+    Source: Barlow, Bartholomew, Bremner and Brunk, Statistical Inference under Order Restrictions, 1972.
     """
-    known = np.flatnonzero(np.isfinite(values))
-    stamps, read = times[known], values[known]
-    fresh = np.flatnonzero(np.diff(read)) + 1
-    waits = np.diff(stamps[fresh])
-    waits = waits[waits <= _LONGEST_REPEAT_S]
-    if not waits.size:
-        return values, 0.0
-    period = float(np.median(waits))
-    last = np.searchsorted(stamps, stamps[fresh] - _ALMOST * period, side="right") - 1
-    before = np.append(0, fresh[:-1])
-    knots = np.unique(np.concatenate((before, np.maximum(last, before), fresh, [read.size - 1])))
-    filled = values.copy()
-    filled[known] = np.interp(stamps, stamps[knots], read[knots])
-    return filled, period
+    means, sizes = list[float](), list[int]()
+    for value in values.tolist():
+        mean, size = value, 1
+        while means and means[-1] >= mean:
+            last, count = means.pop(), sizes.pop()
+            mean, size = (mean * size + last * count) / (size + count), size + count
+        means.append(mean)
+        sizes.append(size)
+    return np.repeat(np.asarray(means, dtype=np.float64), sizes)
 
 
 def integrate_rate(times: Floats, rate: Floats) -> Floats:

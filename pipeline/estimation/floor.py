@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads, solve_nonnegative
+from pipeline.core.arrays import Flags, Floats, Ints, fit_rising, guarded_spreads, solve_nonnegative
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import CLIP, average_lags, find_live
@@ -408,12 +408,7 @@ def _smooth_falling(shares: Floats) -> Floats:
     known = np.flatnonzero(np.isfinite(shares))
     if not known.size:
         return np.ones(shares.size)
-    values, count = shares[known], known.size
-    fitted = [
-        min(max(values[first:last].mean() for last in range(at + 1, count + 1)) for first in range(at + 1))
-        for at in range(count)
-    ]
-    smooth: Floats = np.interp(np.arange(shares.size), known, fitted)
+    smooth: Floats = np.interp(np.arange(shares.size), known, -fit_rising(-shares[known]))
     return smooth
 
 

@@ -356,8 +356,6 @@ class Selection:
         least: float = 0.0,
         useful: float = math.inf,
         beyond: list[CandidateModel] | None = None,
-        *,
-        pairs: bool = True,
     ) -> list[CandidateModel]:
         """The most promising extensions of a model by one effect or by two, fitted.
 
@@ -367,7 +365,6 @@ class Selection:
             least: chi-square that an extension must promise.
             useful: loss above which an extension need not be fitted to the end.
             beyond: takes the extensions by an effect with values beyond the observed range.
-            pairs: also extend by two effects.
 
         Returns:
             Models of which every effect may be named, those with fewer numbers first, then by loss.
@@ -381,8 +378,7 @@ class Selection:
             for hypothesis, model in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
                 if self._keep(model, base, models) and self.judge(base, model).is_significant:
                     best = max(best, _surplus(hypothesis))
-        together = evidence.rank_pairs(PRICE) if pairs else []
-        together = [one for one in together if one.chi_square >= max(least, best + PRICE)]
+        together = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
         for model in self._fit_each(base, together[:_PAIRS], useful):
             self._keep(model, base, models)
         return self.sort(models.values())

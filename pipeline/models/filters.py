@@ -174,9 +174,9 @@ def _pull(goal: float, state: float, tau: float, limit: float, time: float) -> t
     gap = state - goal
     ramp = min(max(abs(gap) / limit - tau, 0.0), time)
     gone = limit * ramp if gap > 0.0 else -limit * ramp
-    left = gap - gone
+    rest = gap - gone
     grown = -math.expm1((ramp - time) / tau)
-    return goal * time + ramp * (gap - 0.5 * gone) + tau * left * grown, goal + left * (1.0 - grown)
+    return goal * time + ramp * (gap - 0.5 * gone) + tau * rest * grown, goal + rest * (1.0 - grown)
 
 
 def lag_unevenly(

@@ -358,9 +358,9 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     # Sideways motion counts only without a forward command.
     covered = gains[0] or gains[1]
     source = "the wheels turned" if ideal is samples.measured else "was commanded"
-    way = f"{path:.0f}" if path >= 10.0 else f"{path:.2g}"  # noqa: PLR2004 - two digits
+    driven = f"{path:.0f}" if path >= 10.0 else f"{path:.2g}"  # noqa: PLR2004 - two digits
     text = (
-        f"the vehicle does not move: of {way} m that {source} it covered "
+        f"the vehicle does not move: of {driven} m that {source} it covered "
         f"{format_share(covered, 0)}, within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=covered)]

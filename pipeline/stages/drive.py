@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core.arrays import Floats, Ints, interpolate_repeats
+from pipeline.core.arrays import Floats, Ints
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run.signals import LIVE_SHARE
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
@@ -452,3 +452,37 @@ def interpolate_readings(wheels: pl.DataFrame) -> tuple[pl.DataFrame, list[Findi
         "interpolated between readings"
     )
     return repeated, [Finding("held_wheels", "info", text, where="wheels", value=max(periods))]
+
+
+_LONGEST_REPEAT_S = 1.0
+"""Longest period of readings [s]: encoders of the recordings are read every 0.1, 0.15 or 0.25 s."""
+_ALMOST = 0.9
+"""Share of the period before a new reading at which the one before was still right: stamps vary."""
+
+
+def interpolate_repeats(times: Floats, values: Floats) -> tuple[Floats, float]:
+    """Readings that are published repeatedly until the next one, linear between one and the next.
+
+    A reading that repeats its value at a later period, as at rest, is left until one period before a change.
+
+    Args:
+        times: increasing [s], shape (n,).
+        values: NaN where unknown, shape (n,).
+
+    Returns:
+        The values, and the median period of the readings [s]; zero if none is periodic.
+    """
+    known = np.flatnonzero(np.isfinite(values))
+    stamps, read = times[known], values[known]
+    fresh = np.flatnonzero(np.diff(read)) + 1
+    waits = np.diff(stamps[fresh])
+    waits = waits[waits <= _LONGEST_REPEAT_S]
+    if not waits.size:
+        return values, 0.0
+    period = float(np.median(waits))
+    last = np.searchsorted(stamps, stamps[fresh] - _ALMOST * period, side="right") - 1
+    before = np.append(0, fresh[:-1])
+    knots = np.unique(np.concatenate((before, np.maximum(last, before), fresh, [read.size - 1])))
+    filled = values.copy()
+    filled[known] = np.interp(stamps, stamps[knots], read[knots])
+    return filled, period

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.optimize import isotonic_regression
 
 from pipeline.core.arrays import (
     ROUNDING_S,
@@ -15,6 +14,7 @@ from pipeline.core.arrays import (
     Flags,
     Floats,
     Ints,
+    fit_rising,
     join_parts,
     robust_spread,
     solve_banded,
@@ -480,7 +480,7 @@ def _list_terms(track: Track) -> Floats:
 def _take_off(track: Track, ages: Floats) -> Floats:
     """Stamps minus the ages, changed as little as their order and the way between poses require."""
     least = np.append(0.0, np.cumsum(_find_least_waits(track)))
-    ordered: Floats = isotonic_regression(track.times - ages - least).x + least
+    ordered: Floats = fit_rising(track.times - ages - least) + least
     return ordered
 
 
@@ -495,6 +495,6 @@ def _find_least_waits(track: Track) -> Floats:
     whole = (segment[later] == segment) & (times[later] >= times + _FASTEST_S)
     speed = np.abs(path[later] - path)[whole] / (times[later] - times)[whole]
     usual = float(np.median(np.diff(times))) if times.size > 1 else 0.0
-    way = np.where(np.diff(segment) == 0, np.abs(np.diff(path)), 0.0)
-    waits = np.minimum(way / float(speed.max(initial=_DRIVING_MPS)), usual)
+    distance = np.where(np.diff(segment) == 0, np.abs(np.diff(path)), 0.0)
+    waits = np.minimum(distance / float(speed.max(initial=_DRIVING_MPS)), usual)
     return np.maximum(waits, min(_SHORTEST_STEP, _LEAST_OF_USUAL * usual))

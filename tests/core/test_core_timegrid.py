@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pipeline.core import arrays
+from pipeline.stages.drive import interpolate_repeats
 
 WINDOW_S = 0.75
 
@@ -127,7 +128,7 @@ def hold(times: arrays.Floats, values: arrays.Floats, every: int, first: int = 0
 def test_repeated_readings_are_linear_between_readings(first: int) -> None:
     times = np.arange(0.0, 60.0, 0.05)
     true = 2.0 * np.sin(0.9 * times)
-    filled, period = arrays.interpolate_repeats(times, hold(times, true, 5, first))
+    filled, period = interpolate_repeats(times, hold(times, true, 5, first))
     assert period == pytest.approx(0.25)
     inside = slice(first, times.size - 5)
     assert np.abs(filled - true)[inside].max() < 0.02
@@ -137,7 +138,7 @@ def test_repeated_readings_are_linear_between_readings(first: int) -> None:
 def test_readings_at_rest_last_until_one_period_before_they_change() -> None:
     times = np.arange(0.0, 30.0, 0.05)
     true = np.where(times < 10.0, 0.0, np.minimum(times - 10.0, 5.0))
-    filled, _ = arrays.interpolate_repeats(times, hold(times, true, 5))
+    filled, _ = interpolate_repeats(times, hold(times, true, 5))
     assert np.all(filled[times < 9.99] == 0.0)
     assert np.all(filled[times > 15.3] == 5.0)
     assert np.abs(filled - true).max() < 0.26 * 0.25
@@ -148,13 +149,13 @@ def test_readings_of_which_none_is_repeated_stay_as_they_are() -> None:
     times = np.cumsum(0.02 + 0.01 * generator.random(2000))
     values = np.cumsum(generator.standard_normal(times.size))
     values[400:900] = values[400]
-    assert np.array_equal(arrays.interpolate_repeats(times, values)[0], values)
+    assert np.array_equal(interpolate_repeats(times, values)[0], values)
 
 
 def test_steps_that_last_for_seconds_are_no_repeated_readings() -> None:
     times = np.arange(0.0, 60.0, 0.05)
     values = np.floor(times / 4.0)
-    filled, period = arrays.interpolate_repeats(times, values)
+    filled, period = interpolate_repeats(times, values)
     assert period == 0.0
     assert np.array_equal(filled, values)
 
@@ -163,6 +164,6 @@ def test_readings_that_are_missing_stay_so() -> None:
     times = np.arange(0.0, 20.0, 0.05)
     values = hold(times, np.sin(times), 4)
     values[100:120] = np.nan
-    filled, period = arrays.interpolate_repeats(times, values)
+    filled, period = interpolate_repeats(times, values)
     assert period == pytest.approx(0.2)
     assert np.array_equal(np.isnan(filled), np.isnan(values))

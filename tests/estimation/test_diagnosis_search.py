@@ -434,10 +434,7 @@ def test_a_rival_takes_as_much_off_the_loss_as_a_name_must(
     idle = selection.enter(ideal.state.add(find_effect("lateral_skid")().make_usual(selection.largest)))
     asked = list[float]()
 
-    def note(
-        _base: CandidateModel, _evidence: object, _least: float, useful: float, *, pairs: bool
-    ) -> list[CandidateModel]:
-        assert pairs
+    def note(_base: CandidateModel, _evidence: object, _least: float, useful: float) -> list[CandidateModel]:
         asked.append(useful)
         return []
 

@@ -237,7 +237,7 @@ def test_generators_know_no_estimator() -> None:
 
 
 def test_the_published_list_is_sound() -> None:
-    assert len(NAMES) == 47
+    assert len(NAMES) == 49
     for name, entry in NAMES.items():
         assert set(entry) <= {"family", "slip", "kinds", "same_as", "formula", "parameters"}
         assert entry["parameters"]
