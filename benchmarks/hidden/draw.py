@@ -188,7 +188,7 @@ def open_seal(text: str) -> Answer:
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in (*CAR, "steering_sensor_offset", "steering_play") or (
+    car = effect in (*CAR, "steering_sensor_offset", "steering_play", "effective_wheelbase") or (
         effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS
     )
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
