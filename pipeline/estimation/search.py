@@ -446,10 +446,11 @@ def search_wheels(
 def _search_both(
     selection: Selection, first: CandidateModel
 ) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
-    """Search from a whole effect and without it: no single step exchanges it for several simple ones."""
-    final, near = search_effects(selection, _begin_whole(selection, first))
+    """Search from a whole effect, and if it is hardly better without it: no step exchanges it for several."""
+    begin, is_clear = _begin_whole(selection, first)
+    final, near = search_effects(selection, begin)
     whole = {effect.id for effect in final.state.effects if effect.companions} - {*first.ids}
-    if not whole or selection.budget.is_spent():
+    if is_clear or not whole or selection.budget.is_spent():
         return final, near
     simple = tuple(one for one in selection.candidates if one.id not in whole)
     without = replace(selection, candidates=simple, rivals={}, _dropped={})
@@ -458,12 +459,10 @@ def _search_both(
     return (final, near) if best is final else search_effects(selection, selection.reweight(best))
 
 
-def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
-    """The model with an effect and its companions, less what is not significant; else the model itself.
+def _begin_whole(selection: Selection, first: CandidateModel) -> tuple[CandidateModel, bool]:
+    """The model with an effect and its companions, less what is not significant, and whether it is clear.
 
-    A speed loop answers ramps of its command: fitted to steps, one without ramps ends in a local minimum. So
-    does friction in contact whose search began with a wider track and a skid. Every start is fitted with the
-    weights of its own residuals: those of the model without the effect see no outlier.
+    A speed loop without ramps ends in a local minimum, as friction in contact that began with a track does.
     """
     usual = {one.id: _make_possible(one(), selection.conditions) for one in selection.candidates}
     for one in (one for one in usual.values() if one.companions and one.id not in first.ids):
@@ -473,6 +472,7 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         tried, simpler = selection.enter_each([starts[0], loaded.add(*cases)])
         if selection.budget.is_spent() or selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
+        is_clear = selection.loss(tried) < _WHOLE**2 * selection.loss(simpler)
         weights, best = selection.weights, _make_sound(selection, tried)
         for state in starts:
             selection.take_weights(make_weights(selection.part.find_residuals(state), selection.part))
@@ -481,9 +481,9 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> CandidateModel:
         selection.noise = selection.take_evidence(best).noise
         pruned = prune(selection, selection.reweight(best))
         if not set(pruned.ids) <= set(first.ids):
-            return pruned
+            return pruned, is_clear
         selection.take_weights(weights)
-    return first
+    return first, True
 
 
 def _make_possible(effect: Effect, conditions: Conditions) -> Effect:
