@@ -190,6 +190,21 @@ def test_trap_18_sliding_is_no_bad_stretch(
     assert "bad_stretch" not in taken.ids()
 
 
+def tabulate_poses(
+    times: np.ndarray, position: np.ndarray, quaternion: np.ndarray, segment: np.ndarray, held: np.ndarray
+) -> pl.DataFrame:
+    return pl.DataFrame(
+        {
+            "t": times,
+            "stamp": np.round(times * 1e9).astype(np.int64),
+            "segment": segment.astype(np.int32),
+            **{name: position[:, i] for i, name in enumerate("xyz")},
+            **{f"q_{name}": quaternion[:, i] for i, name in enumerate("xyzw")},
+            "held": held,
+        }
+    )
+
+
 def make_windowed_poses(steps: int = 5, *, speed: float = 1.0) -> pl.DataFrame:
     """Poses of 6 s steps with a hole of 1 s between, each step going on where the last one ended."""
     pieces = []
@@ -201,16 +216,7 @@ def make_windowed_poses(steps: int = 5, *, speed: float = 1.0) -> pl.DataFrame:
     position = np.stack((np.concatenate([piece[1] for piece in pieces]), 0.0 * times, 0.0 * times), axis=-1)
     quaternion = rigid.quaternions_from_yaw(0.0 * times)
     track = cut_track(times, position, quaternion, np.zeros(times.size, dtype=bool), SETTINGS, "/pose")
-    return pl.DataFrame(
-        {
-            "t": times,
-            "stamp": np.round(times * 1e9).astype(np.int64),
-            "segment": track.segment.astype(np.int32),
-            **{name: track.position[:, i] for i, name in enumerate("xyz")},
-            **{f"q_{name}": track.quaternion[:, i] for i, name in enumerate("xyzw")},
-            "held": track.held,
-        }
-    )
+    return tabulate_poses(times, track.position, track.quaternion, track.segment, track.held)
 
 
 def test_repeats_of_a_localization_that_waits_are_no_rest_while_the_wheels_turn() -> None:
@@ -220,16 +226,8 @@ def test_repeats_of_a_localization_that_waits_are_no_rest_while_the_wheels_turn(
     last = updates[np.searchsorted(updates, times + 1e-9, side="right") - 1]
     place = np.stack((last, 0.0 * last, 0.0 * last), axis=-1)
     quaternion = rigid.quaternions_from_yaw(0.0 * times)
-    poses = pl.DataFrame(
-        {
-            "t": times,
-            "stamp": np.round(times * 1e9).astype(np.int64),
-            "segment": np.zeros(times.size, dtype=np.int32),
-            **{name: place[:, i] for i, name in enumerate("xyz")},
-            **{f"q_{name}": quaternion[:, i] for i, name in enumerate("xyzw")},
-            "held": rigid.find_held(place, quaternion),
-        }
-    )
+    whole, held = np.zeros(times.size, dtype=np.int64), rigid.find_held(place, quaternion)
+    poses = tabulate_poses(times, place, quaternion, whole, held)
     turns = np.full(times.size, 1.0 / 0.165)
     wheels = DriveSeries(times, turns, turns, 0.0 * turns, None)
 

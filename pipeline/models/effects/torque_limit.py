@@ -12,13 +12,11 @@ Source: saturation of a speed controller; Astrom and Murray, Feedback Systems, c
 from dataclasses import replace
 
 from pipeline.models.effect import (
-    INF,
     WHEELED,
     DriveEffect,
     Effect,
     Excitation,
     Least,
-    Parameter,
     Plausible,
     Search,
     Spread,
@@ -48,17 +46,7 @@ class TorqueLimit(DriveEffect):
             between_runs=Spread(0.125, WARTHOG_LAGS),
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
-        Parameter(
-            "limit",
-            "rad/s^2",
-            (0.05, 500.0),
-            INF,
-            "largest wheel acceleration",
-            3.0,
-            search=Search.STARTS,
-            step=1e-2,
-            quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),
-        ),
+        replace(AccelerationLimit.parameters[0], starts=(), search=Search.STARTS),
     )
     starts = (
         {"tau": 0.15, "limit": 4.0},
