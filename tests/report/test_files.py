@@ -14,6 +14,7 @@ from report_synthesis import list_places, make_report
 
 from pipeline.report import ReportError, theme
 from pipeline.report.figures import list_figures
+from pipeline.report.figures.slip_figures import list_responses
 from pipeline.report.page import FORMATS, write_figures
 from pipeline.report.scene import Scene
 from pipeline.report.theme import (
@@ -160,3 +161,14 @@ def test_warming_fills_the_cache_without_waiting(cache: Path) -> None:
         time.sleep(0.05)
     assert cache.is_file()
     assert os.access(cache, os.R_OK)
+
+
+def test_responses_begin_at_what_was_before_the_step_and_the_command_ends_at_one() -> None:
+    rows = list_responses(Scene(make_report(duration_s=120.0)))
+    assert set(rows) == {"response_x", "response_w"}
+    for frame in rows.values():
+        command = frame.filter(pl.col("series") == "command")
+        assert command.filter(pl.col("t") < -0.01)["value"].abs().max() == pytest.approx(0.0, abs=1e-9)
+        assert command.filter(pl.col("t") > 0.01)["value"].to_numpy() == pytest.approx(1.0, abs=1e-9)
+        measured = frame.filter(pl.col("series") == "velocity").sort("t")["value"]
+        assert 0.2 < float(measured[-1]) < 1.2

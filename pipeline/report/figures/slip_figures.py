@@ -426,7 +426,7 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
         frames = []
         for series, (times, values) in lines.items():
             at = np.interp((starts[:, None] + since).ravel(), times, values).reshape(starts.size, -1)
-            before = at[:, [np.searchsorted(since, 0.0) - 1]]
+            before = at[:, [np.searchsorted(since, -0.5 / _RATE_HZ) - 1]]
             middle = np.median((at - before) / (high - low)[:, None], axis=0)
             frames.append(pl.DataFrame({"t": since, "value": middle}).with_columns(series=pl.lit(series)))
         tables[f"response_{component}"] = pl.concat(frames)
