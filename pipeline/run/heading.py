@@ -10,11 +10,10 @@ from pipeline.core import arrays
 from pipeline.core.arrays import ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.machine_code import compiled
 from pipeline.run import GyroFit, MotionRun, Track
-from pipeline.run.signals import Commands, DriveSeries, Signal, Wheels
+from pipeline.run.signals import STILL, Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged
 SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; no window fits into a shorter span or bridges a longer gap
-_STILL = 1e-6  # [rad/s] commanded at rest: above the rounding of sums
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags start at the wheel speeds
 
 
@@ -117,7 +116,10 @@ class MeasuredDrive:
             return np.insert(values, places, np.concatenate((values[hole], values[hole + 1])))
 
         self._steers, self._drifts = bool(series.steering.any()), series.sideways is not None
-        signals = [series.left, series.right, *([series.steering] if self._steers else [])]
+        signals = [series.left, series.right]
+        # A car turns by speed times angle: where both jump, their means would turn less than it did.
+        if self._steers:
+            signals += [series.speed, series.speed * series.steering]
         signals += [] if series.sideways is None else [series.sideways]
         self._values = np.array([fill(signal) for signal in signals])
 
@@ -126,7 +128,7 @@ class MeasuredDrive:
         signals = np.empty((len(self._values), at.size))
         _interpolate(at + delay_s, self._knots, self._values, signals)
         left, right, *rest = signals
-        steering = rest[0] if self._steers else np.zeros(left.size)
+        steering = rest[1] / rest[0] if self._steers else np.zeros(left.size)
         return Wheels(left, right, steering, rest[-1] if self._drifts else None)
 
 
@@ -198,13 +200,15 @@ class HeldDrive:
         def average(values: Floats) -> Floats:
             return average_held(commands.times, values, self._grid)
 
-        steers = commands.steering.any()
+        steering = np.zeros(self._grid.times.size)
+        if commands.steering.any():
+            steering = average(commands.speed * commands.steering) / average(commands.speed)
         return Wheels(
             average(commands.left),
             average(commands.right),
-            average(commands.steering) if steers else np.zeros(self._grid.times.size),
+            steering,
             None if commands.sideways is None else average(commands.sideways),
-            average((np.maximum(np.abs(commands.left), np.abs(commands.right)) < _STILL).astype(np.float64)),
+            average((np.maximum(np.abs(commands.left), np.abs(commands.right)) < STILL).astype(np.float64)),
         )
 
 

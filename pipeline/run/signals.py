@@ -32,6 +32,8 @@ Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 _STEPS = 2.0**20
 """Steps of a second, a metre, a radian: a millionth is less than any sensor resolves, and a million times
 the rounding of positions in a map."""
+STILL = 1e-6
+"""[rad/s] of wheels at rest: above the rounding of sums."""
 _OFF_TIE = 0.37
 """Share of a step added before rounding down: with a half, values of few digits might go either way."""
 
@@ -59,6 +61,11 @@ class DriveSeries:
     right: Floats
     steering: Floats
     sideways: Floats | None = None
+
+    @property
+    def speed(self) -> Floats:
+        """Magnitude of the wheels' mean speed [rad/s], above zero so that it can be a weight, shape (n,)."""
+        return np.abs(0.5 * (self.left + self.right)) + STILL
 
     def change(self, times: Floats, change: Callable[[Floats], Floats]) -> DriveSeries:
         """The series at other stamps, with the same change of each signal."""
