@@ -414,7 +414,7 @@ class Selection:
         fitted = self.approach_each(base, states, useful) if is_rival else self.enter_each(states)
         if beyond is not None:
             beyond += [model for model in fitted if self._is_beyond(model, base)]
-        return [self._simplify(model, base) for model in fitted]
+        return [self._simplify(model, base, useful) for model in fitted]
 
     def _is_beyond(self, model: CandidateModel, base: CandidateModel) -> bool:
         """Whether all that keeps a model from being sound are values of new effects beyond their range."""
@@ -433,14 +433,15 @@ class Selection:
         models[model.ids] = model if rival is None else min(rival, model, key=self.loss)
         return True
 
-    def _simplify(self, model: CandidateModel, base: CandidateModel) -> CandidateModel:
+    def _simplify(self, model: CandidateModel, base: CandidateModel, useful: float) -> CandidateModel:
         """An extension without effects that a new one makes superfluous, or with their simpler forms.
 
         Lags together imitate a delay, a slow steering a limit: put in beside their imitation they leave it
         at nothing. Where nothing new would be left the extension stays as it is, and is not named.
         """
         reduced = self.reduce(model.state)
-        return model if reduced is None or set(reduced.ids) <= set(base.ids) else self.enter(reduced)
+        is_new = reduced is not None and not set(reduced.ids) <= set(base.ids)
+        return self.enter_each([reduced], useful)[0] if reduced is not None and is_new else model
 
     def reduce(self, state: State) -> State | None:
         """The state with the simpler forms of effects that may not be named; None if all may be."""

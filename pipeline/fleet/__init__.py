@@ -19,6 +19,7 @@ import polars as pl
 from pipeline.core import FOLDS, SlipError
 from pipeline.core.arrays import STRETCH_S, Floats
 from pipeline.run.signals import MOVING_MPS
+from pipeline.stages.slip_stage import find_fastest
 
 if TYPE_CHECKING:
     from pipeline.fleet.confidence import Interval
@@ -117,10 +118,6 @@ LABELS = ("dataset", "vehicle", "terrain", "run", "day", "month", "year")
 UNKNOWN = "unknown"
 _FEWEST = 10
 """Minimum samples of a command step, transitory and steady each: half a second at 20 Hz."""
-_CALM_SAMPLES = 21
-"""Width of the running median of the speed [samples]: a second at 20 Hz, which removes jumps of a pose."""
-_FASTEST = 0.99
-"""Quantile used as the largest speed: tolerates one bad pose in a hundred."""
 
 _MEASURES = {
     "relative_slip": pl.Float64,
@@ -198,7 +195,7 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
     - ``transitory_slip`` [m]: median over command steps of the integral of modulus minus the step's steady
       median over its transitory span: the slip path of a command change in excess of steady driving.
     - ``largest_kinetic_energy`` [J]: 1/2 m v^2 of the 99th percentile of the speed's running median over one
-      second, which removes the jitter of held poses and single jumps.
+      second, which removes the jitter of held poses and single jumps; as in table `aggregates`.
     - ``unpredictability`` [m/s]: see `measure_unpredictability`; ``relative_unpredictability`` [1]: over the
       root mean square ideal speed ||(f_x, f_y, L f_w)||.
 
@@ -215,14 +212,12 @@ def measure_difficulty(slip: pl.LazyFrame, vehicles: pl.DataFrame) -> pl.DataFra
     ideal = (pl.col("f_x") ** 2 + pl.col("f_y") ** 2 + squared_yaw).sqrt()
     moved = pl.col("g_x") ** 2 + pl.col("g_y") ** 2
     energy = 0.5 * pl.col("mass") * (moved + pl.col("squared_gyration") * pl.col("g_w") ** 2)
-    speed = (pl.col("v_x") ** 2 + pl.col("v_y") ** 2).sqrt()
-    calm = speed.rolling_median(_CALM_SAMPLES, min_samples=3)
     simple = sound.group_by("run", "input").agg(
         (pl.col("modulus") / ideal).filter(ideal > MOVING_MPS).median().alias("relative_slip"),
         energy.median().alias("slip_energy"),
         (_plate("g").sum() / _plate("v").sum()).alias("lost_energy"),
         (ideal**2).mean().sqrt().alias("ideal"),
-        (0.5 * pl.col("mass").first() * calm.quantile(_FASTEST) ** 2).alias("largest_kinetic_energy"),
+        (0.5 * pl.col("mass").first() * find_fastest() ** 2).alias("largest_kinetic_energy"),
     )
     fresh, late = pl.col("transitory"), ~pl.col("transitory")
     level = pl.col("modulus").filter(late).median()

@@ -357,6 +357,10 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
 
 _ROUGHNESS_S = 1.0
 """Span over which height changes are taken [s]: Triest et al. 2022 use one second."""
+_CALM_SAMPLES = 21
+"""Width of the running median of the speed [samples]: a second at 20 Hz, which removes jumps of a pose."""
+_FASTEST = 0.99
+"""Quantile used as the largest speed: tolerates one bad pose in a hundred."""
 
 
 def aggregate_run(
@@ -383,7 +387,7 @@ def aggregate_run(
         moves: whether the vehicle moves; the path of one that stands is noise of the poses.
     """
     clean, whole = slip.filter(~pl.col("suspect")), windows.filter(~pl.col("suspect"))
-    motion = _summarize_motion(velocities, vehicle)
+    height_rate = _height_rate(velocities)
     period = float(np.median(np.diff(velocities["t"].to_numpy())))
     rows = []
     for name in slip["input"].unique(maintain_order=True):
@@ -391,6 +395,7 @@ def aggregate_run(
             chosen = [
                 frame.filter((pl.col("input") == name) & _in_subset(subset)) for frame in (clean, whole)
             ]
+            energy = 0.5 * pl.lit(vehicle.mass_kg, dtype=pl.Float64) * find_fastest() ** 2
             split = _split_parts(clean.filter(_in_subset(subset)), length) if name == "command" else {}
             rows.append(
                 {
@@ -399,7 +404,8 @@ def aggregate_run(
                     **_summarize_slip(chosen[0], chosen[1]),
                     **_measure_distance(chosen[0], period, moves=moves),
                     **split,
-                    **motion,
+                    "height_rate": height_rate,
+                    "largest_kinetic_energy": clean.filter(pl.col("input") == name).select(energy).item(),
                     "length_scale": length,
                 }
             )
@@ -459,13 +465,10 @@ def _measure_distance(slip: pl.DataFrame, period: float, *, moves: bool) -> dict
     return {"distance": float(speed.sum()) * period if moves else None, "duration": slip.height * period}
 
 
-def _summarize_motion(velocities: pl.DataFrame, vehicle: Vehicle) -> dict[str, float | None]:
-    """Height variation and largest kinetic energy of a run."""
-    speed = np.hypot(velocities["v_x"].to_numpy(), velocities["v_y"].to_numpy())
-    # The 99.5th percentile replaces the largest speed: a single noisy sample would inflate the energy.
-    fastest = float(np.quantile(speed, 0.995))
-    energy = None if vehicle.mass_kg is None else 0.5 * vehicle.mass_kg * fastest**2
-    return {"height_rate": _height_rate(velocities), "largest_kinetic_energy": energy}
+def find_fastest() -> pl.Expr:
+    """Largest speed of sound samples of a run [m/s]: one that lasts, without jumps of single poses."""
+    speed = (pl.col("v_x") ** 2 + pl.col("v_y") ** 2).sqrt()
+    return speed.rolling_median(_CALM_SAMPLES, min_samples=3).quantile(_FASTEST)
 
 
 def _height_rate(velocities: pl.DataFrame) -> float | None:
