@@ -15,7 +15,6 @@ from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model, write_model
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import read_model_text
-from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
 from pipeline.web import Ask, WorkbenchError, evaluating
@@ -151,22 +150,20 @@ def _try_each(prepared: PreparedRun, model: Model, trial: Trial, idle: threading
     trial.total, additions = len(tries.candidates), list[Addition]()
     for addition in tries.try_each():
         additions += [] if addition is None else [addition]
-        trial.additions = [
-            show_addition(one, tries.before, prepared.vehicle) for one in tries.fold(additions)
-        ]
+        trial.additions = [show_addition(one, tries.before, model) for one in tries.fold(additions)]
         trial.tried += 1
         idle.wait()
         if trial.stopped:
             return
 
 
-def show_addition(addition: Addition, before: Errors, vehicle: Vehicle) -> dict[str, object]:
-    """Change of the errors over 2 s by an additional effect, as JSON."""
+def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str, object]:
+    """Change of a model's errors over 2 s by an additional effect, as JSON."""
     effect, after = addition.effect, addition.errors
     return {
         "id": effect.id,
         "about": summarize_effect(effect),
-        "sentence": "" if effect.is_neutral else effect.describe_motion(vehicle),
+        "sentence": "" if effect.is_neutral else effect.describe_motion(model.vehicle, model),
         "left": addition.remaining,
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
@@ -188,7 +185,7 @@ def list_named(
         named = [effect for effect in file.model if not is_term(effect.id)]
         effects = [effect for effect in named if explain_refusal(effect, file.intervals) is None]
         ranked = rank_named(prepared.problem, state, effects)
-    return [show_addition(one, before, prepared.vehicle) for one in ranked]
+    return [show_addition(one, before, model) for one in ranked]
 
 
 _MOST_ALBUMS = 6

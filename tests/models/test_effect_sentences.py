@@ -88,6 +88,17 @@ def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
     )
 
 
+def test_the_share_of_a_difference_is_that_of_both_gains() -> None:
+    """D = g_difference g_drive D_command: tile was said to reach 106 % beside wheels that reach 96.9 %."""
+    difference, drive = find_effect("difference_gain")().change(g=1.06), find_effect("drive_gain")()
+    assert "reaches 106 % of the commanded" in difference.describe_motion(HUSKY, (difference,))
+    both = (difference, drive.change(g=0.969))
+    said = "reaches 103 % of the commanded speed difference of its sides"
+    whole = difference.describe_motion(HUSKY, both)
+    assert whole == f"Difference gain, with the drive gain: the robot {said}"
+    assert difference.describe_clause(HUSKY, both) == said
+
+
 def test_contact_without_a_bound_tells_no_coefficient() -> None:
     contact = find_effect("contact_friction")(k=1.75)
     assert contact.describe_motion(HUSKY) == "Contact friction: track 1.75 times as wide"

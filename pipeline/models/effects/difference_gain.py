@@ -8,12 +8,14 @@ quickly. Only encoders tell it from the effective track; a share that falls with
 Source: steady state of a proportional speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """
 
+from collections.abc import Iterable
 from dataclasses import replace
 
-from pipeline.models.effect import SIDES, DriveEffect, Excitation
-from pipeline.models.effects.drive_gain import SHARE
+from pipeline.models.effect import SIDES, DriveEffect, Effect, Excitation
+from pipeline.models.effects.drive_gain import SHARE, DriveGain
 from pipeline.models.parameter import Conditions
 from pipeline.run.signals import RunContext, Wheels
+from pipeline.sources import Vehicle
 
 
 class DifferenceGain(DriveEffect):
@@ -23,13 +25,18 @@ class DifferenceGain(DriveEffect):
     rank = 1
     kinds = SIDES
     parameters = (replace(SHARE, about="reached over asked difference of the wheels", typical=0.7),)
-    motion = "Difference gain: the sides reach {percent} of the commanded difference of their speeds"
-    clause = "reaches {percent} of the commanded speed difference between its sides"
+    motion = "Difference gain: the robot reaches {percent} of the commanded speed difference of its sides"
     needs = (Excitation.TURNING,)
     confused_with = ("effective_track", "turn_droop", "wheel_servo", "body_turn_limit")
     python = """
         lost = (1.0 - {g}) * (right - left) / 2.0
         left, right = left + lost, right - lost"""
+
+    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
+        """What the sides reach, with the gain of all wheels."""
+        gain = next((one.values["g"] for one in beside if isinstance(one, DriveGain)), 1.0)
+        both = super(DifferenceGain, self.change(g=gain * self.values["g"])).describe_motion(vehicle)
+        return both if gain == 1.0 else both.replace(":", ", with the drive gain:", 1)
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
