@@ -402,6 +402,9 @@ def simulate(  # noqa: D417 - arguments document themselves
         }
         return print_result(lists, lambda: _format_case(lists), json=json)
     effects = dict(_parse_effect(text) for text in effect or [])
+    if len(effects) < len(effect or []):
+        hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
+        raise SlipError("effect_twice", "an effect is given twice", where=" ".join(effect or []), hint=hint)
     path = simulate_case(
         case,
         effects,

@@ -357,8 +357,9 @@ def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None
     assert done.returncode == 0, done.stderr
     assert out.is_file()
 
-    for effect in ("effective_track=wide", "antigravity=1"):
-        wrong = run_verb("simulate", "ideal_husky", "--effect", effect, "--out", tmp_path / "x.mcap")
+    for effects in (["effective_track=wide"], ["antigravity=1"], ["drive_lag=0.3", "drive_lag=0.5"]):
+        asked = [word for effect in effects for word in ("--effect", effect)]
+        wrong = run_verb("simulate", "ideal_husky", *asked, "--out", tmp_path / "x.mcap")
         assert wrong.returncode == 1
         assert len(wrong.stderr.splitlines()) == 1
         assert not (tmp_path / "x.mcap").exists()
