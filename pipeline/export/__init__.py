@@ -294,14 +294,19 @@ class Facts:
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
 
     def find_speed_limit(self) -> Amount:
-        """Largest speed [m/s], from the body command or from the wheels when driving straight."""
+        """Largest speed of the body [m/s], from its command or from the wheels when driving straight."""
         wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
-        return self._hold(_take_least(self.take(Quantity.SPEED_LIMIT), wheels), "driven_speed_mps", "m/s")
+        commanded = self.take(Quantity.SPEED_LIMIT).change(operator.mul, self.take(Quantity.RADIUS))
+        return self._hold(_take_least(commanded, wheels), "driven_speed_mps", "m/s")
 
     def find_turn_limit(self) -> Amount:
-        """Largest yaw rate [rad/s], from the body command or from the wheels when turning on the spot."""
-        limit = _take_least(self.take(Quantity.TURN_LIMIT), self._spin(Quantity.WHEEL_SPEED_LIMIT))
-        return self._hold(limit, "driven_yaw_rate_radps", "rad/s")
+        """Largest yaw rate of the body [rad/s], from its command or from the wheels turning on the spot."""
+        wheels, commanded = self._spin(Quantity.WHEEL_SPEED_LIMIT), self.take(Quantity.TURN_LIMIT)
+        if self.vehicle.kind == "differential":
+            own = self.vehicle.controller_track_multiplier
+            geometry = self.take(Quantity.RADIUS), self.take(Quantity.TRACK)
+            commanded = commanded.change(lambda w, radius, track: w * own * radius / track, *geometry)
+        return self._hold(_take_least(commanded, wheels), "driven_yaw_rate_radps", "rad/s")
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
         """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
@@ -328,11 +333,11 @@ class Facts:
 
     def list_unmapped(self, sheet: Sheet) -> list[str]:
         """Parameters of effects that a sheet does not cover, one line for each effect."""
-        used = {source for setting in sheet.settings for source in setting.sources}
+        used = {(name, source) for one in sheet.settings for source in one.sources for name in one.effects}
         lines = []
         for effect in self.file.model:
             texts = [self._format_source(effect, p) for p in effect.parameters if effect.is_used(p)]
-            missing = [text for text in texts if text not in used]
+            missing = [text for text in texts if (effect.id, text) not in used]
             if missing or not texts:
                 lines.append("; ".join(missing) or effect.id)
         return lines

@@ -107,7 +107,7 @@ def test_the_verdict_says_how_far_off_why_and_what_remains() -> None:
     drawn = draw_diagnosis(effects, [(1.06, 0.96), (0.44, 0.14), (0.1, 0.04)])
     assert check_verdict(drawn) == (
         "Over 2 s the ideal model is 1.06 m and 55 degrees off. The robot turns at 56 % of the ideal rate "
-        "and answers turns 1.1 s late; with both in the model 10 cm and 2.3 degrees remain, 2 times the "
+        "and follows turns with a time constant of 1.1 s; with both in the model 10 cm and 2.3 degrees remain, 2 times the "
         "noise floor. No known effect explains the rest."
     )
 
@@ -159,7 +159,7 @@ def test_alternatives_stand_in_and_doubts_are_named() -> None:
     )
     drawn = draw_diagnosis({"drive_lag": {"tau": 3.5}}, [(1.0, 0.5), (0.3, 0.2)])
     drawn["effects"][0]["clause"] += " (a stand-in for another cause)"
-    assert "3.5 s late (a stand-in for another cause); with this" in check_verdict(drawn)
+    assert "3.5 s (a stand-in for another cause); with this" in check_verdict(drawn)
 
 
 def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:

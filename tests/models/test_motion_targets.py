@@ -285,6 +285,19 @@ def test_limits_are_reached_and_not_more() -> None:
     assert math.radians(degrees["RO_YAW_RATE_LIM"]) == pytest.approx(p["FollowPath.wz_max"], rel=1e-4)
 
 
+def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
+    """Wet grass: a command that is clipped at 1.01 rad/s turns a track twice as wide by .5 rad/s."""
+    effects = (find_effect("effective_track")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
+    file = make(*effects)
+    spin = predict(file, [(-1.0, -99.0, 99.0)], 4.0)
+    assert spin[-1, 6] == pytest.approx(take("nav2", file)["FollowPath.wz_max"], rel=1e-4)
+    assert "# No parameter there stands for:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
+    # The controller that is told of the track asks for no more than its limit lets through.
+    control = take("ros2_control", file)
+    asked = control["angular.z.max_velocity"] * control["wheel_separation_multiplier"]
+    assert asked == pytest.approx(1.0, rel=1e-4)
+
+
 def test_of_two_limits_the_smaller_one_holds() -> None:
     limits = (find_effect("body_speed_limit")(limit=0.5), find_effect("wheel_speed_limit")(limit=99.0))
     assert take("nav2", make(*limits))["FollowPath.vx_max"] == 0.5

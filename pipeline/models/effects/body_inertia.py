@@ -41,7 +41,7 @@ class BodyInertia(BodyEffect):
         ),
     )
     motion = "Body inertia: time constant {tau:.2f} s from wheel speed to body speed"
-    clause = "follows its wheels {tau:.2g} s late"
+    clause = "follows its wheels with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)

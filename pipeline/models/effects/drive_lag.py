@@ -45,7 +45,7 @@ class DriveLag(DriveEffect):
         ),
     )
     motion = "Drive lag: time constant {tau:.2f} s"
-    clause = "answers commands {tau:.2g} s late"
+    clause = "follows commands with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)

@@ -33,7 +33,7 @@ class SteeringLag(DriveEffect):
         ),
     )
     motion = "Steering lag: time constant {tau:.2f} s"
-    clause = "steers {tau:.2g} s late"
+    clause = "steers with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES, Excitation.STEERING)
     confused_with = ("transport_delay",)
     python_state = ("lag_steering",)

@@ -55,7 +55,7 @@ class TorqueLimit(DriveEffect):
         {"tau": 0.5, "limit": 12.0},
     )
     motion = "Torque limit: {limit:.3g} rad/s^2 at every wheel, time constant {tau:.2f} s below it"
-    clause = "answers commands {tau:.2g} s late, with wheels that gain {limit:.2g} rad/s^2 at most"
+    clause = "follows commands with a time constant of {tau:.2g} s, by {limit:.2g} rad/s^2 at most"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.SMALL)
     confused_with = ("drive_lag", "acceleration_limit", "wheel_servo")
     contains = ("drive_lag", "acceleration_limit")

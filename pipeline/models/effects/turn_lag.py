@@ -43,7 +43,7 @@ class TurnLag(TwoLags):
         ),
     )
     motion = "Turning lag: time constant {tau_diff:.2f} s for turning, {tau_mean:.2f} s for speed"
-    clause = "answers turns {tau_diff:.2g} s late"
+    clause = "follows turns with a time constant of {tau_diff:.2g} s"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("drive_lag", "transport_delay", "turn_droop")
     same_in_one_motion = ("drive_lag",)
