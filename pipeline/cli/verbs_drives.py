@@ -255,7 +255,8 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     if not names:
         what = "a check needs the log that was driven"
         raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
-    before = [name for name in promised.runs if name not in names]
+    of_drive = _gather(names, options, quiet=True).recordings
+    before = [name for name in promised.runs if name not in {*names, *(one.name for one in of_drive)}]
     vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
     if promised.vehicle != vehicle.id:
         what = f"the plan is for {promised.vehicle}, and the log is of {vehicle.id}"
@@ -263,7 +264,7 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
-        driven = [load_recording(recording, vehicle) for recording in recordings[len(before) :]]
+        driven = [load_recording(recording, vehicle) for recording in of_drive]
         require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
         diagnosis = diagnose_runs(recordings, vehicle).runs[0]
     checked = check_plan(promised, diagnosis)

@@ -13,7 +13,7 @@ from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
 from pipeline.models import format_model
 from pipeline.models.catalogue import find_effect
-from pipeline.models.parameter import UNDETERMINED, Level, Reading
+from pipeline.models.parameter import AT_BOUND, UNDETERMINED, Level, Reading
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class Value:
         if math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
         if self.at_bound:
-            return f"{text} (at its bound)"
+            return f"{text} ({AT_BOUND})"
         return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
 
     def move(self, change: float) -> Value:

@@ -27,7 +27,14 @@ from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import UNDETERMINED, Parameter, cut_interval, is_of_one_run, stands_at_bound
+from pipeline.models.parameter import (
+    AT_BOUND,
+    UNDETERMINED,
+    Parameter,
+    cut_interval,
+    is_of_one_run,
+    stands_at_bound,
+)
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
@@ -442,7 +449,7 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
                 text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
             elif row.get("fitted"):
                 text += UNDETERMINED
-            marks = ["at its bound"] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
+            marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
             marks += ["not observable in these runs"] * (row.get("observable") is False)
             text += "".join(f"  ({mark})" for mark in marks)
             if "run" in row:

@@ -299,8 +299,10 @@ class Check:
             return BROKEN if "broken" in outcomes else UNDETERMINED if "undetermined" in outcomes else KEPT
         if self.list_status("changed"):
             return BROKEN
-        known = len(self.changes) > len(self.list_status("unknown"))
-        return KEPT if known and not self.list_status("differs") else UNDETERMINED
+        # That little of a motion can be compared does not show that it is unchanged.
+        unknown, numbers = self.list_status("unknown"), {*self.changes} - {*ERRORS}
+        is_compared = len(unknown) < len(self.changes) and 2 * len(numbers & {*unknown}) <= len(numbers)
+        return KEPT if is_compared and not self.list_status("differs") else UNDETERMINED
 
 
 def check_runs(

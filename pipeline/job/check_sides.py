@@ -18,7 +18,16 @@ from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
 from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
-from pipeline.job.stored_fits import ERRORS, Label, RunReading, list_labels, measure_slip, read_run, read_runs
+from pipeline.job.stored_fits import (
+    ERRORS,
+    Label,
+    RunReading,
+    list_labels,
+    measure_slip,
+    read_run,
+    read_runs,
+    refuse_run,
+)
 from pipeline.models import format_model
 from pipeline.models.catalogue import list_effects
 from pipeline.models.formula import FormulaEffect
@@ -144,6 +153,12 @@ def read_sides(
         if isinstance(runs_of, Sequence) and not runs_of:
             what = f"the check has no runs {side.upper()}"
             raise JobError("no_runs", what, hint="Give logs, or runs of the results.")
+    stored = before if isinstance(before, Sequence) else ()
+    refused = {one.run: refuse_run(one) for one in (*stored, *after)}
+    notes = tuple(f"left out: {run}: {why}" for run, why in refused.items() if why)
+    if isinstance(before, Sequence):
+        before = _list_sound(before, refused, BEFORE)
+    after = _list_sound(after, refused, AFTER)
     given = None if isinstance(before, Sequence) else before
     file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
     manifests = list(before) if isinstance(before, Sequence) else []
@@ -166,7 +181,18 @@ def read_sides(
         kind=names.get(type(before), "runs"),
         before=tuple(_note_slip(one, slips) for one in both.before),
         after=tuple(_note_slip(one, slips) for one in both.after),
+        notes=(*notes, *both.notes),
     )
+
+
+def _list_sound(manifests: Sequence[Manifest], refused: Mapping[str, str], side: Side) -> list[Manifest]:
+    """Runs of a side to which a fit has a meaning; an error where none has."""
+    sound = [one for one in manifests if not refused[one.run]]
+    if not sound:
+        why = "; ".join(f"{one.run}: {refused[one.run]}" for one in manifests)
+        what = f"no run {side.upper()} can be compared: {why}"
+        raise JobError("nothing_to_compare", what, hint="Give other runs.")
+    return sound
 
 
 def _note_slip(reading: RunReading, slips: Mapping[str, tuple[float, float]]) -> RunReading:

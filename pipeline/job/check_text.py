@@ -203,7 +203,7 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         why = (
             "not stated by the model"
             if check.sides.kind == "model" and name in ERRORS
-            else "not observable in"
+            else "not determined by the model of both sides in"
         )
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
@@ -216,6 +216,7 @@ def _format_resolution(check: Check, name: str) -> str:
     change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
     text = f"detectable change {show(change.smallest)}"
+    text += "; both at the speed of AFTER" if name in ERRORS else ""
     if check.simulated:
         return text
     source = "(default)" if change.is_default else "(these runs)"

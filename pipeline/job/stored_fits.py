@@ -32,6 +32,7 @@ from pipeline.estimation.rivals import (
     list_learners,
     time_fit,
 )
+from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet.changes import RunNumbers, Side
 from pipeline.job import JobError
 from pipeline.job.keys import Owner, agree_on_vehicle
@@ -129,11 +130,20 @@ def read_runs(
         The vehicle that is used, and the runs.
 
     Raises:
-        SlipError: a run has no poses, or its vehicle contradicts the model's.
+        SlipError: a run has no poses, its vehicle contradicts the model's, or no fit to it has a meaning.
     """
+    for manifest in manifests:
+        if refusal := refuse_run(manifest):
+            hint = "Leave this run out."
+            raise JobError("no_fit", refusal, where=manifest.run, hint=hint)
     known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
     chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
+
+
+def refuse_run(manifest: Manifest) -> str:
+    """The finding of a stored run that makes every fit meaningless; empty where there is none."""
+    return find_refusal({"findings": manifest.read("findings").to_dicts()})
 
 
 def fit_to_runs(

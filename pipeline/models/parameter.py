@@ -209,6 +209,8 @@ class Conditions:
 
 UNDETERMINED = "undetermined"
 """Mark of a fitted value that its runs do not determine."""
+AT_BOUND = "at its bound"
+"""Mark of one at a limit of the search."""
 _MARGIN = 1e-6
 """Distance from a bound, relative to the size of the bounds, within which fits stop."""
 

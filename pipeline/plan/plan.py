@@ -156,7 +156,8 @@ class Plan:
             asked.append(one.question)
         texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
         if is_narrow:
-            texts.append(f"what would observe them does not fit into these limits and this time: {_ROOM}")
+            what = "driving that observes the above does not fit into these limits and this time"
+            texts.append(f"{what}: {_ROOM}")
         return texts
 
     def to_json(self) -> dict[str, object]:

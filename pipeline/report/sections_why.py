@@ -13,6 +13,7 @@ from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.estimation.verdict import holds_formula, name_formula
 from pipeline.models.catalogue import list_effects
+from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.report import (
     MISSING,
     Cell,
@@ -179,12 +180,14 @@ def view_provenance(page: Page) -> dict[str, object]:
 
 
 _MANY_FOLD = 10.0
+_PATHS = {"wheels": "from command to wheels", "measured": "from wheels to body"}
+"""Paths on which effects are judged where wheels are measured; errors of one are not those of the other."""
 _HEAD = (
     Column("effect"),
     Column("value", number=True),
     Column("95 %", number=True),
     Column("95 %, another run", number=True),
-    Column("held-out squared error without it"),
+    Column("held-out squared error over half a second without it"),
 )
 
 
@@ -256,17 +259,23 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
     name, same = str(entry.get("id", "")), entry.get("equivalent_to")
     notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
     notes += ["tentative"] if entry.get("tentative") else []
-    gain = _format_gain(number_in(entry, "gain"))
+    gain = Cell(_format_gain(number_in(entry, "gain")), small=_PATHS.get(str(entry.get("found_on")), ""))
     parameters = mapping_in(entry, "parameters")
     rows: list[list[str | Cell]] = []
     for key in parameters:
         values = mapping_in(parameters, key)
         unit = values.get("unit")
         shown = set_squares(str(unit)) if unit not in (None, "1", "") else ""
+        doubt = AT_BOUND if values.get("at_bound") else UNDETERMINED
+        doubts = [doubt] if values.get("undetermined") else []
         rows.append(
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),
-                Cell(format_number(number_in(values, "value"), digits=4), small=shown),
+                Cell(
+                    format_number(number_in(values, "value"), digits=4),
+                    small=shown,
+                    notes=[doubt] * bool(doubt),
+                ),
                 format_ends(values, digits=4),
                 format_ends(mapping_in(values, "another_run"), digits=4),
                 "" if rows else gain,

@@ -172,7 +172,7 @@ export class Pane {
     ].filter(Boolean));
     this.glance.replaceChildren(
       working(),
-      h("div", { class: "numbers" }, number("t", "position error after 2\u00a0s"), number("r", "heading error after 2\u00a0s"),
+      h("div", { class: "numbers" }, number("t", "position error over 2\u00a0s"), number("r", "heading error over 2\u00a0s"),
         h("div", { class: "scale" },
           h("div", { class: "track", role: "img" }, h("i", { class: "now" }), h("i", { class: "floor" }), h("i", { class: "ceiling" })),
           h("p", { class: "ends" }, h("span", { class: "floor-said" }), h("span", { class: "ideal-said" }))),

@@ -351,7 +351,7 @@ def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
     assert narrow.list_impossible() == [
         "q0; q1: turn both ways; drive backward",
         "q2: drive on a slope",
-        f"what would observe them does not fit into these limits and this time: {room}",
+        f"driving that observes the above does not fit into these limits and this time: {room}",
     ]
 
 

@@ -215,6 +215,8 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
     rivals = [one for one in checked["kept"] if {"or", "icr_offset"} <= set(one["question"].split())]
     assert {one["measured"] for one in rivals} == {"icr_offset"}
     assert checked["next"] is None
+    own = _run("plan", "--check", folder, before, "--results", tmp_path / "results", code=1)
+    assert "no stretch of these commands matches the plan" in own
     toml = folder / "plan.toml"
     toml.write_text(toml.read_text("utf-8").replace('"husky', '"warthog', 1), "utf-8")
     assert "the plan is for warthog" in _run(

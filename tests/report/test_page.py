@@ -343,7 +343,7 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     assert "effective_track" in told
     assert "1.740 to 1.840" in told
     assert "x 13" in told
-    assert "held-out squared error without it" in told
+    assert "held-out squared error over half a second without it" in told
     assert "Easily confused with wheel_radius." in told
     assert "lateral skid or centre of rotation: drive circles" in told
     assert "not observable in this log" in told
