@@ -143,7 +143,8 @@ def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
     verdicts = [judge_pair(row) for row in rows]
     lines = [
-        f"{row['a']} and {row['b']} differ: shift {format_value(row['shift'])} m/s, "
+        f"{row['b']} slips {format_value(abs(cast('float', row['shift'])))} m/s "
+        f"{'more' if cast('float', row['shift']) > 0.0 else 'less'} than {row['a']}: "
         f"Cliff's delta {format_value(row['cliffs_delta'])} ({row['size']}), "
         f"p = {format_value(row['p_adjusted'])} corrected" + f", {ABOUT_BLOCKS}" * (verdict == OF_TWO_RUNS)
         for row, verdict in zip(rows, verdicts, strict=True)

@@ -343,16 +343,16 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
+    numbers: dict[str, Mapping[str, object]] = {}
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
-        lines += [
-            f"  {effect['id']}.{name}".ljust(_LABEL + 2) + _bound(number, str(number["unit"]))
-            for name, number in parameters.items()
-        ]
+        numbers |= {f"  {effect['id']}.{name}": number for name, number in parameters.items()}
+    width = max([_LABEL, *map(len, numbers)]) + 2
+    lines += [f"{label:<{width}}{_bound(one, str(one['unit']))}" for label, one in numbers.items()]
     if not content["effects"]:
         lines.append("  the ideal model: most runs have no significant effect")
     lines += [
-        f"{words:<{_LABEL + 2}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
+        f"{words:<{width}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
     ]
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
@@ -360,7 +360,7 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
 
 def _bound(number: Mapping[str, object], unit: str) -> str:
     shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
-    cut = " (at its bound)" if number.get("at_bound") else ""
+    cut = " (the interval ends at a limit of the search)" if number.get("at_bound") else ""
     cut += " (default spread between runs)" if number.get("default_spread") else ""
     return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
 
@@ -438,12 +438,15 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
     # The notes list the parameters that could not be tested.
-    for one in (one for one in followed.parameters if not one.need):
+    tested = [one for one in followed.parameters if not one.need]
+    names = [f"{one.vehicle} {one.label}" for one in tested] + [one.group for one in followed.series]
+    width = max(map(len, names), default=0)
+    for one in tested:
         unit = "" if one.unit == "1" else f" {one.unit}"
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height
         lines.append(
-            f"{label:<34}{runs:>4} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, "
+            f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, "
             f"{format_power(one)}"
         )
     for group in dict.fromkeys(one.group for one in followed.series):
@@ -452,5 +455,5 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
         runs = slip.points.height
         name = slip.quantity.replace("median_modulus", "median slip speed")
         latest = f"{name} latest {slip.latest:.3g} {slip.unit}"
-        lines.append(f"{group:<34}{runs:>4} run{'s' * (runs != 1):<2} {latest}")
+        lines.append(f"{group:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {latest}")
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

@@ -17,6 +17,7 @@ from pipeline.core.arrays import Floats
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
+from pipeline.job.compared_runs import refuse_run
 from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.job.stored_fits import (
     ERRORS,
@@ -26,7 +27,6 @@ from pipeline.job.stored_fits import (
     measure_slip,
     read_run,
     read_runs,
-    refuse_run,
 )
 from pipeline.models import format_model
 from pipeline.models.catalogue import list_effects

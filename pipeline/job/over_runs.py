@@ -307,6 +307,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     notes = list(compared.notes)
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
+    notes += [f"slip of {run} left out, {reason}" for run, reason in sorted(compared.refusals.items())]
     if dated.is_empty():
         hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
         raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)
@@ -409,7 +410,8 @@ def summarize_trend(trend: Trend) -> dict[str, object]:
 
 
 def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
-    runs = gather_runs(compared.scan("aggregates").collect(), compared.labels)
+    sound = compared.labels.filter(~pl.col("run").is_in(list(compared.refusals)))
+    runs = gather_runs(compared.scan("aggregates").collect(), sound)
     long = runs.unpivot(list(_SLIP), index=["run", "input"], variable_name="quantity", value_name="value")
     return long.drop_nulls("value").select(
         "run",

@@ -32,9 +32,9 @@ from pipeline.estimation.rivals import (
     list_learners,
     time_fit,
 )
-from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet.changes import RunNumbers, Side
 from pipeline.job import JobError
+from pipeline.job.compared_runs import refuse_run
 from pipeline.job.keys import Owner, agree_on_vehicle
 from pipeline.models.effect import Effect, Late, Parameter
 from pipeline.models.learned_term import drop_learned, find_learned
@@ -139,11 +139,6 @@ def read_runs(
     known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
     chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
-
-
-def refuse_run(manifest: Manifest) -> str:
-    """The finding of a stored run that makes every fit meaningless; empty where there is none."""
-    return find_refusal({"findings": manifest.read("findings").to_dicts()})
 
 
 def fit_to_runs(

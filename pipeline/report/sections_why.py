@@ -274,7 +274,7 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
                 Cell(
                     format_number(number_in(values, "value"), digits=4),
                     small=shown,
-                    notes=[doubt] * bool(doubt),
+                    notes=doubts,
                 ),
                 format_ends(values, digits=4),
                 format_ends(mapping_in(values, "another_run"), digits=4),

@@ -470,7 +470,8 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
     return (
         wanted.select(
             pl.col("subset").cast(pl.String),
-            pl.col("mean_square").alias("total"),
+            # Of the samples with both inputs, which are fewer than those of the command alone.
+            pl.sum_horizontal(f"{part}_mean_square" for part in _PARTS).alias("total"),
             *(pl.col(f"{part}_mean_square").fill_null(0.0).alias(part) for part in _PARTS),
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
