@@ -345,7 +345,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         list[str] | None,
         Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated"),
     ] = None,
-    file: Path = Path("run.mcap"),
+    file: Path | None = None,
     seed: int | None = None,
     duration: PositiveFloat | None = None,
     vehicle: str | None = None,
@@ -368,7 +368,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     The truth stays out of the log that is written.
 
     Args:
-        file: the log to write.
+        file: the log to write (run.mcap).
         seed: seed of driving and noise.
         duration: length of the run [s].
         vehicle: simulated vehicle.
@@ -380,8 +380,8 @@ def simulate(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
     """
     made = {
-        "--effect": effect, "--seed": seed, "--duration": duration, "--vehicle": vehicle, "--layout": layout,
-        "--program": program, "--platform": platform, "--play": play,
+        "--effect": effect, "--file": file, "--seed": seed, "--duration": duration, "--vehicle": vehicle,
+        "--layout": layout, "--program": program, "--platform": platform, "--play": play,
     }  # fmt: skip
     idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
     if idle:
@@ -408,7 +408,7 @@ def simulate(  # noqa: D417 - arguments document themselves
     path = simulate_case(
         case,
         effects,
-        out=file,
+        out=file or Path("run.mcap"),
         seed=seed,
         duration_s=duration,
         vehicle=vehicle,
@@ -428,14 +428,18 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
     try:
         if ":" not in values:
             return name, float(values)
-        pairs = (pair.partition(":") for pair in values.split(","))
-        return name, {key.strip(): float(value) for key, _, value in pairs}
+        pairs = [pair.partition(":") for pair in values.split(",")]
+        numbers = {key.strip(): float(value) for key, _, value in pairs}
     except ValueError:
         raise SlipError(
             "bad_effect",
             f"the effect {text!r} has no number where one belongs",
             hint="Write ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; `slip simulate --cases` lists them.",
         ) from None
+    if len(numbers) < len(pairs):
+        hint = "Give each number of an effect once."
+        raise SlipError("number_twice", "a number is given twice", where=text, hint=hint)
+    return name, numbers
 
 
 def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:

@@ -268,9 +268,8 @@ class _Builder:
         if TwinRole.CREEP in self.effects and room > 0.0:
             # With equal creep in both directions, the wheels follow equally late in all directions.
             width = 0.5 * (effective + math.sqrt(room))
-            self.notes.append(
-                f"the wheels stand {width:.4g} m apart, not {nominal:.4g} m: all lags are alike"
-            )
+            apart = f"{width:.3g} m apart, not {nominal:.3g} m"
+            self.notes.append(f"the wheels stand {apart}: they so creep alike along and across")
         return width, wheelbase
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:

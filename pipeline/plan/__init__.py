@@ -146,7 +146,7 @@ def parse_area(text: str, vehicle: Vehicle) -> Area:
     margin = _MARGIN_M + 0.5 * body
     if match is None or min(float(match[1]), float(match[2])) <= 2.0 * margin:
         what = f"the area {text!r} is not a length and width in metres of more than {2.0 * margin:.1f} m"
-        raise PlanError("bad_area", what, where="--area", hint="Write for example --area 20x10m.")
+        raise PlanError("bad_area", what, where="--area", hint="Write it like 20x10m.")
     return Area(float(match[1]), float(match[2]), margin)
 
 
@@ -160,7 +160,7 @@ def parse_time(text: str) -> float:
     seconds = float(match[1]) * (60.0 if match[2] == "min" else 1.0) if match is not None else 0.0
     if not _SHORTEST_S <= seconds <= _LONGEST_S:
         what = f"{text!r} is not a time of {_SHORTEST_S:g} s to {_LONGEST_S / 60.0:g} min"
-        raise PlanError("bad_time", what, where="--time", hint="Write for example --time 60s.")
+        raise PlanError("bad_time", what, where="--time", hint="Write it like 60s.")
     return seconds
 
 

@@ -217,7 +217,9 @@ def make_handlers(places: ServerFolders) -> dict[type[Exception], Callable[[Requ
 
     def respond(_: Request, error: Exception) -> Response:
         shown = error if isinstance(error, SlipError) else _name_defect(error)
-        said = {"message": places.hide(shown.what), "where": places.hide(shown.where), "hint": shown.hint}
+        # An option of the command line is a field of the page, which its user sees.
+        where = "" if shown.where.startswith("--") else places.hide(shown.where)
+        said = {"message": places.hide(shown.what), "where": where, "hint": shown.hint}
         status = 404 if shown.code in _NOT_FOUND else 500 if shown is not error else 422
         return answer({"error": {"code": shown.code, **said}}, status)
 

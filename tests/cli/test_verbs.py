@@ -357,7 +357,8 @@ def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None
     assert done.returncode == 0, done.stderr
     assert out.is_file()
 
-    for effects in (["effective_track=wide"], ["antigravity=1"], ["drive_lag=0.3", "drive_lag=0.5"]):
+    twice = ["drive_lag=tau:1,tau:2"], ["drive_lag=0.3", "drive_lag=0.5"]
+    for effects in (["effective_track=wide"], ["antigravity=1"], *twice):
         asked = [word for effect in effects for word in ("--effect", effect)]
         wrong = run_verb("simulate", "ideal_husky", *asked, "--out", tmp_path / "x.mcap")
         assert wrong.returncode == 1
