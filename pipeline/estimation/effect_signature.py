@@ -11,6 +11,7 @@ from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import State
+from pipeline.models.effect import Place
 from pipeline.models.model import Timing
 from pipeline.run.windows import WINDOW_S
 
@@ -60,6 +61,8 @@ VARIABLES: Mapping[str, tuple[str, str]] = {
     "y": ("y in the map", "m"),
 }
 """Variables of signatures, the simplest first: label and unit."""
+_OF_MAP = frozenset({"x", "y", "yaw"})
+"""Variables on which what a command or a drive does cannot depend."""
 
 
 @dataclass(frozen=True)
@@ -109,9 +112,10 @@ def find_signatures(problem: Problem, state: State, run: int = 0) -> list[Signat
     ]
     after = problem.find_run_residuals(state, run)
     signatures = []
-    for name in state.ids:
-        before = problem.find_run_residuals(state.drop([name]), run)
-        signature = _find_one(name, before - after, after, by_channel, block)
+    for effect in state.effects:
+        before = problem.find_run_residuals(state.drop([effect.id]), run)
+        acts = [one for one in VARIABLES if effect.place > Place.DRIVE or one not in _OF_MAP]
+        signature = _find_one(effect.id, before - after, after, by_channel, block, acts)
         if signature is not None:
             signatures.append(signature)
     return signatures
@@ -276,7 +280,12 @@ def _merge(met: Ints) -> Ints:
 
 
 def _find_one(
-    name: str, curve: Floats, after: Floats, by_channel: Sequence[Mapping[str, _Bins]], block: Ints
+    name: str,
+    curve: Floats,
+    after: Floats,
+    by_channel: Sequence[Mapping[str, _Bins]],
+    block: Ints,
+    variables: Sequence[str],
 ) -> Signature | None:
     """The signature in the channel and variable with the largest contribution of the effect.
 
@@ -287,7 +296,7 @@ def _find_one(
         size = float(np.sqrt((curve[:, channel] ** 2).mean()))
         if size <= best:
             continue
-        shares = {key: known[key].explain(curve[:, channel]) for key in VARIABLES}
+        shares = {key: known[key].explain(curve[:, channel]) for key in variables}
         most = max(shares.values())
         if size * most > best:
             best = size * most
