@@ -89,9 +89,10 @@ def _compare_causes(
         parts = ", ".join(
             f"{causes.names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.parts
         )
+        runs = f"{budget.runs} run{'s' * (budget.runs != 1)}"
         lines += [
             "",
-            f"{budget.dataset}: {budget.total**0.5:.3g} m/s, {budget.runs} run{'s' * (budget.runs != 1)}",
+            f"{budget.dataset}: root mean square {budget.total**0.5:.3g} m/s, {runs}",
             f"  {parts}",
         ]
     lines += [""] * bool(content["differences"])

@@ -23,11 +23,11 @@ from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import TERM
+from pipeline.estimation.verdict import FORMULA
 
 Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]
 
-UNEXPLAINED = "unexplained"
 QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
 """Mean squares that are apportioned, with their units: slip speed over half a second, 2 s errors."""
 
@@ -93,7 +93,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     problem, fitted = judgement.problem, judgement.fitted
     players: dict[str, set[str]] = {}
     for name in fitted.model.ids:
-        players.setdefault(UNEXPLAINED if name.startswith(TERM) else name, set()).add(name)
+        players.setdefault(FORMULA if name.startswith(TERM) else name, set()).add(name)
 
     known = {frozenset(players): judgement.whole.held_out}
     known[frozenset()] = judgement.ladder.steps[0].held_out

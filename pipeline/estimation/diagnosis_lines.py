@@ -13,7 +13,6 @@ from pipeline.core import INPUT_WORDS, format_share
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.apportion import UNEXPLAINED
 from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
@@ -26,6 +25,7 @@ from pipeline.estimation.error_regions import (
 from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
+    CAUSE_NAMES,
     SEARCH_CUT,
     format_verdict,
     holds_formula,
@@ -64,7 +64,6 @@ _CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
 _VALUE = re.compile(r'^(\w+) = \{value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
 _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
 """Inputs of formulas in words."""
-_CAUSES = {"localization_noise": "localization noise", UNEXPLAINED: "the formula in the model"}
 _FINDINGS_SHOWN = 4
 """Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
 FINDING_LABELS = ("findings", "further", "notes")
@@ -325,7 +324,7 @@ def _format_budget(run: RunDiagnosis) -> str:
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [
-                f"{_CAUSES.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.shares
+                f"{CAUSE_NAMES.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.shares
             ]
             signs = "; below zero: it makes slip larger" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"

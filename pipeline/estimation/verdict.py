@@ -24,7 +24,9 @@ FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 SEARCH_CUT = "search_cut"
 """The finding of a run whose budget ended the search for effects before it was complete."""
 FORMULA = "unexplained"
-"""What a rung of the ladder calls the terms of a formula that no effect of the catalogue gives."""
+"""What ladder and budget call the terms of a formula that no effect of the catalogue gives."""
+CAUSE_NAMES = {FORMULA: "formula in the model", "localization_noise": "localization noise"}
+"""Causes of an error budget in words, where these differ from the id."""
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
 _MAIN_SHARE = 0.1

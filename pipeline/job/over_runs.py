@@ -9,6 +9,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.core import finite_or_none, pick, pick_finite
+from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.deployments import (
@@ -90,7 +91,7 @@ def _find_names(store: Store) -> dict[str, str]:
         for name in names
         if names == {name} != {effect}
     }
-    return called | {"localization_noise": "localization noise"}
+    return called | CAUSE_NAMES
 
 
 def summarize_causes(causes: Causes) -> dict[str, object]:

@@ -11,6 +11,7 @@ from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_i
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal, format_angle, format_length
 from pipeline.estimation.ladder import format_rises
+from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
 from pipeline.report.figures import Drawing, Figure, Section
 from pipeline.report.scene import (
@@ -328,7 +329,7 @@ ENOUGH = Figure("Is the log long enough", Section.WHY, draw_enough, order=6, wid
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
 _SCHEMA_BUDGET = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
-_LEFT = {"disturbance": "disturbance", "localization_noise": "localization noise"}
+_LEFT = ("disturbance", "localization_noise")
 _COLOURS_BUDGET = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 
 
@@ -376,7 +377,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
         low, high = number_in(part, "low"), number_in(part, "high")
         rows.append(
             {
-                "cause": _LEFT.get(name, name),
+                "cause": CAUSE_NAMES.get(name, name),
                 "from": top,
                 "to": top - share,
                 "low": None if high is None else top - high,
