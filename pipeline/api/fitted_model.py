@@ -21,8 +21,9 @@ from pipeline.estimation.ladder import format_ladder
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
 from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs
-from pipeline.models import Effect, ModelFile, find_effect, list_effects, read_model, write_model
+from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
+from pipeline.models.catalogue import refuse_taken
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
@@ -114,9 +115,7 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
     if not name.isidentifier():
         hint = "Use letters, digits and _, a letter first."
         raise MotionError("bad_value", f"{name!r} cannot be the id of an effect", where="effect", hint=hint)
-    if name in {known.id for known in list_effects()}:
-        what = f"an effect of the catalogue is called {name!r}"
-        raise MotionError("bad_value", what, where="effect", hint="Choose another name.")
+    refuse_taken(name)
     for key, (_, low, high) in tuples.items():
         if not low < high:
             what = f"bounds of {key} must be two numbers, not {low} and {high}"

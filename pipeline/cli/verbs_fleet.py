@@ -437,11 +437,11 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
-    # The notes list the parameters that could not be tested.
-    tested = [one for one in followed.parameters if not one.need]
-    names = [f"{one.vehicle} {one.label}" for one in tested] + [one.group for one in followed.series]
+    # The notes list the parameters that could not be judged.
+    judged = [one for one in followed.parameters if not one.need]
+    names = [f"{one.vehicle} {one.label}" for one in judged] + [one.group for one in followed.series]
     width = max(map(len, names), default=0)
-    for one in tested:
+    for one in judged:
         unit = "" if one.unit == "1" else f" {one.unit}"
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height

@@ -177,6 +177,17 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 
+def refuse_taken(name: str, where: str = "effect") -> None:
+    """Refuse a formula that is called like an effect of the catalogue.
+
+    Raises:
+        MotionError: ``bad_name``.
+    """
+    if name in {effect.id for effect in list_effects()}:
+        what = f"an effect of the catalogue is called {name!r}"
+        raise MotionError("bad_name", what, where=where, hint="Choose another name.")
+
+
 def find_late_effect(late: Late) -> EffectClass:
     """The effect of the folder with this delay.
 

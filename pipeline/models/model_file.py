@@ -18,6 +18,7 @@ from pipeline.models.catalogue import (
     hash_code,
     list_trusted,
     read_code,
+    refuse_taken,
     run_effects,
 )
 from pipeline.models.effect import Effect
@@ -339,6 +340,7 @@ class _Reader:
             if stays:
                 fixed.append(key)
         if formulas:
+            refuse_taken(name, self._locate(at, "id"))
             texts = {channel: str(text) for channel, text in formulas.items()}
             return self._formula(at, name, texts, numbers, values, fixed)
         try:

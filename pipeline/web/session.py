@@ -15,6 +15,7 @@ import msgspec
 from pipeline.core import naming_os_errors
 from pipeline.job.run_results import locate_beside
 from pipeline.models import Effect, Model, Parameter, format_model, list_effects
+from pipeline.models.catalogue import refuse_taken
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.model_file import ModelFile, parse_model
@@ -324,10 +325,7 @@ def make_formula(name: str, channel: str, text: str, parameters: str) -> Formula
         )
     if not text.isprintable():
         raise WorkbenchError("bad_formula", "the formula is not one line of text", hint="Write one line.")
-    if name in {effect.id for effect in list_effects()}:
-        raise WorkbenchError(
-            "bad_name", f"an effect of the catalogue is called {name!r}", hint="Choose another name."
-        )
+    refuse_taken(name, "")
     declared = tuple(_read_parameter(part.strip()) for part in parameters.split(",") if part.strip())
     if len({parameter.name for parameter in declared}) < len(declared):
         raise WorkbenchError(

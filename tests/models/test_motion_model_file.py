@@ -55,6 +55,7 @@ class Tilt(LinearEffect):
         (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "furlong" }\n', 6, "not a unit"),
         (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "1", bounds = [2, 1] }\n', 7, "bounds"),
         (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { value = 3, bounds = [-1, 1] }\n', 7, "outside"),
+        (HEAD + '[[effect]]\nid = "drive_lag"\nv_x = "k * v0"\nk = 0.1\n', 5, "of the catalogue is called"),
         (HEAD + "[[effect]]\nk = 1.0\n", 4, "needs an id"),
         (HEAD + "[effect]\n", 4, "[[effect]]"),
         (HEAD + "[[effect]\n", 4, "not a valid TOML"),
