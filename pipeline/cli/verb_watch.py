@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Choices, build_options, print_lines, print_note, spell_choices
-from pipeline.core import SlipError, format_duration, format_share, naming_os_errors
+from pipeline.core import SlipError, format_duration, format_share, naming_os_errors, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.job.watch import Watch
@@ -224,7 +224,7 @@ def _format_number(number: Content) -> str:
     value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
     if value is None or low is None or high is None or share is None:
         return "not determined"
-    unit = "" if number["unit"] == "1" else f" {number['unit']}"
+    unit = suffix_unit(number["unit"])
     return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {format_share(share)})"
 
 

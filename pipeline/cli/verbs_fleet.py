@@ -30,7 +30,7 @@ from pipeline.cli.conventions import (
     use_key,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import SlipError
+from pipeline.core import SlipError, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.fleet.trend import Trend
@@ -279,7 +279,7 @@ def _format_fleet(content: Mapping[str, object]) -> list[str]:
 
 def _format_number(row: Mapping[str, object]) -> list[str]:
     label = f"{row['effect']}.{row['parameter']}"
-    unit = "" if row["unit"] == "1" else f" {row['unit']}"
+    unit = suffix_unit(row["unit"])
     spreads = [f"{words} {format_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
     value = f"{format_value(row['value'])}{unit}"
     if row["low"] is not None:
@@ -359,7 +359,7 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
 
 
 def _bound(number: Mapping[str, object], unit: str) -> str:
-    shown = f"{number['value']:.3g}" + ("" if unit == "1" else f" {unit}")
+    shown = f"{number['value']:.3g}" + suffix_unit(unit)
     cut = " (the interval ends at a limit of the search)" if number.get("at_bound") else ""
     cut += " (default spread between runs)" if number.get("default_spread") else ""
     return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
@@ -442,7 +442,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     names = [f"{one.vehicle} {one.label}" for one in judged] + [one.group for one in followed.series]
     width = max(map(len, names), default=0)
     for one in judged:
-        unit = "" if one.unit == "1" else f" {one.unit}"
+        unit = suffix_unit(one.unit)
         label = f"{one.vehicle} {one.label}"
         runs = one.points.height
         lines.append(

@@ -104,6 +104,11 @@ INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """Text for each input of the ideal model."""
 
 
+def suffix_unit(unit: object) -> str:
+    """A unit as the suffix of a number; empty for a plain number."""
+    return "" if unit == "1" else f" {unit}"
+
+
 def format_share(share: float, digits: int = 2) -> str:
     """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
 

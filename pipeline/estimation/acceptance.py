@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import format_share
+from pipeline.core import format_share, suffix_unit
 from pipeline.core.arrays import Floats, robust_spreads
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.parts import CLIP, count_seconds
@@ -101,7 +101,7 @@ def find_beyond(effect: Effect) -> str | None:
         if _is_at_bound(value, parameter):
             return None
         if shown is not None and not shown.low <= value <= shown.high:
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            unit = suffix_unit(parameter.unit)
             reasons.append(
                 f"{parameter.name} = {value:.3g}{unit} is outside the observed range "
                 f"({shown.low:g} to {shown.high:g}{unit}, {shown.source})"
@@ -118,7 +118,7 @@ def find_implausible(effect: Effect) -> str | None:
         shown = parameter.plausible
         low, high = parameter.bounds if shown is None else (shown.low, shown.high)
         if not low <= value <= high or _is_at_bound(value, parameter):
-            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+            unit = suffix_unit(parameter.unit)
             return (
                 f"{effect.id}: {parameter.name} = {value:.3g}{unit} is outside the observed range "
                 f"({low:g} to {high:g}{unit}); the cause may be another effect"

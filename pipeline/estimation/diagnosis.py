@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite
+from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite, suffix_unit
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
@@ -60,7 +60,7 @@ class Value:
     @property
     def suffix(self) -> str:
         """The unit as a suffix of a number; empty where dimensionless."""
-        return "" if self.unit == "1" else f" {self.unit}"
+        return suffix_unit(self.unit)
 
     def __str__(self) -> str:
         """The value as text, with its interval where there is one, and whether it is at its bound."""

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from pipeline.core import INPUT_WORDS, guess_names
+from pipeline.core import INPUT_WORDS, guess_names, suffix_unit
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
@@ -364,7 +364,7 @@ class Facts:
 
     def _format_source(self, effect: Effect, parameter: Parameter) -> str:
         label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
-        unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+        unit = suffix_unit(parameter.unit)
         text = f"{label} = {value:.5g}{unit}"
         if label in self.file.intervals:
             low, high = self.file.intervals[label]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core import NORMAL_95, finite_or_none, pick
+from pipeline.core import NORMAL_95, finite_or_none, pick, suffix_unit
 from pipeline.fleet import UNKNOWN
 from pipeline.fleet.forecast import leave_out_odd, list_numbers
 from pipeline.fleet.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
@@ -215,7 +215,7 @@ def format_change(trend: ParameterTrend, change: LevelChange) -> str:
 
 def shorten_change(trend: ParameterTrend, change: LevelChange) -> str:
     """Format the levels before and after."""
-    unit = "" if trend.unit == "1" else f" {trend.unit}"
+    unit = suffix_unit(trend.unit)
     return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
 
 
@@ -225,7 +225,7 @@ def format_power(trend: ParameterTrend) -> str:
         return f"not tested: a change takes {trend.need}"
     if not math.isfinite(trend.least):
         return "not tested: no ground was driven on two dates"
-    unit = "" if trend.unit == "1" else f" {trend.unit}"
+    unit = suffix_unit(trend.unit)
     return f"a change by {trend.least:.2g}{unit} would be detected"
 
 

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core import format_share
+from pipeline.core import format_share, suffix_unit
 from pipeline.estimation.error_regions import format_angle, format_length
 from pipeline.estimation.verdict import enumerate_texts, name_effect
 from pipeline.job.check import Check, find_pace
@@ -61,7 +61,7 @@ def _format_simulated(check: Check, named: Sequence[str]) -> str:
         if is_lacking and label.parameter.unit != "1":
             lacks.append(f"{_name(check, name)} of {change.after:.3g} {label.parameter.unit}")
         else:
-            unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+            unit = suffix_unit(label.parameter.unit)
             other.append(
                 f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
             )
@@ -83,7 +83,7 @@ def _format_pair(check: Check, name: str) -> str:
         before, after = (show(pace * math.exp(one)) for one in (change.before, change.after))
         return f"{before} -> {after}"
     label = _find(check, name)
-    unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+    unit = suffix_unit(label.parameter.unit)
     return f"{change.before:.3g} -> {change.after:.3g}{unit}"
 
 
@@ -167,7 +167,7 @@ def _format_smallest(check: Check, name: str) -> str:
     size = abs(change.before)
     if label.parameter.unit == "1" and size > 0.0:
         return f"{format_share(change.smallest / size)} of {_name(check, name)}"
-    unit = "" if label.parameter.unit == "1" else f" {label.parameter.unit}"
+    unit = suffix_unit(label.parameter.unit)
     return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
 
 

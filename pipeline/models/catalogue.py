@@ -15,7 +15,7 @@ from importlib import resources
 from pathlib import Path, PurePosixPath
 from types import ModuleType
 
-from pipeline.core import guess_names
+from pipeline.core import guess_names, suffix_unit
 from pipeline.models.effect import Effect, Late, Parameter, Search, find_late
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm
@@ -287,7 +287,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
         )
         texts = _format_sizes(parameter)
         if not is_of_one_run(effect.parameters):
-            spread, unit = parameter.spread, "" if parameter.unit == "1" else f" {parameter.unit}"
+            spread, unit = parameter.spread, suffix_unit(parameter.unit)
             texts.append(
                 f"standard deviation between runs on one ground {spread.size:.2g}{unit}: {spread.source}"
             )
@@ -310,7 +310,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
 
 def _format_sizes(parameter: Parameter) -> list[str]:
     """Detection threshold, exported quantities, observed range and sign of a parameter."""
-    unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+    unit = suffix_unit(parameter.unit)
     lines = []
     if parameter.least is not None:
         least = parameter.least

@@ -10,7 +10,7 @@ from copy import copy
 from string import Formatter
 from typing import ClassVar, Self, TypeVar
 
-from pipeline.core import format_share
+from pipeline.core import format_share, suffix_unit
 from pipeline.models.parameter import (
     Conditions,
     Excitation,
@@ -371,7 +371,7 @@ class Effect(ABC):
                 hint = "Give a value inside the bounds."
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
             if not neutral and not low <= value <= high:
-                unit = "" if parameter.unit == "1" else f" {parameter.unit}"
+                unit = suffix_unit(parameter.unit)
                 what = f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}"
                 hint = "Give a value inside the bounds."
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)

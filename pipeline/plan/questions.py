@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, suffix_unit
 from pipeline.core.arrays import STRETCH_S, Floats, Ints
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.error_regions import find_goal
@@ -328,7 +328,7 @@ def ask_numbers(model: Hypothesis) -> list[Precision]:
     for index, number in enumerate(model.free):
         goal = find_goal(number.effect, number.name, float(model.values[index]))
         if NORMAL_95 * float(spread[index]) > goal:
-            unit = "" if number.unit == "1" else f" {number.unit}"
+            unit = suffix_unit(number.unit)
             text = f"{number.label} within {goal:.2g}{unit}"
             questions.append(Precision(text, (number.effect,), model, index, goal))
     return questions
