@@ -127,7 +127,7 @@ const buildNext = (pane) => {
 
 const buildRow = (pane, row, first) => {
   const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
-  const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis"),
+  const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis, beside its other effects"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
