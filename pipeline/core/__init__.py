@@ -15,7 +15,7 @@ import sys
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -107,6 +107,11 @@ INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 def suffix_unit(unit: object) -> str:
     """A unit as the suffix of a number; empty for a plain number."""
     return "" if unit == "1" else f" {unit}"
+
+
+def enumerate_texts(texts: Sequence[str]) -> str:
+    """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
+    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
 def format_share(share: float, digits: int = 2) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
+from pipeline.core import enumerate_texts
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors, format_excess
 from pipeline.estimation.ladder import ERRORS_OVER_2S
@@ -215,11 +216,6 @@ def _join_clauses(clauses: Sequence[str]) -> str:
     own = [one for one in clauses if one.startswith("the ")]
     parts = [f"the robot {enumerate_texts(predicates)}"] if predicates else []
     return ", and ".join([*parts, *own]) if predicates else enumerate_texts(own)
-
-
-def enumerate_texts(texts: Sequence[str]) -> str:
-    """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
-    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
 def _name_model(step: Content, shown: int) -> str:

@@ -294,18 +294,25 @@ class Facts:
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
 
     def find_speed_limit(self) -> Amount:
-        """Largest speed of the body [m/s], from its command or from the wheels when driving straight."""
+        """Largest speed of the body [m/s], from its command or from the wheels when driving straight.
+
+        Gains of the drive are left out.
+        """
         wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
         commanded = self.take(Quantity.SPEED_LIMIT).change(operator.mul, self.take(Quantity.RADIUS))
         return self._hold(_take_least(commanded, wheels), "driven_speed_mps", "m/s")
 
     def find_turn_limit(self) -> Amount:
-        """Largest yaw rate of the body [rad/s], from its command or from the wheels turning on the spot."""
+        """Largest yaw rate of the body [rad/s], from its command or from the wheels turning on the spot.
+
+        Gains of the drive are left out; without a known track or wheelbase it is that of the command.
+        """
         wheels, commanded = self._spin(Quantity.WHEEL_SPEED_LIMIT), self.take(Quantity.TURN_LIMIT)
-        if self.vehicle.kind == "differential":
-            own = self.vehicle.controller_track_multiplier
-            geometry = self.take(Quantity.RADIUS), self.take(Quantity.TRACK)
-            commanded = commanded.change(lambda w, radius, track: w * own * radius / track, *geometry)
+        is_car = self.vehicle.kind == "ackermann"
+        width = self.take(Quantity.WHEELBASE if is_car else Quantity.TRACK)
+        if width.is_known:
+            own = 1.0 if is_car else self.vehicle.controller_track_multiplier
+            commanded = commanded.change(lambda w, r, k: w * own * r / k, self.take(Quantity.RADIUS), width)
         return self._hold(_take_least(commanded, wheels), "driven_yaw_rate_radps", "rad/s")
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:

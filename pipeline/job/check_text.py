@@ -7,9 +7,9 @@ import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core import format_share, suffix_unit
+from pipeline.core import enumerate_texts, format_share, suffix_unit
 from pipeline.estimation.error_regions import format_angle, format_length
-from pipeline.estimation.verdict import enumerate_texts, name_effect
+from pipeline.estimation.verdict import name_effect
 from pipeline.job.check import Check, find_pace
 from pipeline.job.stored_fits import ERRORS, POSITION_ERROR, Label
 from pipeline.models.effect import Place

@@ -12,11 +12,10 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import CONFIDENCE, finite_or_none, pick
+from pipeline.core import CONFIDENCE, enumerate_texts, finite_or_none, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.estimation.verdict import enumerate_texts
 from pipeline.fleet import read_day
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects

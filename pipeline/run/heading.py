@@ -200,13 +200,11 @@ class HeldDrive:
         def average(values: Floats) -> Floats:
             return average_held(commands.times, values, self._grid)
 
-        steering = np.zeros(self._grid.times.size)
-        if commands.steering.any():
-            steering = average(commands.speed * commands.steering) / average(commands.speed)
+        steers = commands.steering.any()
         return Wheels(
             average(commands.left),
             average(commands.right),
-            steering,
+            average(commands.steering) if steers else np.zeros(self._grid.times.size),
             None if commands.sideways is None else average(commands.sideways),
             average((np.maximum(np.abs(commands.left), np.abs(commands.right)) < STILL).astype(np.float64)),
         )

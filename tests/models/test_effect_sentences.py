@@ -86,6 +86,13 @@ def test_the_rate_of_turning_is_read_with_the_effective_wheel_radius() -> None:
         "Effective track 1.10 m (nominal 0.55), with the effective wheel radius: "
         "the robot turns at 40 % of the ideal rate"
     )
+    gains = [find_effect("drive_gain")().change(g=0.9), find_effect("difference_gain")().change(g=1.1)]
+    assert track.describe_motion(HUSKY, (*gains, track)) == (
+        "Effective track 1.10 m (nominal 0.55), with the drive gain and the difference gain: "
+        "the robot turns at 50 % of the ideal rate"
+    )
+    alone = track.change(k=1.0).describe_motion(HUSKY, (radius, gains[1]))
+    assert alone.endswith("at 88 % of the ideal rate")
 
 
 def test_the_share_of_a_difference_is_that_of_both_gains() -> None:

@@ -20,7 +20,7 @@ from pipeline.models.filters import (
     swing_signal,
     wait_at_reversal,
 )
-from pipeline.run.heading import Grid, HeldDrive, MeasuredDrive, average_held
+from pipeline.run.heading import Grid, MeasuredDrive, average_held
 from pipeline.run.signals import DriveSeries, Resets
 
 STEP = 0.005
@@ -342,16 +342,10 @@ def test_a_swing_without_a_time_constant_is_its_input_itself() -> None:
 
 
 @pytest.mark.parametrize("speed", [3.0, -3.0])
-def test_a_car_that_starts_and_steers_at_once_turns_by_all_of_it(speed: float) -> None:
+def test_readings_of_a_car_that_starts_and_steers_at_once_turn_by_all_of_it(speed: float) -> None:
     """With the means of both, a gain of the steering was stated up to .2 % too small in 9 of 11 logs."""
     cells = lay_cells(200)
     at, angle = 0.5012, 0.3
-    speeds, angles = np.array([0.0, speed]), np.array([0.0, angle])
-    command = DriveSeries(np.array([0.0, at]), speeds, speeds, angles)
-    held = HeldDrive(command, cells)
-    driven = held.average_on_grid(held.begin_spans(np.full((1, 3), np.nan)))
-    turned = float(np.sum(driven.left * np.tan(driven.steering))) * STEP
-    assert turned == pytest.approx(speed * math.tan(angle) * (1.0 - at), rel=1e-3)
     times = np.arange(0.0, 1.01, 0.05)
     moves = (times > at).astype(np.float64)
     seen = MeasuredDrive(DriveSeries(times, speed * moves, speed * moves, angle * moves))

@@ -292,10 +292,22 @@ def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
     spin = predict(file, [(-1.0, -99.0, 99.0)], 4.0)
     assert spin[-1, 6] == pytest.approx(take("nav2", file)["FollowPath.wz_max"], rel=1e-4)
     assert "# No parameter there stands for:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
+    # What the body reaches is not known with a track that is not: the command's own limit is written.
+    leo = vehicle_of("leo_rover")
+    fit = FIT | {"undecided": [["effective_track", "icr_lateral"]]}
+    known = {"effective_track.k": (1.9, 2.1), "body_turn_limit.limit": (0.9, 1.1)}
+    open_track = make(*effects, vehicle=leo, fit=fit, intervals=known)
+    assert take("nav2", open_track)["FollowPath.wz_max"] == 1.0
+    assert take("nav2", make(effects[1], vehicle=leo))["FollowPath.wz_max"] == 1.0
     # The controller that is told of the track asks for no more than its limit lets through.
     control = take("ros2_control", file)
     asked = control["angular.z.max_velocity"] * control["wheel_separation_multiplier"]
     assert asked == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_car_with_a_longer_wheelbase_reaches_less_than_its_limit() -> None:
+    longer = (find_effect("effective_wheelbase")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
+    assert take("nav2", make(*longer, vehicle=CAR))["FollowPath.wz_max"] == 0.5
 
 
 def test_of_two_limits_the_smaller_one_holds() -> None:

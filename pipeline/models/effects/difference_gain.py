@@ -11,6 +11,7 @@ Source: steady state of a proportional speed controller; Astrom and Murray, Feed
 from collections.abc import Iterable
 from dataclasses import replace
 
+from pipeline.core import format_share
 from pipeline.models.effect import SIDES, DriveEffect, Effect, Excitation
 from pipeline.models.effects.drive_gain import SHARE, DriveGain
 from pipeline.models.parameter import Conditions
@@ -35,8 +36,10 @@ class DifferenceGain(DriveEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the sides reach, with the gain of all wheels."""
         gain = next((one.values["g"] for one in beside if isinstance(one, DriveGain)), 1.0)
-        both = super(DifferenceGain, self.change(g=gain * self.values["g"])).describe_motion(vehicle)
-        return both if gain == 1.0 else both.replace(":", ", with the drive gain:", 1)
+        if gain == 1.0 or self.open_numbers:
+            return super().describe_motion(vehicle)
+        both = self.motion.format(percent=format_share(gain * self.values["g"], 3))
+        return both.replace(":", ", with the drive gain:", 1)
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""

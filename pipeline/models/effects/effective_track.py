@@ -8,9 +8,10 @@ the sum of track width and wheelbase, on omni wheels the diameter of their circl
 Source: Mandow et al., IROS 2007; Baril et al., CRV 2020.
 """
 
+import math
 from collections.abc import Iterable
 
-from pipeline.core import format_share
+from pipeline.core import enumerate_texts, format_share
 from pipeline.models.effect import (
     SIDES,
     Effect,
@@ -25,6 +26,13 @@ from pipeline.models.effects.wheel_radius import WheelRadius
 from pipeline.models.parameter import Level, Quantity, Reading, TwinRole
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
+
+_BESIDE = {
+    "wheel_radius": "the effective wheel radius",
+    "drive_gain": "the drive gain",
+    "difference_gain": "the difference gain",
+}
+"""Effects of one factor that change how fast the robot turns as well."""
 
 
 class EffectiveTrack(KinematicEffect):
@@ -60,11 +68,12 @@ class EffectiveTrack(KinematicEffect):
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers."""
         nominal, k = vehicle.track_width_m or 1.0, self.values["k"]
-        radius = next((one.values["k"] for one in beside if isinstance(one, WheelRadius)), 1.0)
-        beside_it = "" if radius == 1.0 else ", with the effective wheel radius"
+        others = {_BESIDE[one.id]: next(iter(one.values.values())) for one in beside if one.id in _BESIDE}
+        names = enumerate_texts([name for name, value in others.items() if value != 1.0])
+        reached = math.prod(others.values()) / k
         return (
-            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}){beside_it}: "
-            f"the robot turns at {format_share(radius / k)} of the ideal rate"
+            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}){names and f', with {names}'}: "
+            f"the robot turns at {format_share(reached)} of the ideal rate"
         )
 
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:

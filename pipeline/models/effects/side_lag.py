@@ -30,7 +30,7 @@ class SideLag(TwoLags):
         time_constant("tau_right", "time constant of the right side", 0.2, (0.4,)),
     )
     motion = "Side lag: time constant {tau_left:.2f} s on the left, {tau_right:.2f} s on the right"
-    clause = "follows with a time constant of {tau_left:.2g} s on the left, {tau_right:.2g} s on the right"
+    clause = "follows with time constants of {tau_left:.2g} s on the left and {tau_right:.2g} s on the right"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "icr_lateral")
     # If the ground disturbs the wheels, a second time constant always reduces the error a little.

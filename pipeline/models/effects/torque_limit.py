@@ -55,7 +55,7 @@ class TorqueLimit(DriveEffect):
         {"tau": 0.5, "limit": 12.0},
     )
     motion = "Torque limit: {limit:.3g} rad/s^2 at every wheel, time constant {tau:.2f} s below it"
-    clause = "follows commands with a time constant of {tau:.2g} s, by {limit:.2g} rad/s^2 at most"
+    clause = "follows commands with a lag of {tau:.2g} s and at most {limit:.2g} rad/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.SMALL)
     confused_with = ("drive_lag", "acceleration_limit", "wheel_servo")
     contains = ("drive_lag", "acceleration_limit")
