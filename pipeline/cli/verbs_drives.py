@@ -255,9 +255,9 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     if not names:
         what = "a check needs the log that was driven"
         raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
-    of_drive = _gather(names, options, quiet=True).recordings
+    of_drive = _gather(names, options, quiet=quiet).recordings
     before = [name for name in promised.runs if name not in {*names, *(one.name for one in of_drive)}]
-    vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=quiet)
+    vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=True)
     if promised.vehicle != vehicle.id:
         what = f"the plan is for {promised.vehicle}, and the log is of {vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."

@@ -281,8 +281,8 @@ class Facts:
     def find_turning_radius(self) -> Amount:
         """Smallest turning radius that a car reaches to both sides [m]."""
         gain, offset = self.take(Quantity.STEERING_GAIN), self.take(Quantity.STEERING_OFFSET)
-        angle = self.measure("max_steering_rad").change(lambda a, g, o: g * a - abs(o), gain, offset)
-        return self.find_wheelbase().change(_find_circle, angle)
+        angle = combine(lambda a, g, o: g * a - abs(o), self.measure("max_steering_rad"), gain, offset)
+        return combine(_find_circle, self.find_wheelbase(), angle)
 
     def find_speed_delay(self) -> Amount:
         """Delay of the speed behind a smooth command [s]: sum of dead time and time constants."""

@@ -346,7 +346,7 @@ def read_px4(text: str) -> Current:
 
 
 def _find_full_speed(facts: Facts, current: Current) -> Amount:
-    wheels = facts.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, facts.find_radius())
+    wheels = combine(operator.mul, facts.take(Quantity.WHEEL_SPEED_LIMIT), facts.find_radius())
     if wheels.is_known or _FULL_SPEED not in current:
         return wheels
     used = Amount(current[_FULL_SPEED], (f"{_FULL_SPEED} = {current[_FULL_SPEED]:g} in use",))

@@ -269,7 +269,7 @@ class _Builder:
             # With equal creep in both directions, the wheels follow equally late in all directions.
             width = 0.5 * (effective + math.sqrt(room))
             apart = f"{width:.3g} m apart, not {nominal:.3g} m"
-            self.notes.append(f"the wheels stand {apart}: they so creep alike along and across")
+            self.notes.append(f"the wheels stand {apart}: so they creep alike along and across")
         return width, wheelbase
 
     def _find_creep(self, track: float, wheelbase: float) -> tuple[float, float]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import operator
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from xml.etree import ElementTree as ET
@@ -38,8 +37,7 @@ def write_gazebo(file: ModelFile, current: Current) -> str:
     else:
         sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
         sheet.add("plugin.wheel_base", facts.find_wheelbase())
-        angle = facts.measure("max_steering_rad").change(operator.mul, facts.take(Quantity.STEERING_GAIN))
-        sheet.add("plugin.steering_limit", angle)
+        sheet.add("plugin.steering_limit", facts.find_largest_steering())
     _add_limits_of_gazebo(facts, sheet)
     return _write_element(facts, sheet)
 

@@ -299,10 +299,13 @@ class Check:
             return BROKEN if "broken" in outcomes else UNDETERMINED if "undetermined" in outcomes else KEPT
         if self.list_status("changed"):
             return BROKEN
-        # That little of a motion can be compared does not show that it is unchanged.
+        return KEPT if self.is_compared and not self.list_status("differs") else UNDETERMINED
+
+    @property
+    def is_compared(self) -> bool:
+        """Whether most of the model's numbers can be compared: a few do not show that nothing changed."""
         unknown, numbers = self.list_status("unknown"), {*self.changes} - {*ERRORS}
-        is_compared = len(unknown) < len(self.changes) and 2 * len(numbers & {*unknown}) <= len(numbers)
-        return KEPT if is_compared and not self.list_status("differs") else UNDETERMINED
+        return len(unknown) < len(self.changes) and 2 * len(numbers & {*unknown}) <= len(numbers)
 
 
 def check_runs(

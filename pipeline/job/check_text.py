@@ -46,7 +46,8 @@ def format_verdict(check: Check) -> str:
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "No conclusion: no number is known on both sides"
-        sentences.append(f"No change shown in {known} number{'s' * (known != 1)}" if known else nothing)
+        few = "" if check.is_compared else "; most numbers of the model cannot be compared"
+        sentences.append(f"No change shown in {known} number{'s' * (known != 1)}{few}" if known else nothing)
     sentences += [*_format_limits(check), *_format_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
@@ -203,7 +204,7 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         why = (
             "not stated by the model"
             if check.sides.kind == "model" and name in ERRORS
-            else "not determined by the model of both sides in"
+            else "not determined in"
         )
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
@@ -216,7 +217,7 @@ def _format_resolution(check: Check, name: str) -> str:
     change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
     text = f"detectable change {show(change.smallest)}"
-    text += "; both at the speed of AFTER" if name in ERRORS else ""
+    text += "; errors at the speed of AFTER" if name in ERRORS else ""
     if check.simulated:
         return text
     source = "(default)" if change.is_default else "(these runs)"

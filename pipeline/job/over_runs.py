@@ -308,7 +308,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     notes = list(compared.notes)
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
-    notes += [f"slip of {run} left out, {reason}" for run, reason in sorted(compared.refusals.items())]
+    refused = sorted(compared.refusals.items())
+    notes += [f"slip of {run} left out, {why}" for run, why in refused if run in set(dated["run"])]
     if dated.is_empty():
         hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
         raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)

@@ -134,7 +134,7 @@ def read_runs(
     """
     for manifest in manifests:
         if refusal := refuse_run(manifest):
-            hint = "Leave this run out."
+            hint = "No fit to it has a meaning: give other runs."
             raise JobError("no_fit", refusal, where=manifest.run, hint=hint)
     known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
     chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)

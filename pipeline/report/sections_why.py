@@ -259,7 +259,8 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
     name, same = str(entry.get("id", "")), entry.get("equivalent_to")
     notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
     notes += ["tentative"] if entry.get("tentative") else []
-    gain = Cell(_format_gain(number_in(entry, "gain")), small=_PATHS.get(str(entry.get("found_on")), ""))
+    gain = _format_gain(number_in(entry, "gain"))
+    without = Cell(gain, small=_PATHS.get(str(entry.get("found_on")), "")) if gain else ""
     parameters = mapping_in(entry, "parameters")
     rows: list[list[str | Cell]] = []
     for key in parameters:
@@ -278,10 +279,10 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
                 ),
                 format_ends(values, digits=4),
                 format_ends(mapping_in(values, "another_run"), digits=4),
-                "" if rows else gain,
+                "" if rows else without,
             ]
         )
-    return rows or [[Cell(name, notes=notes), "", "", "", gain]]
+    return rows or [[Cell(name, notes=notes), "", "", "", without]]
 
 
 def _format_gain(gain: float | None) -> str:

@@ -107,6 +107,16 @@ def test_nothing_is_called_a_change_where_nothing_changed(same: Sides) -> None:
     assert "default spread" not in verdict
 
 
+def test_a_check_in_which_most_numbers_are_unknown_shows_nothing(same: Sides) -> None:
+    found = compare(same)
+    parameters = [label.name for label in found.sides.labels]
+    hidden = {name: replace(found.changes[name], status="unknown") for name in parameters}
+    blind = replace(found, changes={**found.changes, **hidden})
+    assert (found.is_compared, blind.is_compared) == (True, False)
+    assert blind.code == UNDETERMINED
+    assert "most numbers of the model cannot be compared" in format_verdict(blind)
+
+
 def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     found = compare(replace(late, before=late.before[:1], after=late.after[:1]))
 

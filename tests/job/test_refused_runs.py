@@ -72,3 +72,32 @@ def test_a_plan_and_the_workbench_give_the_same_reason(folder: Path) -> None:
     shown = summarize_run(manifest)
     assert WHY in str(shown["refusal"])
     assert str(shown["refusal"])[1:] in str(shown["verdict"])
+
+
+@pytest.mark.usefixtures("batch")
+def test_no_model_is_fitted_and_nothing_is_compared_with_such_a_run(folder: Path) -> None:
+    """`slip model add` wrote friction 20 and track 20 of it, `slip check` a radius of .01."""
+    simulate_case("ideal_husky", out=folder / "ground.mcap", seed=3, duration_s=40.0)
+    (folder / "m.toml").write_text('format = 1\n\n[vehicle]\npreset = "husky_a200"\n', "utf-8")
+    before = (folder / "m.toml").read_bytes()
+    fitted = run_verb("model", "add", "m.toml", "contact_friction", "--on", "air.mcap", cwd=folder)
+    assert (fitted.returncode, len(fitted.stderr.strip().splitlines()[-1:])) == (1, 1)
+    assert WHY in fitted.stderr
+    assert (folder / "m.toml").read_bytes() == before
+    checked = run_verb("check", "ground.mcap", "air.mcap", cwd=folder)
+    assert checked.returncode == 1
+    assert "no run AFTER can be compared: " in checked.stderr
+    assert WHY in checked.stderr
+    mixed = run_verb("check", "ground.mcap,air.mcap", "ground.mcap", cwd=folder)
+    assert "a run is on both sides" in mixed.stderr
+
+
+@pytest.mark.usefixtures("batch")
+def test_a_trend_leaves_its_slip_out_and_says_so(folder: Path) -> None:
+    followed = json.loads(run_verb("fleet", "trend", "--json", cwd=folder).stdout)
+    assert any(
+        note.startswith("slip of ") and "air left out, the vehicle does not move" in note
+        for note in followed["notes"]
+    )
+    slip = [one["points"] for one in followed["series"] if "modulus" in one["quantity"]]
+    assert not [point for points in slip for point in points if point["run"].endswith("/air")]

@@ -106,6 +106,22 @@ def test_the_share_of_a_difference_is_that_of_both_gains() -> None:
     assert difference.describe_clause(HUSKY, both) == said
 
 
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("side_lag", {"tau_left": 0.2, "tau_right": 0.4}),
+        ("brake_lag", {"tau_drive": 0.6, "tau_brake": 0.2}),
+        ("torque_limit", {"tau": 0.5, "limit": 12.0}),
+    ],
+)
+def test_a_clause_of_two_numbers_is_none_with_one_of_them(name: str, values: dict[str, float]) -> None:
+    """Of side_lag with one number was said: `the robot 0.4 s on the right`."""
+    effect = find_effect(name)().change(**values)
+    assert all(f"{value:.2g}" in effect.describe_clause(HUSKY) for value in values.values())
+    for number in values:
+        assert effect.omit_open({number}).describe_clause(HUSKY) == f"shows signs of {name.replace('_', ' ')}"
+
+
 def test_contact_without_a_bound_tells_no_coefficient() -> None:
     contact = find_effect("contact_friction")(k=1.75)
     assert contact.describe_motion(HUSKY) == "Contact friction: track 1.75 times as wide"

@@ -64,6 +64,7 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "id": "drive_lag",
                 "parameters": {"tau": {"value": 1.08, "low": 1.01, "high": 1.15, "unit": "s"}},
                 "gain": 0.31,
+                "found_on": "wheels",
                 "equivalent_to": ["body_inertia"],
                 "clause": "follows commands with a time constant of 1.1 s",
                 "growth": make_growth("tau", 0.07),

@@ -16,6 +16,7 @@ from report_synthesis import join_commands, list_places, make_report
 
 from pipeline import report
 from pipeline.core import format_duration, format_recorded
+from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.report import (
     begin_large,
     format_date,
@@ -27,6 +28,7 @@ from pipeline.report import (
 )
 from pipeline.report.page import format_standing, render_report
 from pipeline.report.scene import RunReport
+from pipeline.report.sections_why import _list_parameters
 
 TEMPLATES = Path(report.__file__).parents[1]
 HOSTILE = "</script><script>alert(1)</script><!-- <img src=x onerror=alert(2)> \u2028 \" ' & \u202e"
@@ -343,6 +345,7 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     assert "effective_track" in told
     assert "1.740 to 1.840" in told
     assert "x 13" in told
+    assert "from command to wheels" in told
     assert "held-out squared error over half a second without it" in told
     assert "Easily confused with wheel_radius." in told
     assert "lateral skid or centre of rotation: drive circles" in told
@@ -421,3 +424,16 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
 def test_names_of_ours_stay_as_they_are_written() -> None:
     written = ("drive_lag.tau of warthog moved.", "husky_a200_wetgrass: 3 runs", "warnings rose", "")
     assert [begin_large(text) for text in written] == [*written[:2], "Warnings rose", ""]
+
+
+def test_numbers_that_a_run_does_not_determine_are_marked() -> None:
+    """A no-load speed of 100 m/s, the limit of the search, stood in the table as if it were measured."""
+    open_number = {"value": 0.1, "low": None, "high": None, "unit": "s", "undetermined": True}
+    parameters = {
+        "tau": {**open_number, "at_bound": False},
+        "limit": {**open_number, "value": 100.0, "at_bound": True},
+        "drag": {"value": 0.1, "low": 0.05, "high": 0.2, "unit": "m/s", "undetermined": False},
+    }
+    rows = _list_parameters({"id": "wheel_servo", "parameters": parameters})
+    marks = [row[1].notes for row in rows if not isinstance(row[1], str)]
+    assert marks == [[UNDETERMINED], [AT_BOUND], []]

@@ -26,9 +26,7 @@ class BrakeLag(TwoLags):
         time_constant("tau_brake", "time constant of slowing down", 0.2, (0.2,)),
     )
     motion = "Brake lag: time constant {tau_drive:.2f} s speeding up, {tau_brake:.2f} s slowing down"
-    clause = (
-        "speeds up and slows down with time constants of {tau_drive:.2g} s and {tau_brake:.2g} s"
-    )
+    clause = "speeds up and slows down with time constants of {tau_drive:.2g} s and {tau_brake:.2g} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "acceleration_limit")
     # If the ground disturbs the wheels, a second time constant always reduces the error a little.

@@ -461,18 +461,19 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
     table = scene.report.table("aggregates")
     if table is None:
         return None
-    wanted = table.filter(
+    # Parts are known for samples with both inputs, which are fewer than those of the command alone.
+    parts = pl.sum_horizontal(f"{part}_mean_square" for part in _PARTS)
+    wanted = table.with_columns(total=parts).filter(
         (pl.col("input").cast(pl.String) == "command")
         & pl.col("drivetrain_mean_square").is_not_null()
-        & (pl.col("mean_square") > 0.0)
+        & (pl.col("total") > 0.0)
     )
     if wanted.is_empty():
         return None
     return (
         wanted.select(
             pl.col("subset").cast(pl.String),
-            # Of the samples with both inputs, which are fewer than those of the command alone.
-            pl.sum_horizontal(f"{part}_mean_square" for part in _PARTS).alias("total"),
+            "total",
             *(pl.col(f"{part}_mean_square").fill_null(0.0).alias(part) for part in _PARTS),
         )
         .unpivot(list(_PARTS), index=["subset", "total"], variable_name="part", value_name="mean_square")
