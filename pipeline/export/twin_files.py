@@ -376,7 +376,7 @@ def list_notes(body: TwinBody, outside: Iterable[Effect]) -> list[str]:
     """
     lines = []
     if body.creep_s > 0.0:
-        late = f"it follows them {body.creep_s:.2g} s late"
+        late = f"the body follows them with a time constant of {body.creep_s:.2g} s"
         lines.append(f"Its wheels creep: {late}, by which lags of the drive must be less.")
     if body.grip < GRIP:
         lines.append(f"Its wheels slide above a friction coefficient of {body.grip:.2g}.")

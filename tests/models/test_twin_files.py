@@ -291,7 +291,7 @@ def test_the_file_says_where_skid_makes_friction_uneven() -> None:
     assert said not in export_model(make(HUSKY, contact_friction=sliding), "mjcf")
     text = export_model(make(HUSKY, contact_friction=sliding, lateral_skid=0.2), "mjcf")
     assert f"{said} 0.33" in text
-    assert "0 s late" not in text
+    assert "constant of 0 s" not in text
 
 
 def test_other_vehicles_and_unknown_geometry_are_one_clear_error() -> None:
