@@ -206,16 +206,18 @@ class _Gathered(NamedTuple):
     lossy: bool
 
 
-def _gather(names: Sequence[str], options: Options, *, quiet: bool) -> _Gathered:
-    """Runs of one vehicle, each once."""
+def _gather(
+    names: Sequence[str], options: Options, *, quiet: bool, known: _Gathered | None = None
+) -> _Gathered:
+    """Runs of one vehicle, each once, after those that are known already."""
     from pipeline.job.next_drive import read_command  # noqa: PLC0415 - heavy
     from pipeline.job.run_results import read_recording  # noqa: PLC0415 - heavy
 
-    vehicles: list[Vehicle] = []
-    recordings: list[Recording] = []
-    manifests: list[Manifest] = []
-    chosen: dict[str, object] = {}
-    lossy = False
+    recordings = [] if known is None else [*known.recordings]
+    manifests = [] if known is None else [*known.manifests]
+    vehicles = [] if known is None else [known.vehicle] * len(recordings)
+    chosen = {} if known is None else known.command
+    lossy = known is not None and known.lossy
     for name in names:
         with open_shown(name, options, quiet=quiet) as opened:
             vehicle, recording = read_recording(opened.manifest)
@@ -255,18 +257,19 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     if not names:
         what = "a check needs the log that was driven"
         raise SlipError("no_log", what, where=str(path), hint="Give it as well.")
-    of_drive = _gather(names, options, quiet=quiet).recordings
-    before = [name for name in promised.runs if name not in {*names, *(one.name for one in of_drive)}]
-    vehicle, recordings, _, _, lossy = _gather([*before, *names], options, quiet=True)
+    drive = _gather(names, options, quiet=quiet)
+    new = len(drive.recordings)
+    before = [name for name in promised.runs if name not in {*names, *(one.name for one in drive.recordings)}]
+    vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
     if promised.vehicle != vehicle.id:
         what = f"the plan is for {promised.vehicle}, and the log is of {vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
-        driven = [load_recording(recording, vehicle) for recording in of_drive]
+        driven = [load_recording(recording, vehicle) for recording in drive.recordings]
         require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
-        diagnosis = diagnose_runs(recordings, vehicle).runs[0]
+        diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
     checked = check_plan(promised, diagnosis)
     following = f"slip plan {' '.join(dict.fromkeys([*before, *names]))}"
     if json:

@@ -438,22 +438,20 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
     # The notes list the parameters that could not be judged.
-    judged = [one for one in followed.parameters if not one.need]
-    names = [f"{one.vehicle} {one.label}" for one in judged] + [one.group for one in followed.series]
-    width = max(map(len, names), default=0)
-    for one in judged:
-        unit = suffix_unit(one.unit)
-        label = f"{one.vehicle} {one.label}"
-        runs = one.points.height
-        lines.append(
-            f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} latest {one.latest:.3g}{unit}, "
-            f"{format_power(one)}"
+    rows = [
+        (
+            f"{one.vehicle} {one.label}",
+            one.points.height,
+            f"latest {one.latest:.3g}{suffix_unit(one.unit)}, {format_power(one)}",
         )
+        for one in followed.parameters
+        if not one.need
+    ]
     for group in dict.fromkeys(one.group for one in followed.series):
         own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
-        runs = slip.points.height
         name = slip.quantity.replace("median_modulus", "median slip speed")
-        latest = f"{name} latest {slip.latest:.3g} {slip.unit}"
-        lines.append(f"{group:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {latest}")
+        rows.append((group, slip.points.height, f"{name} latest {slip.latest:.3g} {slip.unit}"))
+    width = max((len(label) for label, _, _ in rows), default=0)
+    lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

@@ -440,8 +440,9 @@ class Selection:
         at nothing. Where nothing new would be left the extension stays as it is, and is not named.
         """
         reduced = self.reduce(model.state)
-        is_new = reduced is not None and not set(reduced.ids) <= set(base.ids)
-        return self.enter_each([reduced], useful)[0] if reduced is not None and is_new else model
+        if reduced is None or set(reduced.ids) <= set(base.ids):
+            return model
+        return self.enter_each([reduced], useful)[0]
 
     def reduce(self, state: State) -> State | None:
         """The state with the simpler forms of effects that may not be named; None if all may be."""

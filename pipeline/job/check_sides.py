@@ -17,7 +17,7 @@ from pipeline.core.arrays import Floats
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
-from pipeline.job.compared_runs import refuse_run
+from pipeline.job.compared_runs import find_run_refusal
 from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.job.stored_fits import (
     ERRORS,
@@ -153,15 +153,10 @@ def read_sides(
         if isinstance(runs_of, Sequence) and not runs_of:
             what = f"the check has no runs {side.upper()}"
             raise JobError("no_runs", what, hint="Give logs, or runs of the results.")
-    stored = before if isinstance(before, Sequence) else ()
-    refused = {one.run: refuse_run(one) for one in (*stored, *after)}
-    notes = tuple(f"left out: {run}: {why}" for run, why in refused.items() if why)
-    if isinstance(before, Sequence):
-        before = _list_sound(before, refused, BEFORE)
-    after = _list_sound(after, refused, AFTER)
     given = None if isinstance(before, Sequence) else before
     file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
-    manifests = list(before) if isinstance(before, Sequence) else []
+    manifests, notes = _leave_out_refused(before if isinstance(before, Sequence) else (), BEFORE)
+    after, more = _leave_out_refused(after, AFTER)
     everything = [*manifests, *after]
     known = before.readings if isinstance(before, Baseline) else ()
     _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
@@ -181,18 +176,19 @@ def read_sides(
         kind=names.get(type(before), "runs"),
         before=tuple(_note_slip(one, slips) for one in both.before),
         after=tuple(_note_slip(one, slips) for one in both.after),
-        notes=(*notes, *both.notes),
+        notes=(*notes, *more, *both.notes),
     )
 
 
-def _list_sound(manifests: Sequence[Manifest], refused: Mapping[str, str], side: Side) -> list[Manifest]:
-    """Runs of a side to which a fit has a meaning; an error where none has."""
-    sound = [one for one in manifests if not refused[one.run]]
-    if not sound:
-        why = "; ".join(f"{one.run}: {refused[one.run]}" for one in manifests)
-        what = f"no run {side.upper()} can be compared: {why}"
+def _leave_out_refused(manifests: Sequence[Manifest], side: Side) -> tuple[list[Manifest], list[str]]:
+    """Runs of a side to which a fit has a meaning, and notes on the others; an error where none has."""
+    refused = {one.run: why for one in manifests if (why := find_run_refusal(one))}
+    sound = [one for one in manifests if one.run not in refused]
+    reasons = [f"{run}: {why}" for run, why in refused.items()]
+    if refused and not sound:
+        what = f"no run {side.upper()} can be compared: {'; '.join(reasons)}"
         raise JobError("nothing_to_compare", what, hint="Give other runs.")
-    return sound
+    return sound, [f"left out: {reason}" for reason in reasons]
 
 
 def _note_slip(reading: RunReading, slips: Mapping[str, tuple[float, float]]) -> RunReading:

@@ -92,7 +92,7 @@ def find_material(
     for manifest in survey.manifests:
         digest = read_digest(manifest)
         reason = _doubt(manifest, tables) or _find_broken(manifest, optional)
-        if refusal := refuse_run(manifest):
+        if refusal := find_run_refusal(manifest):
             refusals[manifest.run] = refusal
             reason = reason and f"no effect can be estimated: {refusal}"
         if digest in holders:
@@ -163,7 +163,7 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     return _find_broken(manifest, tables)
 
 
-def refuse_run(manifest: Manifest) -> str:
+def find_run_refusal(manifest: Manifest) -> str:
     """Reason why slip is not observable in a run; empty if it is."""
     if "findings" not in manifest.tables or _find_broken(manifest, ["findings"]):
         return ""

@@ -304,12 +304,13 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     """
     compared = find_material(store, by, trusted_only=False, optional=("findings", "estimates"))
     dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
-    undated = sorted(set(compared.manifests) - set(dated["run"]))
+    followed = set(dated["run"])
+    undated = sorted(set(compared.manifests) - followed)
     notes = list(compared.notes)
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     refused = sorted(compared.refusals.items())
-    notes += [f"slip of {run} left out, {why}" for run, why in refused if run in set(dated["run"])]
+    notes += [f"slip of {run} left out, {why}" for run, why in refused if run in followed]
     if dated.is_empty():
         hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
         raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)

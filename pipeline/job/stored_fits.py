@@ -34,7 +34,7 @@ from pipeline.estimation.rivals import (
 )
 from pipeline.fleet.changes import RunNumbers, Side
 from pipeline.job import JobError
-from pipeline.job.compared_runs import refuse_run
+from pipeline.job.compared_runs import find_run_refusal
 from pipeline.job.keys import Owner, agree_on_vehicle
 from pipeline.models.effect import Effect, Late, Parameter
 from pipeline.models.learned_term import drop_learned, find_learned
@@ -133,7 +133,7 @@ def read_runs(
         SlipError: a run has no poses, its vehicle contradicts the model's, or no fit to it has a meaning.
     """
     for manifest in manifests:
-        if refusal := refuse_run(manifest):
+        if refusal := find_run_refusal(manifest):
             hint = "No fit to it has a meaning: give other runs."
             raise JobError("no_fit", refusal, where=manifest.run, hint=hint)
     known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
