@@ -155,8 +155,8 @@ def read_sides(
             raise JobError("no_runs", what, hint="Give logs, or runs of the results.")
     given = None if isinstance(before, Sequence) else before
     file = before.model if isinstance(before, Baseline) else given if isinstance(given, ModelFile) else None
-    manifests, notes = _leave_out_refused(before if isinstance(before, Sequence) else (), BEFORE)
-    after, more = _leave_out_refused(after, AFTER)
+    manifests, notes_before = _leave_out_refused(before if isinstance(before, Sequence) else (), BEFORE)
+    after, notes_after = _leave_out_refused(after, AFTER)
     everything = [*manifests, *after]
     known = before.readings if isinstance(before, Baseline) else ()
     _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
@@ -176,7 +176,7 @@ def read_sides(
         kind=names.get(type(before), "runs"),
         before=tuple(_note_slip(one, slips) for one in both.before),
         after=tuple(_note_slip(one, slips) for one in both.after),
-        notes=(*notes, *more, *both.notes),
+        notes=(*notes_before, *notes_after, *both.notes),
     )
 
 
