@@ -62,9 +62,8 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
 
 def explain_values(effect: str, values: Mapping[str, Value]) -> str | None:
     """Clause stating that all intervals of an effect include the neutral value; None where one does not."""
-    return explain_interval(
-        restore(effect, values), {key: (one.low, one.high) for key, one in values.items()}
-    )
+    intervals = {key: (one.low, one.high) for key, one in values.items()}
+    return explain_interval(restore(effect, values), intervals)
 
 
 def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:
@@ -141,8 +140,7 @@ class Unless:
     @property
     def note(self) -> Mapping[str, Json]:
         """The finding that it may act."""
-        text = f"{self.doubt} ({format_numbers(self.parameters)})"
-        return _note_insignificant(self.id, text)
+        return _note_insignificant(self.id, f"{self.doubt} ({format_numbers(self.parameters)})")
 
 
 def find_unless(
@@ -163,25 +161,33 @@ def find_unless(
         name = one.effect.id
         if name in taken:
             continue
-        model = judgement.fitted.model + one.effect
-        fitted = fit_model(judgement.problem, model, start=judgement.fitted, exact=True)
-        beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
+        beside, moved = _find_moved(judgement, named, one.effect, exact=False)
+        if moved:
+            # What it changes is said with its digits: a model with both effects has them.
+            beside, moved = _find_moved(judgement, named, one.effect, exact=True)
         if explain_values(name, beside[name]):
             continue
-        changed = {
-            effect.id: {
-                key: other
-                for key, value in effect.parameters.items()
-                if (other := beside[effect.id][key]).high < value.low or other.low > value.high
-            }
-            for effect in named
-            if effect.id in beside and not effect.by_run
+        for other, instead in moved.items() or [(None, {})]:
+            yield other, Unless(name, beside[name], one.gain, one.evidence, instead)
+
+
+def _find_moved(
+    judgement: Judgement, named: Sequence[Named], effect: Effect, *, exact: bool
+) -> tuple[Mapping[str, Mapping[str, Value]], Mapping[str, Mapping[str, Value]]]:
+    """Values beside an effect, and those of identified effects that it moves out of their intervals."""
+    start = judgement.fitted
+    fitted = fit_model(judgement.problem, start.model + effect, start=start, exact=exact)
+    beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
+    changed = {
+        one.id: {
+            key: other
+            for key, value in one.parameters.items()
+            if (other := beside[one.id][key]).high < value.low or other.low > value.high
         }
-        moved: dict[str | None, dict[str, Value]] = {
-            other: values for other, values in changed.items() if values
-        }
-        for other_id, instead in (moved or {None: {}}).items():
-            yield other_id, Unless(name, beside[name], one.gain, one.evidence, instead)
+        for one in named
+        if one.id in beside and not one.by_run
+    }
+    return beside, {other: values for other, values in changed.items() if values}
 
 
 def list_estimates(
@@ -247,8 +253,7 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
     empty = [explain_values(effect.id, values) for values in effect.tellings]
     if not all(empty):
         return None
-    text = f"{effect.id} is not named: {empty[0]}"
-    return _note_insignificant(effect.id, text)
+    return _note_insignificant(effect.id, f"{effect.id} is not named: {empty[0]}")
 
 
 def _note_insignificant(name: str, text: str) -> Mapping[str, Json]:

@@ -102,6 +102,7 @@ const holdStill = (pane, rows) => {
 };
 
 const buildNext = (pane) => {
+  if (pane.state.run.refusal) return h("div", { class: "next" }, h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."));
   const { session, trial, catalogue, diagnosis } = pane.state;
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
@@ -113,7 +114,6 @@ const buildNext = (pane) => {
   const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. To go on: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
-    pane.state.run.refusal && h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."),
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),

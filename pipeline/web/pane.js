@@ -302,6 +302,7 @@ export class Pane {
   }
 
   async tryAll(anyway = false) {
+    if (this.state?.run.refusal) return;
     if (await this.ask("try", { anyway })) this.follow();
   }
 

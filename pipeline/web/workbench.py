@@ -41,6 +41,8 @@ from pipeline.web.stored_runs import (
 )
 
 _MOST_KEPT = 40
+_FITS = frozenset({"add", "add_named", "add_found", "formula", "drop", "fit", "try"})
+"""Actions that fit a model."""
 
 
 @dataclass
@@ -274,6 +276,9 @@ class Sessions:
 
     def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
         editor = Editor(file, prepared, session)
+        if ask.action in _FITS and (refusal := find_refusal(read_summary(prepared.manifest))):
+            hint = "No fit to it has a meaning: open another run."
+            raise WorkbenchError("no_fit", refusal, where=ask.run, hint=hint)
 
         def make() -> Effect:
             return make_formula(ask.effect, ask.channel, ask.formula, ask.parameters)
@@ -329,12 +334,11 @@ class Sessions:
     def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
         """Rank further effects to add.
 
-        Requires an explicit request if the diagnosis identified more effects, or if slip is not observable.
+        Requires an explicit request if the diagnosis identified more effects.
         """
         file, session = editor.file, editor.session
         model = switch_off(editor.model, session.step.off)
-        refusal = find_refusal(read_summary(editor.prepared.manifest))
-        if ask.anyway or not (refusal or self._list_named(editor.prepared, session, model)):
+        if ask.anyway or not self._list_named(editor.prepared, session, model):
             self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
 

@@ -13,6 +13,7 @@ from workbench_server import RUN, TRACK, Workbench
 from pipeline.core import SlipError
 from pipeline.models import read_model
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 Session = dict[str, dict[str, float]]
 
@@ -421,3 +422,19 @@ def test_ten_minutes_are_answered_within_half_a_second_and_fitted_within_two(tmp
         server.close()
     assert fitted < 2.0
     assert sorted(shown)[2] < 0.5
+
+
+@pytest.mark.parametrize("action", ["add", "formula", "fit", "try"])
+def test_no_model_is_fitted_to_a_run_that_cannot_show_slip(workbench: Workbench, action: str) -> None:
+    manifest = Store(workbench.results).manifest(RUN)
+    assert manifest is not None
+    summary = manifest.path("summary.json")
+    still = [{"id": "not_moving", "severity": "error", "text": "it does not move"}]
+    summary.write_text(json.dumps(json.loads(summary.read_text()) | {"findings": still}))
+
+    opened = workbench.session(RUN)
+    refused = workbench.refuse("/api/session", run=RUN, action=action, effect="effective_track", anyway=True)
+
+    assert refused["code"] == "no_fit"
+    assert "it does not move" in str(refused["message"])
+    assert errors(workbench.session(RUN)) == errors(opened)
