@@ -326,12 +326,16 @@ class Facts:
         return Amount(most, (*limit.sources, source), limit.effects)
 
     def find_speed_acceleration(self) -> Amount:
-        """Largest acceleration [m/s^2] driving straight."""
-        return self.take(Quantity.WHEEL_ACCELERATION_LIMIT).change(operator.mul, self.find_radius())
+        """Largest acceleration [m/s^2], from the command or from the wheels driving straight."""
+        wheels = self.take(Quantity.WHEEL_ACCELERATION_LIMIT).change(operator.mul, self.find_radius())
+        commanded = self.take(Quantity.ACCELERATION_LIMIT).change(operator.mul, self.take(Quantity.RADIUS))
+        return _take_least(commanded, wheels)
 
     def find_turn_acceleration(self) -> Amount:
-        """Largest yaw acceleration [rad/s^2] turning on the spot; unknown for a car."""
-        return self._spin(Quantity.WHEEL_ACCELERATION_LIMIT)
+        """Largest yaw acceleration [rad/s^2], from the command or turning on the spot; unknown for a car."""
+        gains = self.take(Quantity.RADIUS), self.take(Quantity.TRACK)
+        commanded = self.take(Quantity.TURN_ACCELERATION_LIMIT).change(lambda a, r, k: a * r / k, *gains)
+        return _take_least(commanded, self._spin(Quantity.WHEEL_ACCELERATION_LIMIT))
 
     def find_deadband(self) -> tuple[Amount, Amount]:
         """Deadband as speed [m/s] when driving straight and as yaw rate [rad/s] when turning on the spot."""

@@ -90,6 +90,8 @@ _LIMITS = {
     Quantity.TURN_LIMIT,
     Quantity.WHEEL_SPEED_LIMIT,
     Quantity.WHEEL_ACCELERATION_LIMIT,
+    Quantity.ACCELERATION_LIMIT,
+    Quantity.TURN_ACCELERATION_LIMIT,
 }
 _OF_GROUND = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
 _BESIDE_PLUGINS = {

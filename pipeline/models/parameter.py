@@ -68,6 +68,8 @@ class Quantity(enum.Enum):
     TURN_LIMIT = ("largest commanded yaw rate", "rad/s", min)
     WHEEL_SPEED_LIMIT = ("largest wheel speed", "rad/s", min)
     WHEEL_ACCELERATION_LIMIT = ("largest wheel acceleration", "rad/s^2", min)
+    ACCELERATION_LIMIT = ("largest change of the commanded speed", "m/s^2", min)
+    TURN_ACCELERATION_LIMIT = ("largest change of the yaw rate asked of the wheels", "rad/s^2", min)
     DEADBAND = ("largest nominal speed at the rim for which a wheel stands still", "m/s", max)
 
     def __init__(self, about: str, unit: str, join: Joined) -> None:

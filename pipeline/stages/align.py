@@ -86,6 +86,11 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
             "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
             f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
         )
+        if turning is not None and not abs(np.log(turning / forward)) < _SCALED:
+            text += (
+                f"; the difference of the sides is {turning:.2f} times the commanded one, so that this scale "
+                "does not hold in turns: slip from commands there, and gains of the difference, depend on it"
+            )
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import itertools
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.core import arrays
+from pipeline.core import arrays, format_share
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run import read_wheel_times
@@ -97,6 +97,7 @@ class Rims:
         command: commanded speed, zero without a valid command.
         asked: (f_x, f_y, f_w times half the track) of the command, shape (n, 3).
         is_known: whether a command is valid, or the topic is silent after its first one.
+        kept: what the last command asked where it is too old to be valid, else zero, shape (n, 3).
         wheels: measured; None without encoders.
         driven: (f_x, f_y, f_w times half the track) of the wheels, zero where unknown, shape (n, 3).
         body: speed of the poses.
@@ -108,11 +109,19 @@ class Rims:
     command: Floats
     asked: Floats
     is_known: Flags
+    kept: Floats
     wheels: Floats | None
     driven: Floats
     body: Floats
     moved: Floats
     top: float
+
+    @property
+    def goes_on(self) -> Flags:
+        """Whether the vehicle moves as its last command asked, which is too old to be valid."""
+        apart = np.linalg.norm((self.moved if self.wheels is None else self.driven) - self.kept, axis=1)
+        goes_on: Flags = self.kept.any(axis=1) & (apart < _ALIKE * np.linalg.norm(self.kept, axis=1))
+        return goes_on
 
 
 def find_incidents(
@@ -146,9 +155,10 @@ def find_incidents(
             if inside.size and inside.mean() < _MOSTLY:
                 incidents.append((kind, start, end))
                 inside[:] = True
+    kept = _report_kept(rims)
     moving = (rims.body > LIVE_SHARE * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
-        return nothing
+        return replace(nothing, findings=kept)
     excluded = mark_excluded(times, incidents)
     findings = [
         Finding(
@@ -158,7 +168,24 @@ def find_incidents(
         )
         for kind, start, end in sorted(incidents, key=lambda one: one[1])
     ]  # fmt: skip
-    return Incidents(excluded, tuple(findings), tuple(sorted(incidents, key=lambda one: one[1])))
+    ordered = tuple(sorted(incidents, key=lambda one: one[1]))
+    return Incidents(excluded, (*kept, *findings), ordered)
+
+
+def _report_kept(rims: Rims) -> tuple[Finding, ...]:
+    """Report a vehicle that mostly goes on as its last command asked when that is too old to be valid."""
+    stale = np.asarray(rims.kept.any(axis=1), dtype=bool)
+    share = float(np.mean(rims.goes_on[stale])) if stale.any() else 0.0
+    spans = _list_spans(rims.times, stale, _SHOWS_S)
+    if not spans or share < _MOSTLY:
+        return ()
+    longest = max(float(rims.times[last] - rims.times[first]) for first, last in spans)
+    text = (
+        f"where the last command is too old to count, the vehicle goes on as it asked ({format_share(share)} "
+        f"of the time, for up to {longest:.1f} s): the base keeps its last command; set command.hold_s to "
+        "the longest pause between commands, and these stretches are compared, too"
+    )
+    return (Finding("kept_command", "warning", text, where="command", value=longest, count=len(spans)),)
 
 
 def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:
@@ -188,13 +215,14 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
         driven = np.nan_to_num(measured.velocity) * scale
         wheels = np.abs(driven).sum(axis=1)
         known = known & np.isfinite(measured.velocity).all(axis=1)
+    kept = np.zeros((times.size, 3)) if command is None else command.expired * scale
     size = np.abs(asked).sum(axis=1)
     largest = [one[one > 0.02] for one in (size, wheels) if one is not None]  # noqa: PLR2004 - asked at all
     if all(one.size < _FEWEST_ALIKE for one in largest):
         return None
     top = max(float(np.quantile(one, 0.95)) for one in largest if one.size)
     body = np.abs(moved).sum(axis=1)
-    return Rims(times, size, asked, known, wheels, driven, body, moved, top)
+    return Rims(times, size, asked, known, kept, wheels, driven, body, moved, top)
 
 
 def _smooth(times: Floats, values: Floats) -> Floats:
@@ -309,7 +337,8 @@ def _find_stops(rims: Rims) -> list[Span]:
 def _find_manual(rims: Rims) -> list[Span]:
     """A vehicle that continues to drive, or starts, under zero commands."""
     speed, turns = (rims.body, LIVE) if rims.wheels is None else (rims.wheels, LIVE_SHARE)
-    silent = rims.is_known & (rims.command < _NOTHING * rims.top)
+    # A vehicle without a watchdog keeps its last command.
+    silent = rims.is_known & (rims.command < _NOTHING * rims.top) & ~rims.goes_on
     moving, second = speed > turns * rims.top, arrays.count_steps(rims.times, 1.0)
     shows, seeds = np.zeros(silent.size, dtype=bool), []
     for quiet, first, last in _list_within(rims, silent, ANSWERS_S, moving):
@@ -364,13 +393,14 @@ def _find_silent(rims: Rims, tables: Mapping[str, pl.DataFrame], hold_s: float |
     if commands is None or commands.is_empty() or hold_s is None:
         return []
     stamps, active = read_wheel_times(commands), commands["active"].to_numpy()
-    stands, silent = _stands(rims), list[Span]()
+    stands, silent, step = _stands(rims), list[Span](), float(np.median(np.diff(rims.times)))
     for index in np.flatnonzero((np.diff(stamps) > max(hold_s, ANSWERS_S)) & active[:-1]).tolist():
         start, end = float(stamps[index]), float(stamps[index + 1])
         before = rims.command[_slice(rims.times, start - 0.5, start)]
-        inside = stands[_slice(rims.times, start + 0.5 * (end - start), end)]
+        # Where nothing at all was recorded, nobody knows whether it stood.
+        rest = stands[_slice(rims.times, start + 0.5 * (end - start), end)].sum() * step
         asks = before.size > 0 and bool((before > LIVE_SHARE * rims.top).all())
-        if asks and inside.size and float(np.mean(inside)) >= _MOSTLY:
+        if asks and rest >= _MOSTLY * 0.5 * (end - start):
             silent.append(("commands_silent", start, end))
     driven = float(np.sum(np.diff(rims.times)[rims.command[1:] > 0.0]))
     return silent if len(silent) <= max(driven / USUAL_S, 1.0) else []

@@ -137,6 +137,14 @@ class Ideal:
         """The same with some samples unknown."""
         return replace(self, velocity=np.where(samples[:, None], np.nan, self.velocity))
 
+    @property
+    def expired(self) -> Floats:
+        """Velocities of the last valid input where it is stale; zero elsewhere, shape (n, 3)."""
+        known = np.isfinite(self.velocity).all(axis=1)
+        last = np.maximum.accumulate(np.where(known, np.arange(known.size), -1))
+        taken = self.stale & (last >= 0)
+        return np.where(taken[:, None], self.velocity[np.maximum(last, 0)], 0.0)
+
 
 def compute_slip(
     velocities: pl.DataFrame,

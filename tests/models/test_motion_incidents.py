@@ -132,6 +132,36 @@ def test_one_of_each_kind_is_found_within_a_second_and_nothing_else() -> None:
         assert "left out of all fits" in findings[0].text
 
 
+def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:
+    """Commands that are sent at changes only: what goes on until the next one was asked for."""
+    tables = extract(simulate_run(make_scenario(TRUTH, seed=3, duration_s=120.0)), HUSKY)
+    asked = tables["commands"]
+    is_new = (pl.col("left").diff().abs() + pl.col("right").diff().abs()).fill_null(1.0) > 1e-6
+    sparse = {**tables, "commands": asked.filter(is_new)}
+    findings = align_tables(sparse, HUSKY, hold_s=0.5, body_commanded=False, where="simulated").findings
+    (kept,) = (one for one in findings if one.id == "kept_command")
+    pauses = sparse["commands"]["t"].diff().drop_nulls().to_numpy()
+    assert kept.value == pytest.approx(np.max(pauses) - 0.5, abs=1.0)
+    assert not [one for one in findings if one.id in INCIDENTS]
+
+
+def test_a_pause_of_the_recorder_is_no_incident() -> None:
+    """Nothing is recorded from while the vehicle drives until it stands: nobody saw it stop."""
+    program = Program("stop_and_go")
+    tables = extract(simulate_run(make_scenario(TRUTH, seed=3, duration_s=120.0, program=program)), HUSKY)
+    times, asked = tables["commands"]["t"].to_numpy(), tables["commands"]["left"].to_numpy()
+    live = np.abs(asked) > 0.5 * np.abs(asked).max()
+    start = next(t for t in times[live] if t > 20.0 and live[(times > t - 1.0) & (times <= t)].all())
+    end = next(t for t in times if t > start + 8.0 and not asked[(times > t - 2.0) & (times <= t)].any())
+    gone = pl.col("t").is_between(start, end, closed="right")
+    paused = {name: table.filter(~gone) if "t" in table.columns else table for name, table in tables.items()}
+    paused["commands"] = paused["commands"].filter((pl.col("t") <= start) | (pl.col("t") > end + 0.3))
+    later = (pl.col("t") > start).cast(pl.Int32)
+    paused["poses"] = paused["poses"].with_columns(segment=pl.col("segment") + later)
+    findings = align_tables(paused, HUSKY, hold_s=None, body_commanded=False, where="simulated").findings
+    assert not [one for one in findings if one.id in INCIDENTS]
+
+
 @pytest.mark.long
 def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
     missed, more = [], 0

@@ -285,6 +285,25 @@ def test_limits_are_reached_and_not_more() -> None:
     assert math.radians(degrees["RO_YAW_RATE_LIM"]) == pytest.approx(p["FollowPath.wz_max"], rel=1e-4)
 
 
+def test_ramps_of_the_command_are_limits_of_acceleration() -> None:
+    effects = (
+        find_effect("effective_track")(k=1.8),
+        find_effect("wheel_radius")(k=0.9),
+        find_effect("body_acceleration_limit")(limit=1.0),
+        find_effect("turn_acceleration_limit")(limit=2.0),
+    )
+    file = make(*effects)
+    p, degrees = take("nav2", file), take("px4", file)
+    straight, spin = predict(file, [(-1.0, 9.0, 9.0)], 1.0), predict(file, [(-1.0, -9.0, 9.0)], 1.0)
+    assert np.diff(straight[:100, 4]).max() / 0.005 == pytest.approx(p["FollowPath.ax_max"], rel=1e-4)
+    assert np.diff(spin[:100, 6]).max() / 0.005 == pytest.approx(p["FollowPath.az_max"], rel=1e-4)
+    assert math.radians(degrees["RO_YAW_ACCEL_LIM"]) == pytest.approx(p["FollowPath.az_max"], rel=1e-4)
+    # Of two limits the smaller one holds; ros2_control has a parameter for both.
+    steep = make(*effects, find_effect("acceleration_limit")(limit=99.0))
+    assert take("nav2", steep)["FollowPath.ax_max"] == p["FollowPath.ax_max"]
+    assert "No parameter there stands for" not in export_model(make(*effects[2:]), "ros2_control")
+
+
 def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
     """Wet grass: a command that is clipped at 1.01 rad/s turns a track twice as wide by .5 rad/s."""
     effects = (find_effect("effective_track")(k=2.0), find_effect("body_turn_limit")(limit=1.0))

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from pipeline.models.effect import INF, SIDES, DriveEffect, Excitation, Parameter
 from pipeline.models.filters import limit_rate
-from pipeline.models.parameter import Conditions, Largest, Level
+from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 LEAST_RAMP_S = 0.08
@@ -35,6 +35,7 @@ class BodyAccelerationLimit(DriveEffect):
             1.0,
             starts=(0.4, 1.0, 2.5),
             step=1e-2,
+            quantities=(Quantity.ACCELERATION_LIMIT,),
             level=Level.VEHICLE,
         ),
     )

@@ -13,7 +13,7 @@ from dataclasses import replace
 from pipeline.models.effect import INF, SIDES, DriveEffect, Excitation, Parameter
 from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S
 from pipeline.models.filters import limit_rate
-from pipeline.models.parameter import Conditions, Largest, Level
+from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -33,6 +33,7 @@ class TurnAccelerationLimit(DriveEffect):
             2.0,
             starts=(0.8, 2.0, 5.0),
             step=1e-2,
+            quantities=(Quantity.TURN_ACCELERATION_LIMIT,),
             level=Level.VEHICLE,
         ),
     )
