@@ -254,11 +254,15 @@ def compare(  # noqa: D417 - the shared options document themselves
     chosen = choose_input(files[0][1], spoken.input, effects, last=last.pop() if len(last) == 1 else None)
     rows: list[tuple[str, Transfer]] = []
     held: list[dict[str, Coverage]] = []
+    own_runs: list[str] = []
     for path, (file, runs) in zip(paths, files, strict=True):
+        own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
+        seen = "the error of its values there is not held out"
+        own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
         held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
         carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
         rows += [(str(path), item) for item in carried]
-    warnings = [text for text in (chosen.warning, *(item.warning for _, item in rows)) if text]
+    warnings = [text for text in (chosen.warning, *own_runs, *(item.warning for _, item in rows)) if text]
     if spoken.json:
         print_json(
             {

@@ -42,7 +42,9 @@ def format_verdict(check: Check) -> str:
         listed = enumerate_texts(
             [f"{_name(check, name)} {_format_pair(check, name)}" for name in differs[:_MOST_NAMED]]
         )
-        sentences.append(f"No conclusion: the recordings differ in {listed}, but no more than runs do anyway")
+        sentences.append(
+            f"No conclusion: the recordings differ in {listed}, but runs on each side may differ as much"
+        )
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "No conclusion: no number is known on both sides"
@@ -180,7 +182,7 @@ def list_lines(check: Check) -> list[Line]:
     pairs = max((len(_format_pair(check, name)) for name in _list_known(check)), default=0)
     for status in STATUSES:
         for name in check.list_status(status):
-            lines.append((status, _format_row(check, name, names, pairs)))
+            lines.append((_name_outcome(check, name), _format_row(check, name, names, pairs)))
             if status != "unknown":
                 lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
     lines += [("may be", text) for text in _list_readings(check)]
@@ -209,7 +211,21 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
     within = f", {change.p_within:.2g} within these recordings" if change.status == "differs" else ""
-    return f"{text}  p = {change.p:.2g}{within}"
+    few = "; too few runs to see one of its own size" if _is_unseen(check, name) else ""
+    return f"{text}  p = {change.p:.2g}{within}{few}"
+
+
+def _name_outcome(check: Check, name: str) -> str:
+    return "not shown" if _is_unseen(check, name) else check.changes[name].status
+
+
+def _is_unseen(check: Check, name: str) -> bool:
+    """Whether a change of a parameter's own size could have been missed, and none was shown."""
+    change = check.changes[name]
+    if change.status != "unchanged" or name in ERRORS:
+        return False
+    usual = _find(check, name).parameter.usual_size
+    return not change.smallest <= max(abs(change.before), abs(change.after), usual)
 
 
 def _format_resolution(check: Check, name: str) -> str:
@@ -268,7 +284,7 @@ def format_markdown(check: Check) -> str:
             change = check.changes[name]
             known = status != "unknown"
             pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
-            rows.append(f"| {_escape(name)} | {pair} | {p} | {status} |")
+            rows.append(f"| {_escape(name)} | {pair} | {p} | {_name_outcome(check, name)} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
 
@@ -291,6 +307,7 @@ def format_junit(check: Check) -> str:
     gate = not check.limits
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
+        kind = "skipped" if _is_unseen(check, name) else kind
         text = _format_row(check, name)
         text += "" if change.status == "unknown" else f"; {_format_resolution(check, name)}"
         cases.append(("number", name, kind, text))

@@ -30,12 +30,13 @@ from pipeline.estimation.apportion import SlipBudget, apportion
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import Judgement, Ladder, LadderStep
+from pipeline.estimation.ladder import Judgement, Ladder, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out, hold_out_model
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, Timing, find_effect
+from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run, load_vehicle
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
@@ -142,12 +143,20 @@ class PreparedRun:
     def apportion(self, model: Model, length_scale_m: float) -> Sequence[SlipBudget]:
         """Budgets by cause of a model, after fitting it; empty for the ideal model."""
         with self.lock:
-            whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
-            if not whole.fitted.model.effects:
+            judgement = self._judge_ladder(model)
+            if not judgement.fitted.model.effects:
                 return ()
-            ladder = Ladder((ideal.ladder_step, whole.ladder_step))
-            judgement = Judgement(self.problem, ladder, whole.ladder_step, whole.estimates)
             return apportion(judgement, length_scale_m=length_scale_m)
+
+    def note_fit(self, file: ModelFile) -> ModelFile:
+        """A model file with the data of its fit to this run."""
+        with self.lock:
+            return note_fit(file, self._judge_ladder(file.model))
+
+    def _judge_ladder(self, model: Model) -> Judgement:
+        whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
+        ladder = Ladder((ideal.ladder_step, whole.ladder_step))
+        return Judgement(self.problem, ladder, whole.ladder_step, whole.estimates)
 
     def judge_quickly(self, model: Model) -> Errors:
         """Held-out errors of a fitted model, without intervals."""
@@ -157,8 +166,11 @@ class PreparedRun:
             ).pooled
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
-        """Errors of a model with its present values, without a fit."""
+        """Errors of a model with its present values: held out where a fit gave these, else as they are."""
         with self.lock:
+            known = self._fits.get(model.effects)
+            if known is not None and _list_keys(known.fitted.model) == _list_keys(model):
+                return known.errors
             return score(self.problem, self.state(model, timing)).pooled
 
     def state(self, model: Model, timing: Sequence[float]) -> State:
@@ -249,6 +261,10 @@ class RunCache:
                 while len(self._prepared) > _MOST_RUNS:
                     self._prepared.popitem(last=False)
             return prepared
+
+
+def _list_keys(model: Model) -> list[object]:
+    return [effect.rounded.key for effect in model.effects]
 
 
 def step_as_json(effects: Sequence[str], errors: Errors) -> dict[str, object]:

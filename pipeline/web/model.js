@@ -103,11 +103,10 @@ const holdStill = (pane, rows) => {
 
 const buildNext = (pane) => {
   if (pane.state.run.refusal) return h("div", { class: "next" }, h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."));
-  const { session, trial, catalogue, diagnosis } = pane.state;
+  const { session, trial, catalogue, diagnosis, missing } = pane.state;
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
   const running = trial && !trial.done;
-  const named = rows.filter((row) => row.named).length;
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
@@ -117,7 +116,7 @@ const buildNext = (pane) => {
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
-    named > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, onclick: () => pane.addAll() }, `Add all ${named} of the diagnosis`),
+    missing.length > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, title: missing.join(", "), onclick: () => pane.addAll() }, `Add all ${missing.length} of the diagnosis`),
     trial?.done && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),

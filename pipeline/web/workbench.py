@@ -237,11 +237,18 @@ class Sessions:
         return self._look(ask, lambda cache, shown: cache.redraw(shown, ask.stretch))
 
     def save(self, ask: Ask) -> dict[str, object]:
-        """Write the model file of a session, without the effects that are switched off."""
+        """Write the model file of a session, without the effects that are switched off.
+
+        The data of its fit are written as well, unless values were set by hand since.
+        """
         file, session = self._read_session(ask.run, ask.slot)
         parsed = file.parse(session.step.model)
+        written = replace(parsed, model=switch_off(parsed.model, session.step.off))
+        if written.model.effects and not session.step.by_hand:
+            with evaluating(ask.run):
+                written = self._find(ask)[1].note_fit(written)
         make_folder(file.model_path.parent)
-        write_model(replace(parsed, model=switch_off(parsed.model, session.step.off)), file.model_path)
+        write_model(written, file.model_path)
         return {"path": str(file.model_path)}
 
     def diagnose(self, ask: Ask) -> dict[str, object]:
@@ -300,25 +307,29 @@ class Sessions:
         }
         return changes[ask.action]()
 
-    def _find_named(self, editor: Editor) -> ModelFile | None:
+    def _find_named(self, prepared: PreparedRun) -> ModelFile | None:
         """The model of the diagnosis, whose effects were tested there together with all others."""
-        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
+        diagnosis = read_diagnosis(self.results, prepared.manifest)
         return None if diagnosis is None else read_model_text(diagnosis)
 
     def _is_named(self, editor: Editor, ask: Ask) -> bool:
-        named = self._find_named(editor)
+        named = self._find_named(editor.prepared)
         return named is not None and ask.effect in named.model
 
+    def _list_missing(self, prepared: PreparedRun, session: Session) -> list[Effect]:
+        """Effects of the diagnosis that the session's model lacks."""
+        named = self._find_named(prepared)
+        return [] if named is None else [one for one in named.model if one.id not in session.step.order]
+
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
-        named = self._find_named(editor)
-        if named is None:
+        missing = self._list_missing(editor.prepared, editor.session)
+        if not missing:
             raise WorkbenchError(
                 "not_diagnosed",
-                "the diagnosis of this run found no effect",
+                "the diagnosis of this run found no effect that the model lacks",
                 where=ask.run,
                 hint="Diagnose it first.",
             )
-        missing = [effect for effect in named.model if effect.id not in editor.session.step.order]
         return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=True)
 
     def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:
@@ -367,6 +378,7 @@ class Sessions:
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": read_diagnosis(self.results, prepared.manifest),
             "named": self._list_named(prepared, session, model),
+            "missing": [effect.id for effect in self._list_missing(prepared, session)],
             "plan": find_plan(self.results, prepared.manifest),
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,

@@ -89,6 +89,8 @@ def test_two_models_are_compared_on_one_input(
     change(results, capsys, "fit", model, "--input", "measured")
     found = change(results, capsys, "compare", model, other)
 
+    (own,) = (text for text in found["warnings"] if "is not held out" in text)
+    assert own.startswith(f"{model} was fitted to {RUN}")
     assert found["input"] == "command"
     assert len(change(results, capsys, "compare", model, model)["compared"]) == 1
     ideal = [row["ideal"] for row in found["compared"]]

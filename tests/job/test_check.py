@@ -117,6 +117,20 @@ def test_a_check_in_which_most_numbers_are_unknown_shows_nothing(same: Sides) ->
     assert "most numbers of the model cannot be compared" in format_verdict(blind)
 
 
+def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> None:
+    check = compare(same)
+    name = "drive_lag.tau"
+    assert ("unchanged", name) in {(label, text.split()[0]) for label, text in list_lines(check)}
+    blind = replace(check.changes[name], smallest=10.0)
+    unseen = replace(check, changes={**check.changes, name: blind})
+    (row,) = (text for label, text in list_lines(unseen) if label == "not shown")
+    assert row.startswith(name)
+    assert row.endswith("too few runs to see one of its own size")
+    (case,) = (one for one in read_suite(unseen).iter("testcase") if one.get("name") == name)
+    assert case.find("skipped") is not None
+    assert "| not shown |" in format_markdown(unseen)
+
+
 def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     found = compare(replace(late, before=late.before[:1], after=late.after[:1]))
 

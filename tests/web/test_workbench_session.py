@@ -56,6 +56,16 @@ def test_the_ladder_has_a_rung_for_each_effect_in_the_order_of_adding(workbench:
     assert [effect["id"] for effect in effects(dropped)] == ["effective_track"]
 
 
+def test_an_effect_that_is_switched_off_and_on_again_has_the_same_errors(workbench: Workbench) -> None:
+    workbench.session(RUN, "add", effect="drive_lag", anyway=True)
+    added = workbench.session(RUN, "add", effect="effective_track")
+    switched_off = workbench.session(RUN, "switch", effect="effective_track")
+    switched_on = workbench.session(RUN, "switch", effect="effective_track")
+
+    assert errors(switched_off)["r"] > 2.0 * errors(added)["r"]
+    assert errors(switched_on) == errors(added)
+
+
 def test_a_value_set_by_hand_is_scored_and_not_fitted(workbench: Workbench) -> None:
     added = workbench.session(RUN, "add", effect="effective_track")
     wrong = workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.2)
@@ -152,6 +162,13 @@ def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
     assert status == 200
     assert "hidden.toml" in headers["content-disposition"]
     assert b"effective_track" in body
+    # It says what it was fitted to, and keeps its numbers; values set by hand were fitted to nothing.
+    written = read_model(path)
+    assert [row["run"] for row in written.list_fitted("runs")] == [RUN]
+    assert written.model.effect("effective_track").values["k"] == value(added)
+    workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.2)
+    workbench.post("/api/save", run=RUN)
+    assert read_model(path).list_fitted("runs") == []
 
 
 @pytest.mark.parametrize("folder", ["models", "desks/a", "uploads"])
