@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
-from pipeline.core import INPUT_WORDS, format_duration, format_recorded
+from pipeline.core import INPUT_WORDS, format_duration, format_recorded, mark_finding
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
@@ -268,18 +268,15 @@ def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> lis
         elif finding.get("t_end") is not None:
             incidents.setdefault(str(finding["id"]), []).append(finding)
         else:
-            rows.append(f"{_mark([finding])} {text}")
-    rows = [*(f"{_mark(alike)} {_format_timed(alike)}" for alike in incidents.values()), *rows]
+            rows.append(f"{mark_finding(finding['severity'])}{text}")
+    marks = {name: mark_finding(alike[0]["severity"]) for name, alike in incidents.items()}
+    rows = [*(f"{marks[name]}{_format_timed(alike)}" for name, alike in incidents.items()), *rows]
     if everything:
         rows += notes
     elif len(rows) > _SHOWN:
         rest = len(rows) - _SHOWN + len(notes)
         rows = [*rows[:_SHOWN], f"   {rest} more (--all)"]
     return [_row("" if number else "findings", row) for number, row in enumerate(rows)]
-
-
-def _mark(findings: Sequence[Mapping[str, object]]) -> str:
-    return "!!" if any(finding["severity"] == "error" for finding in findings) else "! "
 
 
 def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:

@@ -109,6 +109,11 @@ def suffix_unit(unit: object) -> str:
     return "" if unit == "1" else f" {unit}"
 
 
+def mark_finding(severity: object) -> str:
+    """Mark in front of a finding: `!!` forbids conclusions, `!` is a warning."""
+    return {"error": "!! ", "warning": "!  "}.get(str(severity), "   ")
+
+
 def enumerate_texts(texts: Sequence[str]) -> str:
     """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
-from pipeline.core import INPUT_WORDS, format_share
+from pipeline.core import INPUT_WORDS, format_share, mark_finding
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
@@ -408,16 +408,17 @@ def _format_detectable(run: RunDiagnosis) -> str:
 
 def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> list[Row]:
     """The findings of a run, except those stated in the verdict: the severe ones, then the notes."""
-    texts = Counter((finding.get("severity") == "info", str(finding["text"])) for finding in run.findings)
+    texts = Counter((str(finding.get("severity")), str(finding["text"])) for finding in run.findings)
     severe: list[str] = []
     notes: list[str] = []
-    for (is_note, text), count in texts.items():
+    for (severity, text), count in sorted(texts.items(), key=lambda one: one[0][0] != "error"):
         if text.casefold() not in verdict.casefold():
             # Repeated findings are listed once, with their count.
             times = f" ({count} times)" if count > 1 else ""
-            (notes if is_note else severe).append(f"{prefix}{text}{times}")
+            marked = f"{mark_finding(severity)}{prefix}{text}{times}"
+            (notes if severity == "info" else severe).append(marked)
     shown, further = severe[:_FINDINGS_SHOWN], severe[_FINDINGS_SHOWN:]
-    folded = [f"{len(further)} more{_FOLDED}"] if further else []
+    folded = [f"   {len(further)} more{_FOLDED}"] if further else []
     parts = zip(FINDING_LABELS, ([*shown, *folded], further, notes), strict=True)
     return [row for label, part in parts for row in _label(label, part)]
 

@@ -214,6 +214,7 @@ def view_why(page: Page) -> dict[str, object]:
         "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
         "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in minor],
         "groups": report.small_groups,
+        "undecided": bool(report.undecided),
         "remaining": format_remaining(report),
         "table": Table("Effects", _HEAD, rows),
         "open": list(_list_open(report)),

@@ -203,7 +203,7 @@ def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> No
     spoiled = {"id": "imu_sign", "text": "the gyro turns the wrong way", "severity": "warning"}
     text = describe(Diagnosis((run, replace(run, run="season/tuesday", findings=(spoiled,)))))
     assert text.count("effective_track  ") == 1
-    assert "findings  season/tuesday: the gyro turns the wrong way" in text
+    assert "findings  !  season/tuesday: the gyro turns the wrong way" in text
 
 
 def test_what_is_missing_stands_in_the_order_of_the_ladder(skidding: Diagnosis) -> None:

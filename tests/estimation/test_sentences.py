@@ -173,7 +173,7 @@ def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() ->
     floor = {"t_mrmse_m": 0.05, "r_mrmse_rad": 0.02}
     run = RunDiagnosis("run", "command", ladder=ladder, noise_floor=floor, findings=(stuck, stuck))
     lines = list_lines(run)
-    assert ("findings", "it was stuck (2 times)") in lines
+    assert ("findings", "!  it was stuck (2 times)") in lines
     assert sum("it was stuck" in text for _, text in lines) == 1
     (way_on,) = [text for _, text in lines if text.startswith("next steps: ")]
     assert "another run" in way_on
@@ -181,13 +181,15 @@ def test_what_happened_twice_is_said_once_and_an_open_rest_names_the_way_on() ->
 
 
 def test_every_finding_is_listed_with_all_and_those_left_out_are_counted_without() -> None:
-    severe = [{"id": "w", "severity": "warning", "text": f"warning {number}"} for number in range(6)]
+    """What forbids conclusions comes first; marks are those of `slip analyze`."""
+    severe = [{"id": "w", "severity": "warning", "text": f"warning {number}"} for number in range(5)]
+    grave = {"id": "e", "severity": "error", "text": "an error"}
     note = {"id": "n", "severity": "info", "text": "a note"}
-    lines = list_lines(RunDiagnosis("run", "command", findings=(note, *severe)))
+    lines = list_lines(RunDiagnosis("run", "command", findings=(note, *severe, grave)))
     folded = [text for _, text in choose_lines(lines, everything=False)][1:]
-    assert folded == ["warning 0", "warning 1", "warning 2", "warning 3", "2 more (--all)"]
+    assert folded == ["!! an error", "!  warning 0", "!  warning 1", "!  warning 2", "   2 more (--all)"]
     whole = [text for _, text in choose_lines(lines, everything=True)][1:]
-    assert whole == [*(str(one["text"]) for one in severe), "a note"]
+    assert whole == ["!! an error", *(f"!  {one['text']}" for one in severe), "   a note"]
 
 
 def test_a_share_of_the_residual_names_what_it_is_a_share_of() -> None:

@@ -437,3 +437,12 @@ def test_numbers_that_a_run_does_not_determine_are_marked() -> None:
     rows = _list_parameters({"id": "wheel_servo", "parameters": parameters})
     marks = [row[1].notes for row in rows if not isinstance(row[1], str)]
     assert marks == [[UNDETERMINED], [AT_BOUND], []]
+
+
+def test_an_undecided_effect_is_an_effect(report: RunReport) -> None:
+    alone = {**report.diagnosis, "effects": []}
+    shown = render_report(RunReport(report.summary, {}, alone))
+    assert shown.count("An effect acts, and this log does not decide which") == 2
+    assert "No significant effect" not in shown
+    none = render_report(RunReport(report.summary, {}, {**alone, "undecided": []}))
+    assert none.count("No significant effect") == 2
