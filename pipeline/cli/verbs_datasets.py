@@ -151,7 +151,8 @@ def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
         for row, verdict in zip(rows, verdicts, strict=True)
         if verdict in (DIFFERENT, OF_TWO_RUNS)
     ]
-    return lines if len(lines) == len(rows) else [*lines, count_pairs(rows)]
+    head = ["differences are medians over all pairs of blocks, not differences of the medians above"]
+    return [*(head if lines else []), *lines, *([count_pairs(rows)] if len(lines) < len(rows) else [])]
 
 
 _OWN = Path("deployments.csv")

@@ -106,14 +106,16 @@ class Difference:
                 for part in self.parts
                 if abs(part.difference) >= _LEAST_SHOWN * largest
             )
-            return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more, by cause in m/s: {words}"
+            return (
+                f"{self.b} against {self.a}, {self.total:.2g} m/s of RMS slip more, by cause in m/s: {words}"
+            )
         main_parts = [part for part in self.parts if abs(part.difference) >= _LEAST_SHOWN * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
         rest = f"; no contribution: {', '.join(names[part.name] for part in none)}" if none else ""
-        return f"{self.b} against {self.a}, {self.total:.2g} m/s of slip more: {words}{rest}"
+        return f"{self.b} against {self.a}, {self.total:.2g} m/s of RMS slip more: {words}{rest}"
 
 
 def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:

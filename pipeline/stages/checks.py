@@ -380,15 +380,22 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     findings = []
     for axis, limit, unit in ((0, vehicle.max_speed_mps, "m/s"), (2, vehicle.max_yaw_rate_radps, "rad/s")):
-        asked = np.abs(samples.command[np.isfinite(samples.command[:, axis]), axis])
+        known = np.isfinite(samples.command[:, axis])
+        asked, moved = (np.abs(values[known, axis]) for values in (samples.command, samples.velocity))
         if limit is None or asked.size == 0:
             continue
-        share = float(np.mean(asked > limit * 1.02))
+        beyond = asked > limit * 1.02
+        share = float(np.mean(beyond))
         if share > 0.01:  # noqa: PLR2004 - a hundredth of the samples is no accident
-            name = "speed" if axis == 0 else "yaw rate"
+            name, reached = "speed" if axis == 0 else "yaw rate", float(np.median(moved[beyond]))
             text = (
-                f"{format_share(share)} of the commands ask for more than the vehicle's largest {name} "
-                f"({limit:g} {unit}): its controller may clip them"
+                f"for {format_share(share)} of the time the command asks for more than the vehicle's largest "
+                f"{name} ({limit:g} {unit}): "
+            )
+            text += (
+                f"it then reaches {reached:.2g} {unit} in the median, so that this limit does not act"
+                if reached > limit * 1.02
+                else "its controller may clip it"
             )
             findings.append(
                 Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share)

@@ -17,7 +17,7 @@ def find(command: Floats, stopped: tuple[float, float]) -> list[tuple[float, flo
     zeros = np.zeros(command.size)
     three, moved = (np.stack((one, zeros, zeros), axis=1) for one in (command, follows))
     known = np.ones(command.size, dtype=bool)
-    rims = Rims(times, command, three, known, follows, moved, follows, moved, 1.0)
+    rims = Rims(times, command, three, known, 0.0 * three, follows, moved, follows, moved, 1.0)
     return [(start, end) for _, start, end in _find_stops(rims)]
 
 

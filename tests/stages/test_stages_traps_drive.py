@@ -266,6 +266,11 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
     found = [finding for finding in taken.findings if finding.id == "command_beyond_limit"]
     assert {finding.where for finding in found} == {"command speed", "command yaw rate"}
     assert all(finding.value is not None and 0.2 < finding.value < 0.8 for finding in found)
+    (speed,) = (finding for finding in found if finding.where == "command speed")
+    assert speed.text.endswith("so that this limit does not act")
+    clipped = drive(replace(FIELD, vehicle=eager, effects={"body_speed_limit": 1.0}))
+    texts = {one.where: one.text for one in clipped.findings if one.id == "command_beyond_limit"}
+    assert texts["command speed"].endswith("its controller may clip it")
     assert "command_beyond_limit" not in drive(FIELD).ids()
 
 
