@@ -86,11 +86,10 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
             "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
             f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
         )
-        if turning is not None and not abs(np.log(turning / forward)) < _SCALED:
-            text += (
-                f"; the difference of the sides is {turning:.2f} times the commanded one, so that this scale "
-                "does not hold in turns: slip from commands there, and gains of the difference, depend on it"
-            )
+        steady = both & samples.steady
+        if turning is None and steady.any():
+            turns = _list_ratios(*_average(samples, steady, samples.step.astype(np.int64))[1])
+            text += _contradict_scale(turns) if turns.size else ""
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
@@ -104,6 +103,13 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     )
     finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
     return CommandScale(1.0, multiplier, (finding,))
+
+
+def _contradict_scale(turns: Floats) -> str:
+    return (
+        f"; the sides differ {np.median(turns):.2f} times as much as commanded in the median of turns: no single "
+        "scale holds, and slip from commands in turns depends on it"
+    )
 
 
 def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
@@ -159,14 +165,20 @@ def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
 
 def _find_ratio(asked: Floats, got: Floats) -> float | None:
     """Median ratio of measured to commanded over the slower half of the steps; None if they disagree."""
-    size = np.abs(asked)
-    slow = (size > max(0.1 * float(size.max()), STILL_MPS)) & (size < 0.5 * float(size.max()))
-    if slow.sum() < _FEWEST_STEPS:
+    ratio = _list_ratios(asked, got)
+    if ratio.size < _FEWEST_STEPS:
         return None
-    ratio = got[slow] / asked[slow]
     middle = float(np.median(ratio))
     spread = robust_spread(ratio - middle)
     return middle if middle > _LEAST_RATIO and spread < ONE_SCALE * middle else None
+
+
+def _list_ratios(asked: Floats, got: Floats) -> Floats:
+    """Ratios of measured to commanded in the slower half of the steps, those near a standstill left out."""
+    size = np.abs(asked)
+    slow = (size > max(0.1 * float(size.max()), STILL_MPS)) & (size < 0.5 * float(size.max()))
+    ratios: Floats = got[slow] / asked[slow]
+    return ratios
 
 
 def _find_gain(asked: Floats, got: Floats) -> float | None:

@@ -278,6 +278,7 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
 def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale: float) -> None:
     taken = drive(replace(LONGER, recording=Recording(command_scale=scale)))
     assert taken.finding("command_scale").value == pytest.approx(1.0 / scale, rel=0.02)
+    assert "no single scale holds" not in taken.finding("command_scale").text
     assert "controller_multiplier" not in taken.ids()
 
 
