@@ -106,10 +106,8 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
 
 
 def _contradict_scale(turns: Floats) -> str:
-    return (
-        f"; the sides differ {np.median(turns):.2f} times as much as commanded in the median of turns: no single "
-        "scale holds, and slip from commands in turns depends on it"
-    )
+    times = f"; the sides differ {np.median(turns):.2f} times as much as commanded in the median turn"
+    return f"{times}: no single scale holds, and slip from commands in turns depends on it"
 
 
 def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
