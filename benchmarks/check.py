@@ -89,7 +89,8 @@ def check_pair(
     model = next(model for _, model in (*before, *after) if model is not None)
     effects = unite_effects(*([model for _, model in side] for side in (before, after)))
     sides = {BEFORE: [run for run, _ in before], AFTER: [run for run, _ in after]}
-    return compare(read_under(ModelFile(Model(model.vehicle, effects)), sides))
+    starts = {run.name: own for run, own in (*before, *after) if own is not None}
+    return compare(read_under(ModelFile(Model(model.vehicle, effects)), sides, starts=starts))
 
 
 def redrive(scene: Scenario, kind: str, seed: int) -> Scenario:

@@ -7,6 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 import msgspec
@@ -161,14 +162,17 @@ def read_sides(
     known = before.readings if isinstance(before, Baseline) else ()
     _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
+    starts: dict[str, Model] = {}
     if file is None:
         models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
         file = ModelFile(Model(vehicle, unite_effects(*models)))
+        own = zip(everything, (model for side in models for model in side), strict=True)
+        starts = {manifest.run: model for manifest, model in own if model is not None}
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     if isinstance(before, Baseline):
         file = replace(file, fit={**file.fit, "input": before.source.value})
     sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
-    both = read_under(file, sides, source, known=known)
+    both = read_under(file, sides, source, known=known, starts=starts)
     slips = {one.run: measure_slip(one.read("slip"), both.source) for one in everything}
     names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
     return replace(
@@ -201,6 +205,7 @@ def read_under(
     source: str | None = None,
     *,
     known: Sequence[RunReading] = (),
+    starts: Mapping[str, Model] = MappingProxyType({}),
 ) -> Sides:
     """Fit a model to the runs of both sides.
 
@@ -209,6 +214,8 @@ def read_under(
         runs: runs of both sides; if BEFORE has none, the values of the model take its place.
         source: `command` or `measured`; None chooses.
         known: estimates of BEFORE from a baseline.
+        starts: models of single runs, by name, from whose values the fit to that run starts: on ice a fit
+            that starts from the friction of asphalt does not find its own.
 
     Raises:
         JobError: ``nothing_to_compare``: no run of a side can be fitted.
@@ -220,8 +227,10 @@ def read_under(
     readings: dict[Side, list[RunReading]] = {BEFORE: list(known), AFTER: []}
     for side in (BEFORE, AFTER):
         for run in runs[side]:
+            own = starts.get(run.name, ())
+            start = file.model.swap(*(effect for effect in own if effect.id in file.model))
             try:
-                readings[side].append(read_run(run, file.model, chosen.source, labels, side))
+                readings[side].append(read_run(run, start, chosen.source, labels, side))
             except SlipError as error:
                 notes.append(f"left out: {error}")
     if not runs[BEFORE] and not known:

@@ -21,8 +21,10 @@ from pipeline.core import JSON_DIGITS, finite_or_none
 from pipeline.estimation.problem import average_sustained
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.check import check_runs
 from pipeline.job.run_results import read_diagnosis
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT
+from pipeline.store import Store
 
 pytestmark = pytest.mark.long
 
@@ -188,3 +190,14 @@ def test_the_report_and_the_tables_show_the_errors_of_the_diagnosis(analyzed: li
         for sentence in (effect["sentence"] for effect in one.diagnosis["effects"]):
             words = re.split(r"[:(]", sentence)[0].strip()
             assert words in one.report, (one.name, words)
+
+
+def test_ice_is_told_from_asphalt_by_its_friction(analyzed: list[Analyzed]) -> None:
+    """A fit to the run on ice that starts from the friction of asphalt ends beside it."""
+    root = next(folder.parent for folder in analyzed[0].folder.parents if folder.name == "runs")
+    store = Store(root)
+    runs = {manifest.run.rpartition("/")[2]: manifest for manifest in store.survey().manifests}
+    dry = [runs["warthog_wheels_asphalt"], runs["warthog_wheels_asphalt_2024_8_7_11h30s30"]]
+    found = check_runs(dry, [runs["warthog_wheels_ice_2024_7_30_16h30s21"]], store)
+    assert found.list_status("changed") == ["contact_friction.friction"]
+    assert found.changes["contact_friction.friction"].after < LOW_FRICTION
