@@ -11,7 +11,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import NORMAL_95, arrays
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
 from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, read_drive, tabulate_alignment
 from pipeline.run.heading import fit_gyro
 from pipeline.run.signals import STILL_MPS
@@ -43,8 +43,7 @@ _SCALED = 0.18
 """Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.81
 on `husky_snow_boreal` and 0.95 to 1.04 on the other recordings."""
 _FEWEST_BLOCKS = 60
-"""Half seconds of commands, 30 s, that distinguish a gain from a lag; half and double change no finding of
-two recordings."""
+"""Half seconds that tell a gain from a lag; half and double change no finding of two recordings."""
 
 
 @dataclass(frozen=True)
@@ -65,9 +64,8 @@ class CommandScale:
 def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     """Compare steady commanded wheel speeds with measured ones.
 
-    Only the slower half of the steps is used: there the drive does not saturate, and a wrong scale is
-    constant. If a body command has too few steady steps, the gain of a lag from command to wheels gives the
-    controller's multiplier.
+    Only the slower half of the steps is used: there the drive does not saturate. If a body command has too
+    few steady steps, the gain of a lag from command to wheels gives the controller's multiplier.
 
     Args:
         samples: of the run, before any correction.
@@ -86,10 +84,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
             "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
             f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
         )
-        steady = both & samples.steady
-        if turning is None and steady.any():
-            turns = _list_ratios(*_average(samples, steady, samples.step.astype(np.int64))[1])
-            text += _contradict_scale(turns) if turns.size else ""
+        text += _contradict_scale(samples, both & samples.steady) if turning is None else ""
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
@@ -105,9 +100,12 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     return CommandScale(1.0, multiplier, (finding,))
 
 
-def _contradict_scale(turns: Floats) -> str:
-    times = f"; the sides differ {np.median(turns):.2f} times as much as commanded in the median turn"
-    return f"{times}: no single scale holds, and slip from commands in turns depends on it"
+def _contradict_scale(samples: Samples, steady: Flags) -> str:
+    asked, got = _average(samples, steady, samples.step.astype(np.int64))[1]
+    if not (slow := _find_slow(asked)).any():
+        return ""
+    times = f"{np.median(got[slow] / asked[slow]):.2f} times as much as commanded in the median turn"
+    return f"; the sides differ {times}: no single scale holds, and slip from commands in turns depends on it"
 
 
 def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
@@ -163,20 +161,24 @@ def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
 
 def _find_ratio(asked: Floats, got: Floats) -> float | None:
     """Median ratio of measured to commanded over the slower half of the steps; None if they disagree."""
-    ratio = _list_ratios(asked, got)
-    if ratio.size < _FEWEST_STEPS:
+    slow = _find_slow(asked)
+    if slow.sum() < _FEWEST_STEPS:
         return None
+    ratio, inverse = got[slow] / asked[slow], 1.0 / np.abs(asked[slow])
     middle = float(np.median(ratio))
     spread = robust_spread(ratio - middle)
-    return middle if middle > _LEAST_RATIO and spread < ONE_SCALE * middle else None
+    # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
+    mean = float(inverse.mean())
+    (level, slope), _ = fit_robustly(np.column_stack((np.ones(inverse.size), inverse - mean)), ratio)
+    is_constant = max(spread, abs(level - slope * mean - middle)) < ONE_SCALE * middle
+    return middle if middle > _LEAST_RATIO and is_constant else None
 
 
-def _list_ratios(asked: Floats, got: Floats) -> Floats:
-    """Ratios of measured to commanded in the slower half of the steps, those near a standstill left out."""
-    size = np.abs(asked)
-    slow = (size > max(0.1 * float(size.max()), STILL_MPS)) & (size < 0.5 * float(size.max()))
-    ratios: Floats = got[slow] / asked[slow]
-    return ratios
+def _find_slow(asked: Floats) -> Flags:
+    """The slower half of steps, without those near a standstill."""
+    size, most = np.abs(asked), float(np.abs(asked).max(initial=0.0))
+    slow: Flags = (size > max(0.1 * most, STILL_MPS)) & (size < 0.5 * most)
+    return slow
 
 
 def _find_gain(asked: Floats, got: Floats) -> float | None:
@@ -193,8 +195,7 @@ def _find_gain(asked: Floats, got: Floats) -> float | None:
 
 
 _LEAST_S = 0.05
-"""Least delay of encoders [s] that is corrected here; fits find shorter ones. Of the recordings six of twelve
-are shorter, the others are 0.06 to 0.27."""
+"""Least delay of encoders [s] that is corrected here; fits find shorter ones (six of twelve recordings)."""
 
 
 def measure_wheel_delay(

@@ -12,6 +12,7 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
+from pipeline.stages.align import _find_ratio
 from pipeline.stages.drive import interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
@@ -290,6 +291,7 @@ def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale:
         {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.0}},
         {"body_speed_limit": 0.7, "body_turn_limit": 0.6},
         {"deadband": 0.1},
+        {"deadband": 0.2},
         {"wheel_radius": 0.8},
     ],
     ids=str,
@@ -297,6 +299,15 @@ def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale:
 def test_trap_21_what_the_drive_does_is_no_wrong_scale(drive: TakeThrough, effects: dict[str, float]) -> None:
     taken = drive(replace(LONGER, effects=effects))
     assert {"command_scale", "controller_multiplier"} & taken.ids() == set()
+
+
+def test_trap_21_a_dead_band_is_no_scale() -> None:
+    """It takes a third of slow steps; a scale takes the same of all."""
+    asked = np.array([0.3, -0.35, 0.42, -0.5, 0.58, 0.64, -0.7, 1.5])
+    assert _find_ratio(asked, asked - 0.14 * np.sign(asked)) is None
+    assert _find_ratio(asked, 0.7 * asked) == pytest.approx(0.7)
+    alike = np.array([0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 1.5])
+    assert _find_ratio(alike, 0.7 * alike) == pytest.approx(0.7)
 
 
 def test_a_joint_state_without_wheels_is_left_out_and_the_command_serves(drive: TakeThrough) -> None:
