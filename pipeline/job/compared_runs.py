@@ -65,25 +65,22 @@ def find_material(
     *,
     trusted_only: bool,
     tables: Sequence[str] = _TABLES,
-    optional: Sequence[str] = (),
 ) -> ComparedRuns:
     """Select the current runs of the results, each recording once.
 
-    Excluded with a note are damaged results, duplicates of a recording, tables of another contract version,
-    and runs without a group; with ``trusted_only`` also runs with a finding that forbids conclusions.
+    Excluded with a note are runs with a damaged table, whichever it is, duplicates of a recording, tables
+    of another contract version, and runs without a group; with ``trusted_only`` also runs with a finding
+    that forbids conclusions.
 
     Args:
         store: the results.
         by: columns that define a group.
         trusted_only: whether findings of severity `error` exclude a run.
         tables: tables that a run must have.
-        optional: tables that a run need not have, but whose file must be intact if it does; with
-            ``trusted_only`` these include the findings.
 
     Raises:
         ComparisonError: ``by`` names no column.
     """
-    optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
     manifests: dict[str, Manifest] = {}
@@ -91,7 +88,7 @@ def find_material(
     refusals: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = read_digest(manifest)
-        reason = _doubt(manifest, tables) or _find_broken(manifest, optional)
+        reason = _doubt(manifest, tables)
         if refusal := find_run_refusal(manifest):
             refusals[manifest.run] = refusal
             reason = reason and f"no effect can be estimated: {refusal}"
@@ -160,28 +157,20 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
                 f"its table {name} has contract version {entry.contract_version} instead of "
                 f"{contract_of(name).version}; analyze its log again"
             )
-    return _find_broken(manifest, tables)
+    return _describe_damage(manifest)
 
 
 def find_run_refusal(manifest: Manifest) -> str:
     """Reason why slip is not observable in a run; empty if it is."""
-    if "findings" not in manifest.tables or _find_broken(manifest, ["findings"]):
+    if "findings" not in manifest.tables or manifest.find_damage():
         return ""
     return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
 
 
-def _find_broken(manifest: Manifest, tables: Sequence[str]) -> str:
-    """Report the first of these tables whose file is missing or of another size; empty if all are intact."""
-    for name in tables:
-        if (entry := manifest.tables.get(name)) is None:
-            continue
-        path = manifest.folder / entry.file
-        what = "gone" if not path.exists() else "damaged" if path.stat().st_size != entry.bytes else ""
-        if what:
-            return (
-                f"its table {name} is {what}; slip results verify --repair, then slip batch, makes it again"
-            )
-    return ""
+def _describe_damage(manifest: Manifest) -> str:
+    """What is wrong with the first damaged table of a run, and what to do; empty if all are intact."""
+    damage = manifest.find_damage()
+    return f"{damage.what}; {damage.hint[0].lower()}{damage.hint[1:]}" if damage else ""
 
 
 def read_digest(manifest: Manifest) -> str:

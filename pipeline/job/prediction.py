@@ -266,6 +266,7 @@ class Prediction:
         ideal_t_mrmse_m: error over 2 s of the ideal model [m].
         median_modulus: median slip speed [m/s].
         runs_used: runs whose commands and residuals represent future runs.
+        notes: excluded runs with the reasons.
     """
 
     forecast: Forecast
@@ -274,6 +275,7 @@ class Prediction:
     ideal_t_mrmse_m: Expected
     median_modulus: Expected
     runs_used: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -317,7 +319,8 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         forecast: forecast of the vehicle on the terrain.
         seed: seed of the draws.
     """
-    runs = _load_runs(store, forecast)
+    compared = _find_runs(store)
+    runs = _load_runs(compared, forecast)
     rng = np.random.default_rng(seed)
     paces = np.log([max(run.pace, 1e-6) for run in runs])
     logs = np.log([max(run.error_m, 1e-6) for run in runs]) - paces
@@ -353,7 +356,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     error, without, modulus_median = (_bound(column) for column in numbers.T)
     used = tuple(run.manifest.run for run in runs)
     vehicle = runs[0].comparison.context.vehicle
-    return Prediction(forecast, vehicle, error, without, modulus_median, used)
+    return Prediction(forecast, vehicle, error, without, modulus_median, used, compared.notes)
 
 
 def weigh_runs(there: Flags) -> Floats:
@@ -386,13 +389,14 @@ def _measure_gap(one: Complex, other: Complex) -> float:
     return float(np.sqrt(np.mean(np.abs(one - other) ** 2)))
 
 
-def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
+def _load_runs(compared: ComparedRuns, forecast: Forecast) -> list[_Driven]:
     """Load the runs on the terrain, then others, newest first, with their own models.
 
     Raises:
         JobError: ``nothing_to_drive``: no run has the input.
     """
-    named = find_estimates(store).filter(pl.col("named"), pl.col("input").cast(pl.String) == forecast.input)
+    on_input = pl.col("input").cast(pl.String) == forecast.input
+    named = compared.read_estimates().filter(pl.col("named"), on_input)
     newest = [
         name
         for side in (forecast.here, forecast.elsewhere)
@@ -400,14 +404,14 @@ def _load_runs(store: Store, forecast: Forecast) -> list[_Driven]:
     ]
     runs: list[_Driven] = []
     for name in newest:
-        manifest = store.manifest(name)
+        manifest = compared.manifests.get(name)
         if manifest is not None and len(runs) < MOST_RUNS:
             with contextlib.suppress(MotionError):
                 own = named.filter(pl.col("run") == name)
                 runs.append(_load_run(manifest, own, Input(forecast.input)))
     if not runs:
         what = f"no run of {forecast.vehicle} has the {forecast.input} input to drive again"
-        raise lack_runs("nothing_to_drive", what, store.root, "Choose the other input.")
+        raise lack_runs("nothing_to_drive", what, compared.store.root, "Choose the other input.")
     return runs
 
 
@@ -456,6 +460,7 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
         "runs_on_terrain": len(forecast.here),
         "runs_elsewhere": len(forecast.elsewhere),
         "runs_used": list(prediction.runs_used),
+        "notes": list(prediction.notes),
     }
 
 

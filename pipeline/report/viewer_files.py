@@ -1,8 +1,10 @@
 """Files for viewers and spreadsheets: a log of derived topics, layouts, tables as CSV."""
 
 import json
+import shutil
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -36,7 +38,7 @@ from pipeline.report.export_source import (
     write_findings,
     write_trail,
 )
-from pipeline.store.files import replace_file
+from pipeline.store.files import replace_file, temporary_beside
 from schemas import contract_of
 
 _BODY = "base_link"
@@ -359,7 +361,7 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
 
     Args:
         source: the run.
-        folder: output folder; created if missing.
+        folder: output folder; created if missing, and filled when all tables are written.
 
     Returns:
         The files, sorted.
@@ -367,23 +369,32 @@ def write_csv(source: ExportSource, folder: Path) -> list[Path]:
     Raises:
         ReportError: ``export_not_written``.
     """
-    written = []
-    with writing_export(where=folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    with writing_export(where=folder), _fill_folder(folder) as draft:
         for table in sorted(source.manifest.tables):
-            path = folder / f"{table}.csv"
-            part = path.with_name(f".{path.name}.part")
             heads = {name: _name_column(table, name) for name in source.columns(table)}
-            try:
-                with part.open("wb") as file:
-                    file.write(format_csv(pl.DataFrame(schema=list(heads.values()))).encode())
-                    for frame in source.batches(table):
-                        file.write(format_csv(frame, header=False).encode())
-                part.replace(path)
-            finally:
-                part.unlink(missing_ok=True)
-            written.append(path)
-    return written
+            with (draft / f"{table}.csv").open("wb") as file:
+                file.write(format_csv(pl.DataFrame(schema=list(heads.values()))).encode())
+                for frame in source.batches(table):
+                    file.write(format_csv(frame, header=False).encode())
+    return [folder / f"{table}.csv" for table in sorted(source.manifest.tables)]
+
+
+@contextmanager
+def _fill_folder(folder: Path) -> Iterator[Path]:
+    """A temporary folder whose files stand in ``folder`` when the block ends without an error."""
+    is_new = not folder.is_dir()
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    draft = temporary_beside(folder if is_new else folder / "draft")
+    draft.mkdir()
+    try:
+        yield draft
+        if is_new:
+            draft.rename(folder)
+        else:
+            for path in draft.iterdir():
+                path.replace(folder / path.name)
+    finally:
+        shutil.rmtree(draft, ignore_errors=True)
 
 
 def _name_column(table: str, name: str) -> str:

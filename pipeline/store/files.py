@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, BinaryIO, TypeAlias
 
 from pipeline.core.untrusted import walk_files
 from pipeline.store.names import (
+    NOT_AS_WRITTEN,
     QUARANTINE,
     StoreError,
     file_missing,
@@ -350,6 +351,16 @@ class Manifest:
             return self.tables[table].rows
         entry = self.tables.get(table.removeprefix(QUARANTINE))
         return None if entry is None else entry.quarantined
+
+    def find_damage(self) -> StoreError | None:
+        """What `read` raises of the first table whose file is missing or of another size; nothing is read."""
+        for entry in self.tables.values():
+            path = self.folder / entry.file
+            if not path.exists():
+                return file_missing(path)
+            if path.stat().st_size != entry.bytes:
+                return table_damaged(NOT_AS_WRITTEN, path)
+        return None
 
     def names(self) -> tuple[str, ...]:
         """Names of all tables, then of all other files."""

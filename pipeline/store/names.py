@@ -304,16 +304,20 @@ def name_damage(path: Path) -> Iterator[None]:
         raise file_missing(path) from error
     # Arrow's errors are errors of values and of files.
     except (pl.exceptions.PolarsError, OSError, ValueError) as error:
-        raise table_damaged(str(error).splitlines()[0], path) from error
+        raise table_damaged(getattr(error, "strerror", None) or NOT_AS_WRITTEN, path) from error
+
+
+NOT_AS_WRITTEN = "it is not what was written"
 
 
 def table_damaged(why: str, path: Path) -> StoreError:
     """The error for a table that cannot be trusted."""
-    hint = "Analyze the log again with --force"
-    return StoreError("table_damaged", f"the table cannot be read: {why}", where=str(path), hint=hint)
+    what = f"the table {path.stem} cannot be read: {why}"
+    return StoreError("table_damaged", what, where=str(path), hint="Analyze the log again with --force")
 
 
 def file_missing(path: Path) -> StoreError:
     """The error for a file that a manifest names and that is not there."""
     hint = "slip results verify --repair has the next slip batch make it again"
-    return StoreError("file_missing", "a file of the results is gone", where=str(path), hint=hint)
+    what = f"the file {path.name} of the results is gone"
+    return StoreError("file_missing", what, where=str(path), hint=hint)

@@ -89,7 +89,11 @@ def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
     found = follow(store)
     assert "run_00" not in " ".join(found.keys)
     (note,) = [note for note in found.notes if "run_00" in note]
-    assert note.startswith(f"left out, its table {table} is {what}; slip results verify --repair")
+    said = {
+        "gone": f"the file {table}.parquet of the results is gone; slip results verify --repair",
+        "damaged": f"the table {table} cannot be read: it is not what was written; analyze the log again",
+    }
+    assert note.startswith(f"left out, {said[what]}")
 
 
 def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,6 +18,7 @@ from pipeline.job.prediction import weigh_runs
 from pipeline.models import Model, find_effect, read_model
 from pipeline.run import MotionError
 from pipeline.run.windows import cut_run, find_driven
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -190,6 +192,29 @@ def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.Captu
     )
     assert (code, error.count("\n")) == (1, 1)
     assert "husky_a200" in error
+
+
+def test_a_run_with_a_damaged_table_is_left_out_and_named_by_all_of_the_fleet(
+    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    known = tmp_path / "results"
+    shutil.copytree(fleet / "results", known)
+    damaged = Store(known).manifests()[1]
+    path = damaged.path("poses")
+    path.write_bytes(path.read_bytes()[:1000])
+    why = "the table poses cannot be read: it is not what was written"
+    note = f"left out, {why}; analyze the log again with --force: {damaged.run}"
+    there = ("--vehicle", "husky_a200", "--terrain", "tile", "--input", "measured")
+    for words in (("fit",), ("predict", *there), ("trend",)):
+        code, out, error = run_slip(capsys, "fleet", *words, "--results", str(known), "--json")
+        assert (code, error) == (0, "")
+        assert note in json.loads(out)["notes"]
+        assert f"! {note}" in run_slip(capsys, "fleet", *words, "--results", str(known))[1]
+    asked = ("export", damaged.run, "--to", "csv", "--file", str(tmp_path / "csv"))
+    code, out, error = run_slip(capsys, *asked, "--results", str(known))
+    assert (code, out) == (1, "")
+    assert error.endswith(f"/poses.parquet: {why}. Analyze the log again with --force.\n")
+    assert [one.name for one in tmp_path.iterdir()] == ["results"]
 
 
 def test_a_few_seconds_are_fitted_with_the_fleet_before(

@@ -424,4 +424,9 @@ def test_a_table_that_is_cut_leaves_no_part_of_a_file(results: Path, tmp_path: P
     path.write_bytes(data)
     with pytest.raises(StoreError, match="cannot be read"):
         write_csv(ExportSource(manifest), tmp_path / "csv")
-    assert list((tmp_path / "csv").glob(".*")) == []
+    assert [each.name for each in tmp_path.iterdir()] == ["results"]
+    (tmp_path / "csv").mkdir()
+    (tmp_path / "csv" / "aggregates.csv").write_text("the one before")
+    with pytest.raises(StoreError, match="cannot be read"):
+        write_csv(ExportSource(manifest), tmp_path / "csv")
+    assert [each.read_text() for each in (tmp_path / "csv").iterdir()] == ["the one before"]
