@@ -166,9 +166,13 @@ class Looker:
             kind, leads_to = known
             if kind in kinds:
                 kinds[kind][entry.name] = leads_to
-            elif entry.name.endswith(SUFFIXES):
+            # Whether a link that leads nowhere was one to a folder, its name does not tell.
+            elif kind in _DEAD or entry.name.endswith(SUFFIXES):
                 self.skip(path, kind)
         return number, Folder(folder, kinds["folder"], kinds["file"])
+
+
+_DEAD = (_TO_NOTHING, _TO_ITSELF) = ("it is a link to nothing", "it is a link to itself")
 
 
 def _list(path: Path) -> tuple[tuple[int, int], list[os.DirEntry[str]]]:
@@ -184,7 +188,7 @@ def _follow(entry: os.DirEntry[str]) -> tuple[str, Path]:
     except OSError as error:
         if error.errno != errno.ELOOP:
             raise
-        return "it is a link to itself", Path(entry.path)
+        return _TO_ITSELF, Path(entry.path)
 
 
 def _find_kind(entry: os.DirEntry[str]) -> str:
@@ -194,7 +198,7 @@ def _find_kind(entry: os.DirEntry[str]) -> str:
     if entry.is_file():
         return "file"
     if entry.is_symlink() and not os.path.exists(entry.path):  # noqa: PTH110 - not of a path, but of an entry
-        return "it is a link to nothing"
+        return _TO_NOTHING
     return "it is a pipe, a socket or a device, not a file"
 
 

@@ -101,6 +101,9 @@ KINDS: dict[str, Kind] = {
     "a link to nothing": Kind(
         lambda folder, _: (folder / "x.mcap").symlink_to("gone"), "skipped", "nothing", 3
     ),
+    "a link to a folder that is gone": Kind(
+        lambda folder, _: (folder / "old").symlink_to("/gone/folder"), "skipped", "nothing", 3
+    ),
     "a pipe": Kind(lambda folder, _: os.mkfifo(folder / "x.mcap"), "skipped", "a pipe", 3),
     "a link to a device": Kind(
         lambda folder, _: (folder / "x.mcap").symlink_to("/dev/zero"), "skipped", "a device", 3
