@@ -162,17 +162,14 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Show topics, rates, gaps, clocks and damage of a log.
 
-    Says which topics would serve, and why.
+    Says which topics would serve, and why; or why the log cannot be analyzed.
 
     Args:
         json: print one JSON object.
     """
     from pipeline.job.keys import inspect_log  # noqa: PLC0415 - heavy
 
-    options = build_options(choices)
-    seen = inspect_log(
-        log, config=options.config, overrides=options.overrides, max_inflated=options.max_inflated
-    )
+    seen = inspect_log(log, build_options(choices))
     print_result(_log_as_json(seen), lambda: _format_log(seen), json=json)
     return LOSSY if seen.losses else CLEAN
 
@@ -208,7 +205,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
             if seen.choice
             else {}
         ),
-        "problem": seen.problem or None,
+        "problem": None if seen.problem is None else str(seen.problem),
     }
 
 
@@ -246,7 +243,8 @@ def _format_log(seen: Inspection) -> list[str]:
         lines += _format_ratings(seen.choice.ratings)
         lines += [f"note      {finding.text}" for finding in seen.choice.findings]
     if seen.problem:
-        lines.append(f"problem   {seen.problem}")
+        why = f"{seen.problem.what}. {seen.problem.hint.rstrip('.')}."
+        lines.append(f"problem   the log cannot be analyzed: {why}")
     return lines
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from pipeline.core import SlipError, guess_names
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
-from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose
+from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
     ChannelInfo,
     LogIndex,
@@ -36,7 +36,6 @@ from pipeline.sources import (
     Sources,
     Vehicle,
     choose_sources,
-    find_preset,
     load_configuration,
 )
 from pipeline.sources.message_types import MessageType, find_type, plain_type
@@ -86,17 +85,21 @@ def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> L
         path, given=options.config, fleet=options.fleet, overrides=options.overrides
     )
     recorded = index.deployment
-    if not index.channels:
-        what = "no message of the log can be read" if index.losses else "the log holds no message"
-        hint = "Check that the recording was not cut off before its first message."
-        what += blame_damage(index.losses)
-        raise JobError("log_without_messages", what, where=str(path), hint=hint)
+    _require_messages(index)
     chosen = choose(index, configuration, options.overrides)
     _require_sources(chosen.sources, index, options)
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def _require_messages(index: LogIndex) -> None:
+    if not index.channels:
+        what = "no message of the log can be read" if index.losses else "the log holds no message"
+        hint = "Check that the recording was not cut off before its first message."
+        what += blame_damage(index.losses)
+        raise JobError("log_without_messages", what, where=str(index.path), hint=hint)
 
 
 def _require_sources(sources: Sources, index: LogIndex, options: Options) -> None:
@@ -201,14 +204,14 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Health of a log: index, topics, losses, data without checksum, and the topics that would be used."""
+    """Health of a log: index, topics, losses, data without checksum, topics to use, and why it is refused."""
 
     index: LogIndex
     topics: tuple[TopicHealth, ...]
     losses: tuple[Loss, ...]
     notes: tuple[str, ...]
     choice: Choice | None
-    problem: str
+    problem: SlipError | None
     unchecked: str = ""
 
     @property
@@ -219,8 +222,8 @@ class Inspection:
     @property
     def vehicle(self) -> Vehicle | None:
         """The vehicle; None if it is unknown."""
-        known = self.choice is not None and not self.problem and self.choice.vehicle.id != UNKNOWN_VEHICLE
-        return self.choice.vehicle if known and self.choice is not None else None
+        known = None if self.choice is None else self.choice.vehicle
+        return known if known is not None and known.id != UNKNOWN_VEHICLE else None
 
     @property
     def sources(self) -> Sources | None:
@@ -228,23 +231,19 @@ class Inspection:
         return self.choice.sources if self.choice is not None else None
 
 
-def inspect_log(
-    path: Path, *, config: Path | None, overrides: Mapping[str, object], max_inflated: int | None = None
-) -> Inspection:
+def inspect_log(path: Path, options: Options) -> Inspection:
     """Inspect a log.
 
     Args:
         path: the recording.
-        config: configuration file to use instead of the one beside the log.
-        overrides: configuration values from the command line, nested like the file.
-        max_inflated: limit of the decompressed size of its chunks [bytes]; None for one by its file size.
+        options: options of the user.
 
     Raises:
         LogError: the log cannot be read.
         ConfigurationError: the configuration is wrong.
     """
-    index = open_log(path, max_inflated=max_inflated)
-    configuration = load_configuration(path, given=config, overrides=overrides)
+    index = open_log(path, max_inflated=options.max_inflated)
+    configuration = load_configuration(path, given=options.config, overrides=options.overrides)
     channels = [channel for channel in index.channels if channel.message_count]
     data = read_topics(index, [Wanted(topic, ()) for topic in dict.fromkeys(c.topic for c in channels)])
     times = {columns.channel_id: (columns.log_time, columns.header_time) for columns in data.topics}
@@ -252,7 +251,7 @@ def inspect_log(
         _measure_topic(channel, data.readable, *times.get(channel.id, (np.zeros(0, dtype=np.int64), None)))
         for channel in index.channels
     )
-    choice, problem = _choose(index, configuration, overrides)
+    choice, problem = _choose(index, configuration, options)
     notes = data.notes + tuple(
         f"{count} messages of {topic} are byte-for-byte copies of others: each counts once"
         for topic, count in data.repeated.items()
@@ -290,22 +289,27 @@ def _measure_rate(periods: Floats, gaps: Flags) -> float | None:
 
 
 def _choose(
-    index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]
-) -> tuple[Choice | None, str]:
-    """Vehicle and sources as an analysis would choose them; an error is returned as text, not raised."""
+    index: LogIndex, configuration: Configuration, options: Options
+) -> tuple[Choice | None, SlipError | None]:
+    """Vehicle and sources as an analysis chooses them; its error is returned, not raised."""
+    chosen: Choice | None = None
     try:
-        return choose(index, configuration, overrides), ""
+        _require_messages(index)
+        chosen = choose(index, configuration, options.overrides)
+        _require_sources(chosen.sources, index, options)
     except SlipError as error:
-        problem = str(error)
-    # The choice of topics hardly depends on the vehicle: any differential one replaces an unknown one.
-    stand_in = find_preset("husky_a200")
-    if stand_in is None:
-        return None, problem
+        return chosen or _choose_by_name(index, configuration), error
+    return chosen, None
+
+
+def _choose_by_name(index: LogIndex, configuration: Configuration) -> Choice | None:
+    """Sources of a log whose vehicle is unknown; None if they cannot be chosen."""
+    stand_in = make_stand_in(index, configuration)
     try:
         sources = choose_sources(index.channels, configuration, stand_in, where=str(index.path))
     except SlipError:
-        return None, problem
-    return Choice(stand_in, "fitted", sources), problem
+        return None
+    return Choice(stand_in, "fitted", sources)
 
 
 def find_run(text: str, store: Store) -> Manifest:

@@ -224,7 +224,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     except ConfigurationError as error:
         if error.code != "vehicle_unknown" or configuration.vehicle.preset is not None:
             raise
-        problem, vehicle, source = error, _stand_in(index, configuration), "fitted"
+        problem, vehicle, source = error, make_stand_in(index, configuration), "fitted"
     channels, sources, findings = _leave_out_silent(index, configuration, vehicle)
     if source not in {"flag", "configuration"} and _asks_sideways(index, vehicle, sources):
         vehicle = find_preset(vehicle.sideways_preset) or vehicle
@@ -237,7 +237,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     recorded = find_preset(index.deployment.get("vehicle") or "")
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
     findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
-    if sources.command is None and sources.wheels is not None:
+    if sources.command is None and sources.wheels is not None and sources.pose is not None:
         text = "the log holds no command: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
@@ -278,7 +278,7 @@ def _name_vehicle(
     return vehicle, recognized.source
 
 
-def _stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
+def make_stand_in(index: LogIndex, configuration: Configuration) -> Vehicle:
     """Placeholder vehicle of the kind that the topics suggest; with unit geometry, gains are lengths."""
     types = {channel.type_name for channel in index.channels if channel.message_count != 0}
     steered = any(name.startswith(_STEERED) for name in types)

@@ -75,6 +75,13 @@ def test_a_log_that_cannot_be_analyzed_gets_one_line(
         assert word in done.stderr
     assert list(tmp_path.rglob("*.parquet")) == []
     assert list(tmp_path.rglob("manifest.json")) == []
+    seen = run_verb("inspect", field / name)
+    if seen.returncode == 1:
+        assert seen.stderr == done.stderr
+    else:
+        why = done.stderr.removeprefix(f"slip: {field / name}: ")
+        assert seen.stdout.endswith(f"\nproblem   the log cannot be analyzed: {why}")
+        assert "it is analyzed" not in seen.stdout
 
 
 def test_a_truncated_log_is_analyzed_up_to_the_cut(field: Path, tmp_path: Path) -> None:
