@@ -217,7 +217,7 @@ def _format_log(seen: Inspection) -> list[str]:
     lines = [
         f"log       {index.path}",
         f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
-        f"          {_format_count(seen)} in {index.chunk_count} chunks",
+        f"          {_format_count(seen)}",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"
         + (f", unchecked: {seen.unchecked}" if seen.unchecked else ""),
@@ -226,7 +226,7 @@ def _format_log(seen: Inspection) -> list[str]:
     lines += [f"  note    {note}" for note in seen.notes]
     for name, record in index.metadata.items():
         lines.append(
-            f"metadata  {name}: " + ", ".join(f"{key} = {shorten(value)}" for key, value in record.items())
+            f"metadata  {name}: " + ", ".join(f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items())
         )
     lines += ["", *_format_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
@@ -249,10 +249,11 @@ def _format_log(seen: Inspection) -> list[str]:
 
 
 def _format_count(seen: Inspection) -> str:
-    """Number of messages that can be read, and of how many where some cannot."""
-    stated = seen.index.message_count
+    """Number of messages that can be read, of how many where some cannot, and in how many chunks."""
+    stated, chunks = seen.index.message_count, seen.index.chunk_count
     some = f" of {stated}" if seen.messages < stated else ""
-    return f"{seen.messages}{some} messages"
+    parts = f" in {chunks} chunk{'s' * (chunks != 1)}" if chunks else ""
+    return f"{seen.messages}{some} messages{parts}"
 
 
 def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import bz2
 import os
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from collections.abc import Set as AbstractSet
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -100,7 +100,9 @@ def catalog_bag(source: ByteSource, container: str) -> Catalog:
         if any(catalog.counts.values()):
             catalog.start_ns = max(0, int(metadata.start_time))
             catalog.end_ns = min(_LAST_TIME, int(metadata.end_time) - 1)
-        catalog.compressions = {_name_compression(chunk) for chunk in getattr(reader, "chunks", {}).values()}
+        chunks: Mapping[int, Any] = getattr(reader, "chunks", {})
+        catalog.bag_chunks = len(chunks)
+        catalog.compressions = {_name_compression(chunk) for chunk in chunks.values()}
     if not is_whole(source.read_at(0, LONGEST_HEAD), source.size):
         text = f"the {container} is shorter than it says of itself: its end is missing"
         catalog.losses.append(Loss("truncated", text))

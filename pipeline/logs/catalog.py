@@ -89,7 +89,7 @@ class Catalog:
 
     ``container`` is the kind of file, empty for MCAP. ``most_inflated`` is the user's limit of the inflated
     size of a bag [bytes], counted while it is read. ``metadata`` and ``attachments`` are in the order of the
-    file, ``side_records`` are their offsets, lengths and names. ``counts`` are messages by channel number.
+    file, ``bag_chunks`` is the number of chunks of a bag, which has no spans, ``side_records`` are their offsets, lengths and names. ``counts`` are messages by channel number.
     ``covers`` is the evidence for each schema and channel of an MCAP file, ``contradicted`` are those with
     differing copies, and ``rivals`` are the copies in the summary that lost to copies in the data section.
     """
@@ -104,6 +104,7 @@ class Catalog:
     contradicted: set[tuple[type, int]] = field(default_factory=set)
     rivals: dict[tuple[type, int], Schema | Channel] = field(default_factory=dict)
     spans: list[Span] = field(default_factory=list)
+    bag_chunks: int = 0
     compressions: set[str] = field(default_factory=set)
     metadata: list[tuple[str, dict[str, str]]] = field(default_factory=list)
     attachments: list[str] = field(default_factory=list)
@@ -116,6 +117,10 @@ class Catalog:
     data_crc: int = 0
     side_records: set[tuple[int, int, str]] = field(default_factory=set)
     extras: Extras = field(default_factory=Extras)
+
+    def count_chunks(self) -> int:
+        """Number of chunks; 0 of a file that has none."""
+        return self.bag_chunks + sum(span.kind.value != "loose" for span in self.spans)
 
     def add_description(self, record: Schema | Channel, cover: Cover) -> None:
         """Add a schema or channel; of differing copies the one with more evidence is used, or the first."""

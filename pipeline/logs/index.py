@@ -305,7 +305,7 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
         profile=catalogs[0].profile,
         library=catalogs[0].library,
         compressions=tuple(sorted(set().union(*(catalog.compressions for catalog in catalogs)))),
-        chunk_count=sum(span.kind.value != "loose" for catalog in catalogs for span in catalog.spans),
+        chunk_count=sum(catalog.count_chunks() for catalog in catalogs),
         start_ns=min((each.start_ns for each in catalogs if each.start_ns is not None), default=0),
         end_ns=max((each.end_ns for each in catalogs if each.end_ns is not None), default=0),
         channels=tuple(channels.values()),

@@ -43,7 +43,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
             log.write_columns(f"/{side}_drive/velocity", "std_msgs/msg/Float64", stamps, {"data": 0.0})
         log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
     with LogWriter(folder / "no_messages.mcap") as log:
-        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
+        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile", "note": "one:\n  - two"})
     return folder
 
 
@@ -342,6 +342,7 @@ def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
     assert cut["losses"]
     assert cut["roles"]["pose"]["topic"] == "/mapping/icp_odom"
 
+    assert "note = one: - two\n" in run_verb("inspect", field / "no_messages.mcap").stdout
     unknown = run_verb("inspect", field / "no_vehicle.mcap")
     assert unknown.returncode == 0
     assert "cannot be determined" in unknown.stdout
