@@ -361,14 +361,12 @@ class ResultsLocation:
         Raises:
             StoreError: ``no_results``, there is no such folder; or the object store does not answer.
         """
-        from pipeline.store import Store, StoreError  # noqa: PLC0415 - verbs that only help need none
+        from pipeline.store import Store  # noqa: PLC0415 - verbs that only help need none
+        from pipeline.store.names import no_results  # noqa: PLC0415 - likewise
 
         if self.mirror is None:
             if not self.root.is_dir():
-                hint = "Give their folder with --results, or make them with `slip analyze` or `slip batch`"
-                raise StoreError(
-                    "no_results", "there are no results: it is not a folder", where=str(self.root), hint=hint
-                )
+                raise no_results(self.root)
             return Store(self.root)
         self.mirror.pull_index()
         return self.mirror.store

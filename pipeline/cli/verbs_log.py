@@ -225,9 +225,8 @@ def _format_log(seen: Inspection) -> list[str]:
     lines += [f"  lost    {loss.text}" for loss in seen.losses]
     lines += [f"  note    {note}" for note in seen.notes]
     for name, record in index.metadata.items():
-        lines.append(
-            f"metadata  {name}: " + ", ".join(f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items())
-        )
+        values = [f"{key} = {' '.join(shorten(value).split())}" for key, value in record.items()]
+        lines.append(f"metadata  {name}: " + ", ".join(values))
     lines += ["", *_format_topics(seen.topics), ""]
     lines.append(f"vehicle   {seen.vehicle.name if seen.vehicle else 'unknown'}")
     if seen.choice is not None and seen.vehicle is not None:

@@ -19,13 +19,17 @@ class JobError(SlipError):
 ANALYZE_FIRST = "Analyze logs first: slip analyze LOG... --results RESULTS --terrain NAME."
 
 
-def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] = ()) -> JobError:
+def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] = ()) -> SlipError:
     """Build the error that no run in `root` fits the request; `notes` list what was excluded.
 
-    A file, or a folder of other things, is no results folder: then this is the error.
+    A folder that does not exist, a file, or a folder of other things is no results folder: then this is the
+    error.
     """
+    from pipeline.store.names import no_results  # noqa: PLC0415 - heavy
     from pipeline.store.results import RUNS  # noqa: PLC0415 - heavy
 
+    if not root.exists():
+        return no_results(root)
     if root.is_file() or (root.is_dir() and any(root.iterdir()) and not (root / RUNS).is_dir()):
         what, hint = (
             "this is not a results folder",

@@ -322,7 +322,8 @@ def find_run(text: str, store: Store) -> Manifest:
     manifests = survey.manifests
     if not manifests:
         unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
-        what = f"there is no run {text!r}: no run has been analyzed yet{unread}"
+        gone = "" if store.root.exists() else ": there is no such folder"
+        what = f"there is no run {text!r}: no run has been analyzed yet{gone}{unread}"
         raise JobError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     path = spell_location(Path(text).resolve())
     fitting = [
@@ -381,39 +382,34 @@ _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m", "base_to_rear_axle
 _ROUNDING = 1e-5
 
 
-def agree_on_vehicle(model: Vehicle, runs: Mapping[str, Vehicle], owner: Owner | None) -> Vehicle:
+def agree_on_vehicle(model: Vehicle | None, runs: Mapping[str, Vehicle], owner: Owner | None) -> Vehicle:
     """Vehicle whose geometry is used for a model and runs.
 
     Args:
-        model: vehicle of the model.
+        model: vehicle of the model; None stands for that of the first run.
         runs: vehicle of each run, by name. The controller's track multiplier is always that of the
             recording.
         owner: whose geometry to use if they differ; None raises an error.
 
     Raises:
-        JobError: ``vehicle_contradiction``: they differ and ``owner`` is None, or the runs differ from each
-            other and ``owner`` is ``run``.
+        JobError: ``vehicle_contradiction``: ``owner`` is not ``model``, and the runs differ from each other;
+            or it is None, and they differ from the model.
     """
+    first, own = next(iter(runs.items()))
+    chosen = own if model is None or owner == "run" else model
     if owner == "model":
-        return model
-    chosen = model
-    if owner == "run":
-        chosen = next(iter(runs.values()))
+        return chosen
     for name, vehicle in runs.items():
-        differing = _list_differences(chosen, vehicle)
-        if not differing:
-            continue
-        if owner == "run":
-            first = next(iter(runs))
-            what = f"it is of a {_format(vehicle, differing)}, {first} of a {_format(chosen, differing)}"
-            hint = "Give runs of one vehicle, or --vehicle-of model."
+        if differing := _list_differences(own, vehicle):
+            what = f"it is of a {_format(vehicle, differing)}, {first} of a {_format(own, differing)}"
+            hint = "Give runs of one vehicle, or --vehicle-of model" + (
+                f" for that of {first}." * (not model)
+            )
             raise JobError("vehicle_contradiction", what, where=name, hint=hint)
-        raise JobError(
-            "vehicle_contradiction",
-            f"the run is of a {_format(vehicle, differing)}, the model of a {_format(model, differing)}",
-            where=name,
-            hint="Choose the geometry: --vehicle-of model, or --vehicle-of run.",
-        )
+    if differing := _list_differences(chosen, own):
+        what = f"the run is of a {_format(own, differing)}, the model of a {_format(chosen, differing)}"
+        hint = "Choose the geometry: --vehicle-of model, or --vehicle-of run."
+        raise JobError("vehicle_contradiction", what, where=first, hint=hint)
     return chosen
 
 

@@ -12,7 +12,7 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import CONFIDENCE, enumerate_texts, finite_or_none, pick
+from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
@@ -31,6 +31,7 @@ from pipeline.report.motion_view import load_motion_run, load_vehicle
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
+from pipeline.store.names import no_results
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)
@@ -76,7 +77,7 @@ def find_estimates(store: Store, *, without: Sequence[str] = ()) -> pl.DataFrame
     return compared.read_estimates().filter(pl.col("run").is_in(list(known)))
 
 
-def _lack_estimates(compared: ComparedRuns) -> JobError:
+def _lack_estimates(compared: ComparedRuns) -> SlipError:
     """Build the error that no run has estimates; a diagnosis helps, unless slip is not observable."""
     is_excluded = len(compared.refusals) == len(compared.notes) > 0
     hint = (
@@ -120,9 +121,12 @@ def read_fleet(store: Store) -> dict[str, object]:
 
     Raises:
         JobError: ``no_fleet``: there is none, or it cannot be read.
+        StoreError: ``no_results``.
     """
     path = store.root / FLEET
     hint = f"Fit it: slip fleet fit {store.root}"
+    if not store.root.is_dir():
+        raise no_results(store.root)
     if not path.is_file():
         raise JobError("no_fleet", "no fleet model was fitted to these results", where=str(path), hint=hint)
     try:

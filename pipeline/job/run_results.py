@@ -153,7 +153,7 @@ def diagnose_stored(
 
     read = [read_recording(manifest) for manifest in manifests]
     vehicles = {recording.name: vehicle for vehicle, recording in read}
-    vehicle = agree_on_vehicle(read[0][0] if known is None else known.vehicle, vehicles, owner)
+    vehicle = agree_on_vehicle(None if known is None else known.vehicle, vehicles, owner)
     recordings = [recording for _, recording in read]
     (first, *_) = diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs
     return {**first.to_json(), **read_choices(manifests[0]), LINES: list_lines(first)}

@@ -137,7 +137,7 @@ def read_runs(
             hint = "No fit to it has a meaning: give other runs."
             raise JobError("no_fit", refusal, where=manifest.run, hint=hint)
     known = {manifest.run: load_vehicle(manifest) for manifest in manifests}
-    chosen = agree_on_vehicle(vehicle or next(iter(known.values())), known, owner)
+    chosen = agree_on_vehicle(vehicle, known, owner)
     return chosen, [load_motion_run(manifest, chosen) for manifest in manifests]
 
 

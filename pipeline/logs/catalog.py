@@ -88,10 +88,11 @@ class Catalog:
     """Contents of a file.
 
     ``container`` is the kind of file, empty for MCAP. ``most_inflated`` is the user's limit of the inflated
-    size of a bag [bytes], counted while it is read. ``metadata`` and ``attachments`` are in the order of the
-    file, ``bag_chunks`` is the number of chunks of a bag, which has no spans, ``side_records`` are their offsets, lengths and names. ``counts`` are messages by channel number.
-    ``covers`` is the evidence for each schema and channel of an MCAP file, ``contradicted`` are those with
-    differing copies, and ``rivals`` are the copies in the summary that lost to copies in the data section.
+    size of a bag [bytes], counted while it is read, ``bag_chunks`` is the number of its chunks: it has no
+    spans. ``metadata`` and ``attachments`` are in the order of the file, ``side_records`` are their offsets,
+    lengths and names. ``counts`` are messages by channel number. ``covers`` is the evidence for each schema
+    and channel of an MCAP file, ``contradicted`` are those with differing copies, and ``rivals`` are the
+    copies in the summary that lost to copies in the data section.
     """
 
     container: str = ""

@@ -379,11 +379,15 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
 
 def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:
     known = [vehicle.id for vehicle in list_presets()]
-    hint = (
-        f"{guess_names(named, known)}Give --vehicle NAME (make: VEHICLE=NAME) with one of "
-        f"{', '.join(known)}; "
-        "or --wheel-radius and --track-width in metres."
-    )
+    names = ", ".join(known)
+    if named:
+        guess = guess_names(named, known)
+        hint = f"{guess}Write one of: {names}; or the vehicle's own values in its place."
+    else:
+        hint = (
+            f"Give --vehicle NAME (make: VEHICLE=NAME) with one of {names}; "
+            "or --wheel-radius and --track-width in metres."
+        )
     return ConfigurationError("vehicle_unknown", what, where=where, hint=hint)
 
 

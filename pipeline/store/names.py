@@ -316,6 +316,13 @@ def table_damaged(why: str, path: Path) -> StoreError:
     return StoreError("table_damaged", what, where=str(path), hint="Analyze the log again with --force")
 
 
+def no_results(folder: Path) -> StoreError:
+    """The error for results whose folder is not there."""
+    what = "there are no results: " + ("it is not a folder" if folder.exists() else "there is no such folder")
+    hint = "Give their folder with --results, or make them with `slip analyze` or `slip batch`"
+    return StoreError("no_results", what, where=str(folder), hint=hint)
+
+
 def file_missing(path: Path) -> StoreError:
     """The error for a file that a manifest names and that is not there."""
     hint = "slip results verify --repair has the next slip batch make it again"

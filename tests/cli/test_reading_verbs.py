@@ -12,9 +12,11 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
-from pipeline.job import Options
+from pipeline.job import JobError, Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.keys import Owner, agree_on_vehicle
 from pipeline.simulate import simulate_case
+from pipeline.sources import find_preset
 from pipeline.store import Store
 from pipeline.store.seals import seal, unseal
 
@@ -134,6 +136,24 @@ def test_a_model_of_another_vehicle_is_asked_about(
     for word in ("field/wide", "Husky", "Jackal", "wheel_radius_m", "--vehicle-of model", "--vehicle-of run"):
         assert word in line
     assert hash_tree(place / "results") == before
+
+
+@pytest.mark.parametrize("owner", [None, "run"])
+def test_runs_of_two_vehicles_get_no_choice_that_is_refused(owner: Owner | None) -> None:
+    husky, jackal = find_preset("husky_a200"), find_preset("jackal")
+    assert husky is not None
+    assert jackal is not None
+    runs = {"a": husky, "b": jackal}
+    for model, hint in ((None, "--vehicle-of model for that of a"), (jackal, "--vehicle-of model")):
+        with pytest.raises(JobError) as caught:
+            agree_on_vehicle(model, runs, owner)
+        assert caught.value.where == "b"
+        assert str(caught.value).endswith(
+            f", a of a {husky.name} (wheel_radius_m 0.165, "
+            f"track_width_m 0.55, wheelbase_m 0.512). Give runs of one vehicle, or {hint}."
+        )
+    assert agree_on_vehicle(None, runs, "model") == husky
+    assert agree_on_vehicle(jackal, runs, "model") == jackal
 
 
 def test_the_vehicle_that_is_chosen_is_the_one_that_counts(

@@ -224,7 +224,27 @@ def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> No
         (("model", "show", "folder"), "folder: this is not a model file: it is a folder. Give the TOML file"),
         (("compare", "log.mcap"), "log.mcap: this is not a results folder. Give the folder"),
         (("compare", "folder"), "folder: this is not a results folder. Give the folder"),
-        (("diagnose", "no/such"), "there is no run 'no/such': no run has been analyzed yet. Analyze"),
+        (
+            ("diagnose", "no/such"),
+            "results: there is no run 'no/such': no run has been analyzed yet: there is no",
+        ),
+        (("diagnose", "no/such", "--results", "empty"), "no run has been analyzed yet. Analyze logs first"),
+        (("export", "run", "--to", "csv"), "no run has been analyzed yet: there is no such folder. Analyze"),
+        *(
+            ((*verb, "--results", "nowhere"), "nowhere: there are no results: there is no such folder. Give")
+            for verb in (
+                ("compare",),
+                ("compare", "--causes"),
+                ("results", "status"),
+                ("results", "query", "SELECT 1"),
+                ("fleet", "fit"),
+                ("fleet", "show"),
+                ("fleet", "trend"),
+                ("fleet", "share"),
+                ("fleet", "map"),
+                ("fleet", "predict", "--vehicle", "warthog", "--terrain", "ice"),
+            )
+        ),
         (("diagnose", "no/such", "--apply", "model.toml"), "there is no run 'no/such'"),
         (("inspect", "missing.mcap"), "missing.mcap: there is no such file. Check the path."),
         (("plan", "--check", "robot.toml", "log.mcap"), "this is not a plan.toml"),
@@ -242,6 +262,7 @@ def test_a_file_of_another_kind_is_refused_in_plain_words(
     (tmp_path / "log.mcap").write_bytes(b"\x89MCAP0\r\n")
     (tmp_path / "mystery_1.mcap").touch()
     (tmp_path / "folder").mkdir()
+    (tmp_path / "empty").mkdir()
     (tmp_path / "folder" / "husky.txt").touch()
     with pytest.raises(SystemExit):
         main(["model", "new", "robot.toml", "--vehicle", "husky_a200", "--quiet"])

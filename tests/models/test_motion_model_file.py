@@ -61,7 +61,7 @@ class Tilt(LinearEffect):
         (HEAD + "[[effect]\n", 4, "not a valid TOML"),
         ('format = 7\n[vehicle]\npreset = "husky_a200"\n', 1, "format 7"),
         ("colour = 1\n" + HEAD, 1, "unknown key"),
-        ('[vehicle]\npreset = "nope"\n', 2, "no vehicle preset"),
+        ('[vehicle]\npreset = "nope"\n', 2, "no vehicle preset is called 'nope'. Write one of: "),
         ("[vehicle]\nwheel_radius_m = -1\n", 1, "not valid"),
         ("format = 1\n", 1, "no vehicle"),
         ('effects = ["nowhere.py"]\n' + HEAD, 1, "no such file of effects"),
