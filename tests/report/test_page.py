@@ -374,6 +374,18 @@ def test_summary_of_odd_kinds_is_no_reason_to_fail() -> None:
     assert outline_of(render_report(RunReport(odd, {}))).open == []
 
 
+@pytest.mark.parametrize("larger", ["drivetrain", "ground"])
+def test_the_larger_part_of_the_slip_is_not_called_most_of_it(larger: str) -> None:
+    report = make_report(duration_s=20.0)
+    split = {"drivetrain": 0.32, "ground": 0.32, "cross": 0.19, larger: 0.49}
+    page = outline_text(render_report(RunReport({**report.summary, "split": split}, report.tables)))
+    names = ["drivetrain (command to wheels)", "ground (wheels to body)"]
+    first, second = names if larger == "drivetrain" else names[::-1]
+    assert (
+        f"More of the slip from commands arises in the {first} than in the {second}; mean squares: " in page
+    )
+
+
 def test_without_measured_wheels_nothing_is_said_about_the_ground() -> None:
     page = outline_text(render_report(make_report(duration_s=20.0, measured=False)))
     assert "from wheel encoders" not in page
@@ -391,7 +403,7 @@ def test_a_grave_finding_stands_before_the_numbers() -> None:
 
 
 def test_a_lone_peak_does_not_flatten_a_figure_and_is_told(page: str) -> None:
-    assert re.search(r"peaks cut, the highest (9\.0|8\.9)\d at 5\.00 s", page)
+    assert re.search(r"peaks cut; the furthest is (9\.0|8\.9)\d m/s at 5\.00 s", page)
 
 
 def test_losses_and_findings_are_told_gravest_first(page: str) -> None:

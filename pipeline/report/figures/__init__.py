@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUT_WORDS
+from pipeline.core import INPUT_WORDS, suffix_unit
 from pipeline.report import format_number, theme
 from pipeline.report.scene import Scene, Thinned
 from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis
@@ -129,7 +129,9 @@ def title_panel(quantity: str, unit: str, shown: Range) -> Channel:
     value, time = shown.beyond
     return {
         "text": f"{quantity} [{unit}]",
-        "subtitle": f"peaks cut, the highest {format_number(value)} at {format_number(time)} s",
+        "subtitle": (
+            f"peaks cut; the furthest is {format_number(value)}{suffix_unit(unit)} at {format_number(time)} s"
+        ),
     }
 
 
