@@ -260,6 +260,11 @@ _READERS = re.compile(
 _TOKEN = re.compile(r"'[^']*'|\d[\w.]*|\w+|[^\s\w,]")
 """A text, a number, a word or a mark."""
 
+_QUESTION = re.compile(
+    r"(?>\s|\(|--[^\n]*(?:\n|$)|/\*.*?\*/)*+(?:SELECT|WITH|FROM)\b", re.IGNORECASE | re.DOTALL
+)
+"""The beginning of a query, behind comments; the engine also takes FROM before SELECT."""
+
 _LONGEST = 65_536
 """Characters of a query. Two of them make the engine recurse once (`+1`): so it does less often than where it
 crashes on the stack of `slip results query`."""
@@ -344,6 +349,7 @@ def answer_query(
             ``table_damaged``, a table has not the rows that it should have.
     """
     _check_size(sql)
+    _check_kind(sql)
     reader = None if allow_files else _READERS.search(sql.lower())
     if reader is not None:
         raise StoreError(
@@ -400,6 +406,21 @@ def _check_size(sql: str) -> None:
                 where=_shorten(sql),
                 hint="Ask in parts, with IN (...) in place of a chain of OR",
             )
+
+
+def _check_kind(sql: str) -> None:
+    """Refuse what is no question.
+
+    Raises:
+        StoreError: ``bad_query``.
+    """
+    if _QUESTION.match(sql) is None:
+        raise StoreError(
+            "bad_query",
+            "the query cannot be answered: it does not begin with SELECT or WITH",
+            where=_shorten(sql),
+            hint="Tables are asked, never changed: SELECT run, vehicle FROM runs",
+        )
 
 
 def _list_files(tables: Sequence[str], manifests: Sequence[Manifest]) -> list[Path]:

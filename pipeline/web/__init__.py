@@ -272,12 +272,20 @@ _HEAD = (
     '<meta name="color-scheme" content="light dark"><link rel="icon" href="data:,">'
 )
 
-# The page is opened by a second request: this removes the token from the address, and the browser treats
-# later requests as same-site, wherever the link was. The script preserves the selected run.
-_WELCOME = (
-    f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url=/"></noscript>'
-    '<script src="/enter.js"></script></head><body></body></html>'
-)
+_ENTRANCES = ("/", "/live")
+"""Pages that the token in the address opens."""
+
+
+def _welcome(path: str) -> HTMLResponse:
+    """The answer to an entrance with the token, which opens the page by a second request.
+
+    This removes the token from the address, and the browser treats later requests as same-site, wherever the
+    link was. The script preserves the selected run.
+    """
+    return HTMLResponse(
+        f'{_HEAD}<noscript><meta http-equiv="refresh" content="0; url={path}"></noscript>'
+        '<script src="/enter.js"></script></head><body></body></html>'
+    )
 
 
 def make_token() -> str:
@@ -336,8 +344,9 @@ class Guard:
             return None
         # Cookies are shared between ports: every workbench on a host needs its own cookie name.
         cookie = f"slip-{scope['server'][1]}"
-        if scope["path"] == "/" and self._is_token(QueryParams(scope["query_string"]).get("token", "")):
-            welcome = HTMLResponse(_WELCOME)
+        path, given = scope["path"], QueryParams(scope["query_string"]).get("token", "")
+        if path in _ENTRANCES and self._is_token(given):
+            welcome = _welcome(path)
             welcome.set_cookie(cookie, self._token, httponly=True, samesite="strict")
             welcome.set_cookie(f"{cookie}-pages", self._page_token, httponly=True, samesite="lax")
             return welcome
@@ -365,7 +374,7 @@ class Guard:
         navigates = (
             scope["method"] in _SAFE
             and headers.get("sec-fetch-mode") == "navigate"
-            and (scope["path"] == "/" or _shows_page(scope))
+            and (scope["path"] in _ENTRANCES or _shows_page(scope))
         )
         if headers.get("sec-fetch-site", "same-origin") not in _OWN_SITES and not navigates:
             return "the request comes from another site"
@@ -388,7 +397,7 @@ def strip_port(host: str) -> str:
 
 
 def _refuse(scope: Scope, code: str, why: str) -> Response:
-    if scope["path"] == "/":
+    if scope["path"] in _ENTRANCES:
         sentence = f"{why[0].upper()}{why[1:]}."
         return HTMLResponse(f"{_HEAD}</head><body><p>{sentence}</p></body></html>", status_code=_REFUSED)
     return JSONResponse({"error": {"code": code, "message": why}}, status_code=_REFUSED)

@@ -20,6 +20,7 @@ from pipeline.report.scene import RunReport, Scene, break_lines
 from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
 from pipeline.run.windows import HORIZON_S
 from pipeline.store import Manifest
+from pipeline.web import WorkbenchError
 from pipeline.web.actions import Shown
 from pipeline.web.stored_runs import read_summary
 
@@ -281,6 +282,9 @@ class FigureCache:
             shown: the model.
             tab: one of `TABS`; empty for all of them.
             stretch: index of the enlarged stretch, 0 for the one with the largest error.
+
+        Raises:
+            WorkbenchError: ``bad_request``, there is no such tab.
         """
         ids = _list_ids(tab)
         scene = self._scene(shown, stretch, with_budget=BUDGET in ids)
@@ -349,8 +353,10 @@ def _list_known() -> tuple[Figure, ...]:
 
 
 def _list_ids(tab: str) -> Collection[str]:
+    if tab and tab not in TABS:
+        raise WorkbenchError("bad_request", f"there is no tab {tab!r}", hint=f"Tabs are {', '.join(TABS)}.")
     if tab:
-        return TABS.get(tab, ())
+        return TABS[tab]
     return tuple(name for names in TABS.values() for name in names)
 
 

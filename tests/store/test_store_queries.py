@@ -69,9 +69,20 @@ def test_query_over_a_file_that_is_gone_says_how_it_is_made_again(store: Store) 
     assert (caught.value.code, caught.value.where) == ("file_missing", str(manifest.folder / "slip.parquet"))
 
 
-def test_query_cannot_remove_results(store: Store) -> None:
+@pytest.mark.parametrize(
+    "sql", ["DROP TABLE slip", "-- SELECT\n drop table slip", "SHOW TABLES", "SELECTED", ""]
+)
+def test_what_is_no_question_is_refused_and_removes_no_results(store: Store, sql: str) -> None:
     write_generation(store, "a", "k", 1)
-    store.query("DROP TABLE slip")
+    with pytest.raises(StoreError, match="does not begin with SELECT or WITH") as caught:
+        store.query(sql)
+    assert caught.value.code == "bad_query"
+    for asked in (
+        "select 500",
+        "(/* all\n */ SELECT 500 UNION SELECT 500)",
+        "-- how\nWITH a AS (SELECT 500) SELECT * FROM a",
+    ):
+        assert store.query(asked).rows() == [(500,)]
     assert store.scan("slip").collect().height == 500
 
 

@@ -164,6 +164,7 @@ def measure_ends(rows: dict[str, Any]) -> float:
 
 def test_the_first_view_shows_one_stretch_the_worst_first(workbench: Workbench) -> None:
     workbench.session(RUN)
+    assert workbench.refuse("/api/figures", run=RUN, tab="bogus")["code"] == "bad_request"
     worst = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="first"))
     assert [figure["id"] for figure in worst["shown"]] == ["paths", "stretch"]
     span = worst["stretch"]
