@@ -83,7 +83,7 @@ def plan(  # noqa: D417 - the runs document themselves
         area: free ground: length along the heading at the start, and width; the start is its middle.
         max_speed: [m/s].
         max_yaw_rate: [rad/s].
-        max_acceleration: [m/s2].
+        max_acceleration: [m/s^2].
         topic: on which the commands will be played (default: as the run recorded them).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log that came of it.

@@ -42,7 +42,7 @@ _TURN_RISE_S = 1.0
 # Added to half of the vehicle's length, towards every edge of the area.
 _MARGIN_M = 0.5
 _SHORTEST_S = 15.0
-_LONGEST_S = 3600.0
+LONGEST_S = 3600.0
 
 
 @dataclass(frozen=True)
@@ -68,9 +68,13 @@ class Limits:
     def format(self, *, steered: bool) -> str:
         """All limits with their units; ``steered`` on a car, whose turn is a steering angle."""
         turn = "rad of steering" if steered else "rad/s"
-        texts = [f"{self.speed_mps:.3g} m/s", f"{self.turn:.3g} {turn}", f"{self.acceleration_mps2:.3g} m/s2"]
-        texts.append(f"{self.turn_rate:.3g} {'rad/s of steering' if steered else 'rad/s2'}")
-        return ", ".join([*texts, f"{self.lateral_mps2:.3g} m/s2 sideways"])
+        texts = [
+            f"{self.speed_mps:.3g} m/s",
+            f"{self.turn:.3g} {turn}",
+            f"{self.acceleration_mps2:.3g} m/s^2",
+        ]
+        texts.append(f"{self.turn_rate:.3g} {'rad/s of steering' if steered else 'rad/s^2'}")
+        return ", ".join([*texts, f"{self.lateral_mps2:.3g} m/s^2 sideways"])
 
 
 def is_steered(vehicle: Vehicle) -> bool:
@@ -158,8 +162,8 @@ def parse_time(text: str) -> float:
     """
     match = re.fullmatch(r"\s*(\d+(?:\.\d+)?)\s*(s|min)?\s*", text)
     seconds = float(match[1]) * (60.0 if match[2] == "min" else 1.0) if match is not None else 0.0
-    if not _SHORTEST_S <= seconds <= _LONGEST_S:
-        what = f"{text!r} is not a time of {_SHORTEST_S:g} s to {_LONGEST_S / 60.0:g} min"
+    if not _SHORTEST_S <= seconds <= LONGEST_S:
+        what = f"{text!r} is not a time of {_SHORTEST_S:g} s to {LONGEST_S / 60.0:g} min"
         raise PlanError("bad_time", what, where="--time", hint="Write it like 60s.")
     return seconds
 
@@ -173,6 +177,8 @@ def parse_time(text: str) -> float:
 RATE_HZ = 20.0
 LEAD_S = 3.0
 """Duration of zero commands before the first motion [s]."""
+TAIL_S = 1.0
+"""Duration of zero commands at the end [s], added to the rest of the last manoeuvre."""
 REST_S = 1.0
 """Duration of zero commands after every manoeuvre [s]: delayed responses settle before the next begins."""
 _SHARES = (0.25, 0.5, 1.0)

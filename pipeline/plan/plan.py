@@ -8,14 +8,14 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import FEWEST_OF_SPREAD, finite_or_none, format_share, pick
+from pipeline.core import finite_or_none, format_share, pick
 from pipeline.core.arrays import Complex, Floats
-from pipeline.estimation.search import suggest_manoeuvre
-from pipeline.models import Effect, Excitation, find_effect, list_effects
+from pipeline.models import Effect, list_effects
 from pipeline.models.parameter import Largest
 from pipeline.plan import (
     LEAD_S,
     RATE_HZ,
+    TAIL_S,
     Area,
     Chooser,
     Commands,
@@ -28,6 +28,7 @@ from pipeline.plan import (
     list_manoeuvres,
     wait,
 )
+from pipeline.plan.open_questions import Impossible, explain_open, leave_open, list_reasons
 from pipeline.plan.questions import DECIDED_T, Answerable, Judge, Question, Separation
 from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
@@ -35,19 +36,13 @@ _MODELS = 12
 # Sizes of effects that may act unnoticed, as multiples of the usual one: the largest is not always farthest.
 _SIZES = (0.7, 1.0, 1.5, 2.0)
 _STEP_S = 1.0
-# Duration of zero commands at the end [s], added to the rest of the last manoeuvre.
-_TAIL_S = 1.0
 # Factors on the goals of single manoeuvres, raised until the whole plan reaches its goals.
 _RESERVES = (1.1, 1.4, 1.8)
 # Multiple of the goals; more driving adds nothing. Spare time is driven if it narrows an interval by a tenth.
 _AMPLE = 2.0
 _LEAST_GAIN = 0.1
 # A shorter rest is not reported.
-_HIDDEN = "not observable within these limits and this time"
-_ROOM = "give a larger --area and --time, or a higher --max-speed or --max-acceleration"
 _LEAST_REST_S = 5.0
-_MOST_REPEATS = 10
-"""Largest number of repetitions that is suggested: beyond it another drive is better than a longer one."""
 
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
@@ -77,15 +72,6 @@ class ExpectedGain:
     expected: float
     goal: float
     unit: str = "1"
-
-
-@dataclass(frozen=True)
-class Impossible:
-    """A question that the plan leaves open, and the reason."""
-
-    question: str
-    effects: tuple[str, ...]
-    because: str
 
 
 @dataclass(frozen=True)
@@ -130,35 +116,22 @@ class Plan:
         """Use of the time after the last decision, or why it is not driven; empty without a drive."""
         duration = self.commands.duration_s
         last = max((one.decided_after_s for one in self.promises), default=duration)
+        intervals = any(one.kind == "interval" for one in self.promises)
         sentences = []
         if self.promises and duration - last >= _LEAST_REST_S:
-            sentences.append(
-                f"no further decision after {last:.0f} s; the rest of the {duration:.0f} s narrows intervals"
-            )
+            after = f"no further decision after {last:.0f} s"
+            rest = f"; the rest of the {duration:.0f} s narrows intervals"
+            sentences.append(after + (rest if intervals else f" of {duration:.0f} s"))
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
-            intervals = any(one.kind == "interval" for one in self.promises)
             sentences.append(
                 f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}"
             )
         return "; ".join(sentences)
 
     def list_impossible(self) -> list[str]:
-        """Open questions, one text per reason; a remark that several share comes once, at the end."""
-        questions: dict[frozenset[str], tuple[str, list[str]]] = {}
-        is_narrow = False
-        for one in self.impossible:
-            reason = one.because
-            if reason.startswith(_HIDDEN):
-                is_narrow |= reason.endswith(_ROOM)
-                reason = reason.removeprefix(f"{_HIDDEN}; to observe it: ").removesuffix(f"; {_ROOM}")
-            _, asked = questions.setdefault(frozenset(reason.split("; ")), (reason, []))
-            asked.append(one.question)
-        texts = [f"{'; '.join(asked)}: {reason}" for reason, asked in questions.values()]
-        if is_narrow:
-            what = "driving that observes the above does not fit into these limits and this time"
-            texts.append(f"{what}: {_ROOM}")
-        return texts
+        """Open questions, one text per reason."""
+        return list_reasons(self.impossible)
 
     def to_json(self) -> dict[str, object]:
         """The documented keys of `slip plan --json`, and others."""
@@ -183,7 +156,7 @@ class Plan:
                 for one in self.promises
             ],
             "impossible": [
-                {"question": one.question, "effects": list(one.effects), "because": one.because}
+                {**pick(one, "question", "because", "reached"), "effects": list(one.effects)}
                 for one in self.impossible
             ],
         }
@@ -240,8 +213,8 @@ def make_plan(
         asked = [*questions, *(later if not best.impossible else ())]
         if len(asked) > len(questions):
             chooser = _make_chooser(knowledge, asked, request, library, models)
-        longer = [library[number] for number in chooser.extend(order, _AMPLE)]
-        fuller = _rehearse(knowledge, asked, request.area, longer, models)
+        longer = chooser.extend(order, _AMPLE)
+        fuller = _rehearse(knowledge, asked, request.area, [library[number] for number in longer], models)
         # Questions of second priority may stay open without a report.
         texts = {one.text for one in questions}
         missed = tuple(one for one in fuller.impossible if one.question in texts)
@@ -249,10 +222,14 @@ def make_plan(
         # Questions of second priority must not reduce the gain for the first.
         is_covered = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
         if is_covered and (gain >= _LEAST_GAIN or len(fuller.promises) > len(best.promises)):
-            best, gain = fuller, 0.0
+            best, gain, order = fuller, 0.0, longer[: len(fuller.manoeuvres)]
     if not best.promises:
         # Without an expected answer nothing is driven.
-        best = replace(best, manoeuvres=(), starts=())
+        undriven = tuple(replace(one, reached="") for one in best.impossible)
+        best, order = replace(best, manoeuvres=(), starts=(), impossible=undriven), []
+    if chooser is not None:
+        reasons = tuple(explain_open(one, chooser, order) for one in best.impossible)
+        best = replace(best, impossible=reasons)
     commands, ways = best.commands, best.ways
     return Plan(
         vehicle=knowledge.vehicle.id,
@@ -307,7 +284,7 @@ def _rehearse(
     """Longest beginning of a sequence that stays inside the area, and its expected gain."""
     chosen = list(chosen)
     while True:
-        commands = join([wait(LEAD_S), *(one.commands for one in chosen), wait(_TAIL_S)])
+        commands = join([wait(LEAD_S), *(one.commands for one in chosen), wait(TAIL_S)])
         ends = LEAD_S + np.cumsum([0.0, *(one.commands.duration_s for one in chosen)])
         rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, ends)
         ways = np.array([rehearsal.trace(effects)[0] for effects in models])
@@ -317,7 +294,7 @@ def _rehearse(
         chosen.pop()
     starts = tuple(np.round(ends[:-1], 3).tolist())
     if not chosen:
-        nothing = tuple(Impossible(one.text, one.effects, _advise(one)) for one in questions)
+        nothing = tuple(Impossible(one.text, one.effects, "") for one in questions)
         return _Trial((), starts, commands, ways, (), nothing, 0.0)
     promised = _expect_answers(knowledge, questions, rehearsal, commands.duration_s)
     return _Trial(tuple(chosen), starts, commands, ways, *promised)
@@ -407,7 +384,7 @@ def _make_chooser(
         own = np.exp(-1j * turned[:, :1]) * (paths - paths[:, :1])
         shapes.append(Shape(own, turned[:, -1] - turned[:, 0]))
     answerable = Judge(rehearsal, knowledge, edges).judge(questions)
-    time_s = request.time_s - LEAD_S - _TAIL_S
+    time_s = request.time_s - LEAD_S - TAIL_S
     chooser = Chooser(answerable, durations, shapes, request.area, time_s)
     if not any(chooser.fits([one]) for one in np.flatnonzero(durations <= time_s).tolist()):
         raise PlanError(
@@ -432,13 +409,7 @@ def _expect_answers(
         if reached >= 1.0:
             promises.append(_expect_answer(one, edges, measured))
         else:
-            impossible.append(
-                Impossible(
-                    one.question.text,
-                    one.question.effects,
-                    _explain(one, full, measured, duration_s),
-                )
-            )
+            impossible.append(leave_open(one, full))
     promises.sort(key=lambda answer: answer.decided_after_s)
     return tuple(promises), tuple(impossible), answered
 
@@ -463,37 +434,3 @@ def _expect_answer(one: Answerable, edges: Floats, measured: float) -> ExpectedG
     return ExpectedGain(
         question.text, question.effects, "interval", after, measured, question.goal, number.unit
     )
-
-
-def _explain(one: Answerable, full: Floats, measured: float, duration_s: float) -> str:
-    """Why a question stays open, and what would decide it."""
-    question = one.question
-    repeats = _count_repeats(one, full)
-    if repeats is None:
-        return _advise(question)
-    remark = (
-        f"it takes about {repeats} times as much: give --time {repeats * duration_s:.0f}s and a larger --area"
-    )
-    if isinstance(question, Separation):
-        enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
-    else:
-        bound = float(one.bound(full))
-        enough = bound <= question.goal
-        what = f"+- {measured:.2g}, or up to {bound:.2g} (goal {question.goal:.2g})"
-    if enough:
-        return f"fewer than {FEWEST_OF_SPREAD:g} stretches of the plan excite it; {remark}"
-    return f"the plan reaches {what}; {remark}"
-
-
-def _count_repeats(one: Answerable, full: Floats) -> int | None:
-    """Repetitions of the whole plan that would answer a question; None if even many do not."""
-    repeats = range(2, _MOST_REPEATS + 1)
-    return next((count for count in repeats if float(one.answer(count * full, _RESERVES[1])) >= 1.0), None)
-
-
-def _advise(question: Question) -> str:
-    effects = [find_effect(name)() for name in question.effects]
-    advice = suggest_manoeuvre(*effects)
-    if not any(Excitation.SLOPE in effect.needs for effect in effects):
-        advice += f"; {_ROOM}"
-    return f"{_HIDDEN}; to observe it: {advice}"

@@ -34,7 +34,8 @@ from pipeline.plan import (
     parse_time,
     wait,
 )
-from pipeline.plan.plan import _HIDDEN, _ROOM, Impossible, Plan, Request, find_largest, make_plan
+from pipeline.plan.open_questions import Impossible
+from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
     PROTOCOLS,
@@ -308,18 +309,37 @@ def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     assert "slope" in plan.impossible[0].because
 
 
-def test_what_a_short_plan_leaves_open_says_the_time_that_decides_it() -> None:
+def _ask_for(effect: str, seconds: float, area: str, speed_mps: float = 1.0) -> Plan:
     vehicle = _find("husky_a200")
-    knowledge, limits = assume(vehicle), choose_limits(vehicle)
+    knowledge, limits = assume(vehicle), choose_limits(vehicle, speed_mps=speed_mps)
+    questions = ask_presence(knowledge, [effect], find_largest(knowledge, limits, seconds))
+    return make_plan(knowledge, questions, Request(limits, parse_area(area, vehicle), seconds))
 
-    def plan(seconds: float) -> Plan:
-        questions = ask_presence(knowledge, ["drive_lag"], find_largest(knowledge, limits, seconds))
-        return make_plan(knowledge, questions, Request(limits, parse_area("20x10m", vehicle), seconds))
 
-    (left,) = plan(15.0).impossible
-    asked = re.search(r"--time (\d+)s and a larger --area", left.because)
+@pytest.mark.parametrize(
+    ("effect", "seconds", "area", "reason"),
+    [
+        ("drive_lag", 15.0, "20x10m", r"give --time (\d+)s"),
+        ("drive_lag", 60.0, "3x3m", "give a larger --area"),
+        ("speed_slip", 15.0, "20x10m", r"give a larger --area, and --time (\d+)s"),
+    ],
+    ids=["time", "area", "both"],
+)
+def test_what_a_plan_leaves_open_says_what_decides_it(
+    effect: str, seconds: float, area: str, reason: str
+) -> None:
+    (left,) = _ask_for(effect, seconds, area).impossible
+    asked = re.fullmatch(reason, left.because)
     assert asked
-    assert [one.question for one in plan(float(asked[1])).promises] == [left.question]
+    wanted_s = float(asked[1]) if asked.groups() else seconds
+    wanted_area = "80x80m" if "--area" in left.because else area
+    assert [one.question for one in _ask_for(effect, wanted_s, wanted_area).promises] == [left.question]
+
+
+def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reaches() -> None:
+    (left,) = _ask_for("speed_slip", 15.0, "20x10m", 0.3).impossible
+    assert left.because.startswith("no drive of up to 110 s within these limits decides it; what shows it: ")
+    assert re.fullmatch(r"at best t = [1-4]\.\d of 5", left.reached)
 
 
 def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
@@ -330,28 +350,20 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     assert first.endswith("answers an open question: no file is written")
     assert limits.startswith("limits  ")
     steepest = float(np.abs(np.diff(plan.commands.turn)).max()) * RATE_HZ
-    (stated,) = re.findall(r"([\d.]+) rad/s2", limits)
+    (stated,) = re.findall(r"([\d.]+) rad/s\^2", limits)
     assert steepest <= 1.001 * float(stated)
     assert why == "not decided  a or b: too small"
 
 
 def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
-    hidden, room = _HIDDEN, _ROOM
-    two = ("turn both ways; drive backward", "drive backward; turn both ways")
-    narrow = replace(
-        plan,
-        impossible=(
-            *(
-                Impossible(f"q{i}", (), f"{hidden}; to observe it: {text}; {room}")
-                for i, text in enumerate(two)
-            ),
-            Impossible("q2", (), f"{hidden}; to observe it: drive on a slope"),
-        ),
+    two = ("no drive; turn both ways; drive backward", "no drive; drive backward; turn both ways")
+    questions = (
+        *(Impossible(f"q{i}", (), reason, f"at best t = {i}.0 of 5") for i, reason in enumerate(two)),
+        Impossible("q2", (), "give a larger --area"),
     )
-    assert narrow.list_impossible() == [
-        "q0; q1: turn both ways; drive backward",
-        "q2: drive on a slope",
-        f"driving that observes the above does not fit into these limits and this time: {room}",
+    assert replace(plan, impossible=questions).list_impossible() == [
+        "q0 (at best t = 0.0 of 5); q1 (at best t = 1.0 of 5): no drive; turn both ways; drive backward",
+        "q2: give a larger --area",
     ]
 
 
