@@ -396,17 +396,24 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.over_runs import follow_trend, summarize_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import (  # noqa: PLC0415 - heavy
+        check_limits,
+        follow_trend,
+        summarize_trend,
+        write_trend,
+    )
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):
         raise SlipError(
             "bad_limit", f"{threshold} is not a threshold", hint="Write --threshold 0.1 for a tenth"
         )
+    limits = dict(map(_read_limit, limit))
+    check_limits(limits)
     use_key(key)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
+    followed = follow_trend(store, names, threshold=threshold, limits=limits)
     page = write_trend(store, followed)
     print_result(
         {**summarize_trend(followed), "page": str(page)},
@@ -451,7 +458,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
         own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
         name = slip.quantity.replace("median_modulus", "median slip speed")
-        rows.append((group, slip.points.height, f"{name} latest {slip.latest:.3g} {slip.unit}"))
+        rows.append((group, slip.points.height, f"{name} latest {slip.latest:.3g}{suffix_unit(slip.unit)}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

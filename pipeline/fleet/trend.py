@@ -365,7 +365,8 @@ def raise_alerts(
     for group, quantity, unit, value, run in lasts:
         limit = limits.get(quantity, limits.get(quantity.split(" (")[0]))
         if limit is not None and value > limit:
-            text = f"{quantity} of {group} is {value:.3g} {unit} in {run}, above the limit of {limit:g}"
+            shown = f"{value:.3g}{suffix_unit(unit)}"
+            text = f"{quantity} of {group} is {shown} in {run}, above the limit of {limit:g}"
             alerts.append(Alert(group, quantity, text))
     return alerts
 
@@ -387,7 +388,7 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
 
 def shorten_step(series: Series, step: LevelChange) -> str:
     """Format the levels before and after."""
-    unit = f" {series.unit}" if series.unit not in ("", "1") else ""
+    unit = suffix_unit(series.unit)
     return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import finite_or_none, pick, pick_finite
+from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
 from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
@@ -37,6 +37,7 @@ from pipeline.job import FigureFormat, JobError, lack_runs
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
 from pipeline.job.prediction import fit_results
+from pipeline.models.catalogue import list_effects
 from pipeline.store import Store
 
 _EFFECT = "effect"
@@ -286,6 +287,30 @@ _SLIP = {
 }
 
 
+_HEALTH = ("warnings", "suspect share")
+_FINDING = "finding "
+
+
+def check_limits(limits: Mapping[str, float]) -> None:
+    """Refuse limits on quantities that no run can have.
+
+    Parameters of the catalogue and findings are accepted before a run has them, as a nightly check needs.
+
+    Raises:
+        JobError: ``no_such_quantity``.
+    """
+    slip = [name + suffix for name in _SLIP for suffix in ("", *(f" ({source})" for source in INPUT_WORDS))]
+    parameters = [f"{effect.id}.{one.name}" for effect in list_effects() for one in effect.parameters]
+    known = [*slip, *_HEALTH, *parameters]
+    for name in limits:
+        if name not in known and not name.startswith(_FINDING):
+            hint = (
+                f"{guess_names(name, known)}There are {', '.join([*_SLIP, *_HEALTH])}, findings "
+                "(as 'finding heading_skew') and parameters of effects (as effective_track.k)."
+            )
+            raise JobError("no_such_quantity", f"{name!r} in --limit is no quantity", hint=hint)
+
+
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
     """Analyze trends over dates: of every quantity by group, and of every parameter by vehicle.
 
@@ -333,7 +358,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
     names = [*(one.quantity for one in series), *numbers]
     known = {*names, *(name.split(" (")[0] for name in names)}
-    notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
+    missing = [name for name in limits if name not in known]
+    notes[:0] = [f"the limit on {name} is not checked: no run has this quantity" for name in missing]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
     asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
     return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
@@ -433,7 +459,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .agg(pl.col("value").mean())
         .select(
             "run",
-            pl.concat_str(pl.lit("finding "), "id").alias("quantity"),
+            pl.concat_str(pl.lit(_FINDING), "id").alias("quantity"),
             pl.lit("").alias("unit"),
             "value",
         )
@@ -444,7 +470,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .join(warnings, on="run", how="left")
         .select(
             "run",
-            pl.lit("warnings").alias("quantity"),
+            pl.lit(_HEALTH[0]).alias("quantity"),
             pl.lit("1").alias("unit"),
             pl.col("len").fill_null(0).cast(pl.Float64).alias("value"),
         )
@@ -453,7 +479,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         compared.scan("slip")
         .group_by("run")
         .agg(pl.col("suspect").mean().alias("value"))
-        .select("run", pl.lit("suspect share").alias("quantity"), pl.lit("1").alias("unit"), "value")
+        .select("run", pl.lit(_HEALTH[1]).alias("quantity"), pl.lit("1").alias("unit"), "value")
         .collect()
     )
     return pl.concat([counts, counted, suspect])

@@ -16,7 +16,7 @@ from pipeline.fleet import read_day
 from pipeline.fleet.rank_tests import LEVEL
 from pipeline.fleet.trend import Trend, follow_quantities, format_quiet
 from pipeline.job import JobError
-from pipeline.job.over_runs import follow_trend, write_trend
+from pipeline.job.over_runs import check_limits, follow_trend, write_trend
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -209,7 +209,7 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
     )  # fmt: skip
     found = follow(store, limits={"effective_track.k": 0.7})
     assert found.parameters[0].points["run"][-1] != "last"
-    text = "effective_track.k of warthog-2 is 0.75 1 in last, above the limit of 0.7"
+    text = "effective_track.k of warthog-2 is 0.75 in last, above the limit of 0.7"
     assert text in [alert.text for alert in found.alerts]
 
 
@@ -231,11 +231,41 @@ def test_limits_that_are_not_finite_are_one_line(
     assert told in capsys.readouterr().err
 
 
-def test_several_limits_and_unknown_ones(store: Store) -> None:
+def test_limits_that_no_run_has_yet_are_said_first(store: Store) -> None:
     drive_a_season(store, [1.8, 1.8])
-    found = follow(store, limits={"warnings": 0.0, "beauty": 1.0})
-    assert [alert.quantity for alert in found.alerts] == ["warnings"]
-    assert any("'beauty'" in note for note in found.notes)
+    limits = {"warnings": 0.0, "effective_track.k": 1.7, "wheel_radius.k": 1.0, "finding time_jump": 1.0}
+    check_limits(limits)
+    found = follow(store, limits=limits)
+    assert {alert.quantity for alert in found.alerts} == {"warnings", "effective_track.k"}
+    assert "effective_track.k of warthog-2 is 1.8 in run_01, above the limit of 1.7" in [
+        alert.text for alert in found.alerts
+    ]
+    assert found.notes[:2] == tuple(
+        f"the limit on {name} is not checked: no run has this quantity"
+        for name in ("wheel_radius.k", "finding time_jump")
+    )
+
+
+@pytest.mark.parametrize(
+    ("limit", "hint"),
+    [
+        ("median_modulos=1", "Did you mean median_modulus"),
+        ("effective_track.q=1", "Did you mean effective_track.k"),
+        ("beauty=1", "There are median_modulus, "),
+    ],
+)
+def test_a_limit_on_no_quantity_is_an_error(
+    store: Store, limit: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_a_season(store, [1.8])
+    with pytest.raises(SystemExit) as ended:
+        main(["fleet", "trend", str(store.root), "--limit", limit])
+    assert ended.value.code == 1
+    told = capsys.readouterr()
+    assert "nothing" not in told.out
+    assert f"{limit.split('=')[0]!r} in --limit is no quantity" in told.err
+    assert hint in " ".join(told.err.split())
+    assert not (store.root / "trend.html").exists()
 
 
 def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
