@@ -11,6 +11,7 @@ import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -394,10 +395,10 @@ def read_day(run: str) -> str | None:
     match = _DAY.search(run)
     if match is None:
         return None
-    year, month, day = (int(part) for part in match.groups())
-    if not (1 <= month <= 12 and 1 <= day <= 31):  # noqa: PLR2004 - the calendar
+    try:
+        return date(*(int(part) for part in match.groups())).isoformat()
+    except ValueError:  # no day of the calendar
         return None
-    return f"{year:04d}-{month:02d}-{day:02d}"
 
 
 def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:

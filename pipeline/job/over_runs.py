@@ -308,7 +308,7 @@ def check_limits(limits: Mapping[str, float]) -> None:
                 f"{guess_names(name, known)}There are {', '.join([*_SLIP, *_HEALTH])}, findings "
                 "(as 'finding heading_skew') and parameters of effects (as effective_track.k)."
             )
-            raise JobError("no_such_quantity", f"{name!r} in --limit is no quantity", hint=hint)
+            raise JobError("no_such_quantity", f"{name!r} in --limit is not a quantity", hint=hint)
 
 
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
@@ -331,7 +331,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
     followed = set(dated["run"])
     undated = sorted(set(compared.manifests) - followed)
-    notes = list(compared.notes)
+    notes = [*compared.notes, *(note for note in compared.date_notes if note not in compared.notes)]
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     refused = sorted(compared.refusals.items())

@@ -263,9 +263,24 @@ def test_a_limit_on_no_quantity_is_an_error(
     assert ended.value.code == 1
     told = capsys.readouterr()
     assert "nothing" not in told.out
-    assert f"{limit.split('=')[0]!r} in --limit is no quantity" in told.err
+    assert f"{limit.split('=', maxsplit=1)[0]!r} in --limit is not a quantity" in told.err
     assert hint in " ".join(told.err.split())
     assert not (store.root / "trend.html").exists()
+
+
+def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
+    for name in ("ice_2024_7_30", "gravel_2023_12_12", "asphalt"):
+        write_run(store, Run(name=name, seconds=30.0))
+    found = follow(store)
+    assert found.series[0].points["run"].to_list() == ["gravel_2023_12_12", "ice_2024_7_30"]
+    assert found.notes[:2] == (
+        (
+            "the clocks of 3 runs start at the very same instant of 2023-11-14, which names contradict: "
+            "the dates in the names of 2 count; the others have no date"
+        ),
+        "left out, because no date is known: asphalt",
+    )
+    assert "very same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
 
 
 def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
@@ -280,6 +295,7 @@ def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
         ("warthog_2024_8_7_11h30s30", "2024-08-07"),
         ("2026-05-03_gravel", "2026-05-03"),
         ("run_2024_13_40", None),
+        ("run_2024_2_31", None),
         ("run_7", None),
     ],
 )
