@@ -449,7 +449,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
         (
             f"{one.vehicle} {one.label}",
             one.points.height,
-            f"latest {one.latest:.3g}{suffix_unit(one.unit)}, {format_power(one)}",
+            f"latest {one.shown_latest}, {format_power(one)}",
         )
         for one in followed.parameters
         if not one.need

@@ -381,11 +381,18 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
     if short:
         notes.append(f"too few runs to find a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
     needs: dict[str, list[str]] = {}
+    lost: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for number in parameters:
+        if number.undetermined:
+            lost.setdefault((number.vehicle, number.undetermined), []).append(number.label)
         if number.need:
             needs.setdefault(f"{number.vehicle}, {format_power(number)}", []).append(number.label)
         if number.odd:
             notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    notes += [
+        f"{', '.join(labels)} of {vehicle}, left out where a run does not determine it: {', '.join(runs)}"
+        for (vehicle, runs), labels in lost.items()
+    ]
     return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
 
 

@@ -170,12 +170,18 @@ def _draw_vehicle(parameters: Sequence[ParameterTrend], vehicle: str, number: in
     for index, one in enumerate(own):
         name = f"parameter_{number}_{index}"
         text = "; ".join(format_change(one, change) for change in one.changes) or "no change"
-        odd = f". Left out, apart from the others: {', '.join(one.odd)}" if one.odd else ""
         words = (
-            f"{one.points.height} runs, last {one.latest:.3g}. {begin_large(text)}; {format_power(one)}{odd}."
-        )
+            f"{one.points.height} runs, last {one.shown_latest}. {begin_large(text)}; {format_power(one)}. "
+            f"{_format_omitted(one)}"
+        ).rstrip()
         pictures.append(Picture(name, f"{one.label}{_format_unit(one)}", _draw_parameter(one, name, words)))
     return pictures
+
+
+def _format_omitted(trend: ParameterTrend) -> str:
+    """Sentences on the runs that are not drawn."""
+    reasons = (("apart from the others", trend.odd), ("undetermined", trend.undetermined))
+    return " ".join(f"Not drawn, {why}: {', '.join(runs)}." for why, runs in reasons if runs)
 
 
 def _draw_parameter(trend: ParameterTrend, name: str, words: str) -> Drawing:

@@ -268,6 +268,22 @@ def test_a_limit_on_no_quantity_is_an_error(
     assert not (store.root / "trend.html").exists()
 
 
+def test_an_undetermined_number_is_named_with_its_run(store: Store) -> None:
+    drive_a_season(store, [1.8, 1.81, 1.8, 1.81])
+    write_run(
+        store,
+        Run(
+            name="gentle", dataset="warthog-2_gravel", vehicle="warthog-2", seconds=30.0,
+            start_ns=stamp_of(FIRST + timedelta(days=9)), estimates=[("effective_track", "k", 1.8, 4e5)],
+        ),
+    )  # fmt: skip
+    found = follow(store)
+    (track,) = found.parameters
+    assert track.shown_latest == "1.8 (undetermined)"
+    assert "effective_track.k of warthog-2, left out where a run does not determine it: gentle" in found.notes
+    assert "Not drawn, undetermined: gentle." in write_trend(store, found).read_text(encoding="utf-8")
+
+
 def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
     for name in ("ice_2024_7_30", "gravel_2023_12_12", "asphalt"):
         write_run(store, Run(name=name, seconds=30.0))

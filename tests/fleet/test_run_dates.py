@@ -28,8 +28,10 @@ def test_dates_in_names_count_and_the_clock_that_contradicts_is_said() -> None:
     )
     assert found.days == {"a_2024_7_30": "2024-07-30", "b_2024_8_1": "2024-08-01", "c": "2023-11-15"}
     assert found.notes == (
-        "the date in the name counts, and not that of the clock, "
-        "of a_2024_7_30 (2023-11-14), b_2024_8_1 (2023-11-14)",
+        (
+            "the date in the name counts, and not that of the clock, "
+            "of a_2024_7_30 (2023-11-14), b_2024_8_1 (2023-11-14)"
+        ),
     )
 
 
@@ -50,6 +52,8 @@ def test_runs_of_one_instant_are_ordered_by_name_and_that_is_said() -> None:
         "unset_2": None,
     }
     assert found.notes == (
-        "2 runs start at the very same instant, 2023-11-14 22:13:20 UTC, "
-        "and are in the order of their names: a, b",
+        (
+            "2 runs start at the very same instant, 2023-11-14 22:13:20 UTC, "
+            "and are in the order of their names: a, b"
+        ),
     )
