@@ -377,8 +377,7 @@ def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, obj
 
 # Pages over all runs of a results folder, and their links.
 #
-# A page links the existing ones. Every page links the catalogue, which is rewritten with every page and so
-# links later ones.
+# Every page links the existing others; writing one brings the links of the others up to date.
 
 CATALOGUE = "index.html"
 PLANS = "workbench/plans"
@@ -396,15 +395,18 @@ _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
 def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES` with links to the others, and rewrite the catalogue, which then links it.
+    """Write one of `PAGES` with links to the others, rewrite the catalogue, and renew the others' links.
 
-    Other pages are not changed: others may have written them, or they may be damaged.
+    Pages that are not as they were written, because they are damaged or of another origin, are not changed.
 
     Raises:
         StoreError: the disk reports an error.
     """
     path = store.write_results_text(name, _link(store, name, page))
     if name != CATALOGUE:
+        for other in PAGES:
+            if other not in (CATALOGUE, name):
+                store.edit_results_text(other, partial(_link, store, other))
         store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
     return path
 
