@@ -440,7 +440,7 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _format_trend(followed: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import format_power, format_quiet  # noqa: PLC0415 - heavy
+    from pipeline.fleet.trend import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
@@ -457,8 +457,8 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     for group in dict.fromkeys(one.group for one in followed.series):
         own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
-        name = slip.quantity.replace("median_modulus", "median slip speed")
-        rows.append((group, slip.points.height, f"{name} latest {slip.latest:.3g}{suffix_unit(slip.unit)}"))
+        latest = f"latest {slip.latest:.3g}{suffix_unit(slip.unit)}"
+        rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

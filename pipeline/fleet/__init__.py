@@ -304,7 +304,7 @@ _MEDIANS = (
     "height_rate", "relative_slip", "slip_energy", "lost_energy", "unpredictability",
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
-_REACH = 1.5
+WHISKER_REACH = 1.5
 """Maximum length of whiskers in box lengths (Tukey 1977); 0.7 % of normal values lie beyond."""
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
@@ -415,7 +415,7 @@ def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
     """
     norm = pl.col("window_norm")
     first, third = norm.quantile(0.25), norm.quantile(0.75)
-    span = _REACH * (third - first)
+    span = WHISKER_REACH * (third - first)
     return (
         windows.filter(~pl.col("suspect"), norm.is_finite())
         .join(groups.lazy(), on="run")

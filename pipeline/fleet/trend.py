@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core import NORMAL_95, finite_or_none, pick, suffix_unit
+from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, pick, suffix_unit
 from pipeline.fleet import UNKNOWN
 from pipeline.fleet.forecast import leave_out_odd, list_numbers
 from pipeline.fleet.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
@@ -277,6 +277,14 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
 FEWEST_RUNS = 9
 """Minimum number of runs for detecting a step of a series: with eight, even the rarest order has a
 probability of 2 in 70, more than the half of `LEVEL` that all series share; with nine, of 2 in 126."""
+_QUANTITIES = {
+    "median_modulus": "median slip speed",
+    "median_window_norm": "median norm of slip over 2 s",
+    "steady_median_modulus": "median steady slip speed",
+    "transitory_median_modulus": "median transitory slip speed",
+    "warnings": "number of warnings",
+    "suspect share": "share of suspect samples",
+}
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
@@ -311,6 +319,13 @@ class Alert:
     group: str
     quantity: str
     text: str
+
+
+def name_quantity(quantity: str) -> str:
+    """Name of the quantity of a series in words, as `median slip speed from commands`."""
+    name, _, source = quantity.partition(" (")
+    words = _QUANTITIES.get(name, f"value of the {name}")
+    return f"{words} {INPUT_WORDS[source.rstrip(')')]}" if source else words
 
 
 def follow_quantities(values: pl.DataFrame) -> list[Series]:

@@ -401,7 +401,7 @@ def write_trend(store: Store, trend: Trend) -> Path:
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
+    from pipeline.report.trend_page import render_trend  # noqa: PLC0415 - heavy
 
     return write_page(store, "trend.html", render_trend(trend))
 

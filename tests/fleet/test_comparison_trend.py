@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from datetime import UTC, date, datetime, timedelta
 from typing import TYPE_CHECKING
 
@@ -72,6 +73,14 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
     page = write_trend(store, found).read_text(encoding="utf-8")
     assert "1.8 -&gt; 2.1 since 2026-05-03" in page
+    titles = re.findall("<h3>([^<]+)</h3>", page)
+    assert titles[:2] == ["Effective track (effective_track.k)", "Median slip speed from commands [m/s]"]
+    assert titles[-3:] == [
+        "Value of the finding heading_skew",
+        "Share of suspect samples",
+        "Number of warnings",
+    ]
+    assert "Median norm of slip over 2 s from wheel encoders [m/s]" in titles
 
 
 @pytest.mark.parametrize(
@@ -282,6 +291,36 @@ def test_an_undetermined_number_is_named_with_its_run(store: Store) -> None:
     assert track.shown_latest == "1.8 (undetermined)"
     assert "effective_track.k of warthog-2, left out where a run does not determine it: gentle" in found.notes
     assert "Not drawn, undetermined: gentle." in write_trend(store, found).read_text(encoding="utf-8")
+
+
+def test_a_ground_has_one_mark_and_a_wide_interval_sets_no_axis(store: Store) -> None:
+    ends = [
+        ("asphalt", 1.5),
+        ("gravel", 1.6),
+        ("sand", 1.7),
+        ("asphalt", 1.51),
+        ("gravel", 1.61),
+        ("sand", 1.69),
+    ]
+    for i, (terrain, track) in enumerate(ends):
+        error = 0.3 if i == 2 else 0.004
+        estimates = [("effective_track", "k", track, error)]
+        estimates += [("lateral_skid", "c", 0.1, 0.01)] if terrain != "asphalt" else []
+        start = stamp_of(FIRST + timedelta(days=i))
+        write_run(
+            store, Run(name=f"r{i}", terrain=terrain, seconds=30.0, start_ns=start, estimates=estimates)
+        )
+    page = write_trend(store, follow(store)).read_text(encoding="utf-8")
+    data = json.loads(re.search('id="page-data">(.*?)</script>', page)[1])  # type: ignore[index]
+    drawn = {name: json.dumps(spec) for name, spec in data["figures"].items() if "parameter" in name}
+    track, skid = drawn["parameter_0_0"], drawn["parameter_0_1"]
+    for spec, shown in ((track, ["asphalt", "gravel", "sand"]), (skid, ["gravel", "sand"])):
+        assert '"scale": {"domain": ["asphalt", "gravel", "sand"]}' in spec
+        assert f'"values": {json.dumps(shown)}' in spec
+    low, high = json.loads(re.search(r'"domain": (\[[^]]*\]), "zero": false', track)[1])  # type: ignore[index]
+    assert 1.4 < low < 1.5
+    assert 1.7 < high < 1.8
+    assert "Intervals that are longer than the axis are cut." in page
 
 
 def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
