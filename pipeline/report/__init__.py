@@ -57,12 +57,31 @@ _OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
+_LABEL_LENGTH = 40
+"""Characters of an axis' label that stand beside a figure without making it narrow."""
 
 
 def begin_large(text: str) -> str:
     """Capitalize the text; identifiers such as `drive_lag.tau` remain unchanged."""
     first = text.split(maxsplit=1)[0].rstrip(".,:;") if text.strip() else ""
     return text if "_" in first or "." in first else text[:1].upper() + text[1:]
+
+
+def label_names(names: Sequence[str]) -> dict[str, str]:
+    """Labels for an axis, all different: names without their common folder, long ones cut in the middle."""
+    shared = os.path.commonprefix(list(names)).rpartition("/")[0]  # noqa: RUF071 - cut at a slash
+    # Labels of several columns have spaces about their slashes.
+    start = 0 if not shared or shared.endswith(" ") else len(shared) + 1
+    for most in range(_LABEL_LENGTH, max(map(len, names), default=0) + _LABEL_LENGTH):
+        labels = {name: _cut_middle(name[start:], most) for name in names}
+        if len(set(labels.values())) == len(set(names)):
+            return labels
+    return {name: name for name in names}
+
+
+def _cut_middle(text: str, most: int) -> str:
+    head = (most - 1) // 2
+    return text if len(text) <= most else f"{text[:head]}\u2026{text[head + 1 - most :]}"
 
 
 def set_squares(text: str) -> str:
