@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from pipeline.job.check_sides import Baseline
     from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
+    from pipeline.models.parameter import Parameter as ModelParameter
     from pipeline.store import Manifest
 
 
@@ -294,8 +295,8 @@ def _format_number(row: Mapping[str, object]) -> list[str]:
 
 _WORDS = (
     ("median_modulus", "median slip speed", "m/s"),
-    ("t_mrmse_m", "error over 2 s", "m"),
-    ("ideal_t_mrmse_m", "of the ideal model", "m"),
+    ("t_mrmse_m", "position error over 2 s", "m"),
+    ("ideal_t_mrmse_m", "that of the ideal model", "m"),
 )
 
 
@@ -340,29 +341,43 @@ def predict(
 
 
 def _format_forecast(content: Mapping[str, object]) -> list[str]:
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
-    numbers: dict[str, Mapping[str, object]] = {}
+    lines += [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
+    numbers: dict[str, str] = {}
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
-        numbers |= {f"  {effect['id']}.{name}": number for name, number in parameters.items()}
+        kind = find_effect(str(effect["id"]))()
+        numbers |= {
+            f"  {kind.id}.{name}": _format_expected(number, kind.parameter(name))
+            for name, number in parameters.items()
+        }
     width = max([_LABEL, *map(len, numbers)]) + 2
-    lines += [f"{label:<{width}}{_bound(one, str(one['unit']))}" for label, one in numbers.items()]
+    lines += [f"{label:<{width}}{text}" for label, text in numbers.items()]
     if not content["effects"]:
         lines.append("  the ideal model: most runs have no significant effect")
     lines += [
-        f"{words:<{width}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
+        f"{words:<{width}}{_format_interval(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
     ]
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
 
 
-def _bound(number: Mapping[str, object], unit: str) -> str:
-    shown = f"{number['value']:.3g}" + suffix_unit(unit)
-    cut = " (the interval ends at a limit of the search)" if number.get("at_bound") else ""
-    cut += " (default spread between runs)" if number.get("default_spread") else ""
-    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
+def _format_expected(number: Mapping[str, object], parameter: ModelParameter) -> str:
+    """An expected parameter; a limit at the largest value of its search is none."""
+    low, most, unit = number["low"], parameter.bounds[1], suffix_unit(parameter.unit)
+    default = " (default spread between runs)" if number["default_spread"] else ""
+    if parameter.neutral == math.inf and number["value"] == most:
+        return f"no limit, or one of at least {low:.3g}{unit}{default}"
+    cut = " (the interval ends at a limit of the search)" if number["at_bound"] else ""
+    return f"{_format_interval(number, parameter.unit)}{cut}{default}"
+
+
+def _format_interval(number: Mapping[str, object], unit: str) -> str:
+    return f"{number['value']:.3g}{suffix_unit(unit)} [{number['low']:.3g}, {number['high']:.3g}]"
 
 
 ALERT = 4
