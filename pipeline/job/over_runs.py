@@ -4,6 +4,7 @@ import contextlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -37,7 +38,7 @@ from pipeline.job import FigureFormat, JobError, lack_runs
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
 from pipeline.job.prediction import fit_results
-from pipeline.models.catalogue import list_effects
+from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.store import Store
 
 _EFFECT = "effect"
@@ -161,12 +162,15 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         ("cause_differences", _tabulate_pairs(causes)),
     ):
         written |= write_tables(store, name, frame, frame)
+    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
+    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
+    names |= {effect: name.replace("_", " ") for effect, name in causes.names.items()}
     sentences = [
-        format_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
-        for one in causes.differences
+        format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
     ]
-    written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
-    return written | write_figures(store, lambda: [draw_causes(causes.budgets, causes.names)], figures)
+    page = render_causes(replace(causes, names=names), sentences)
+    written["causes.html"] = write_page(store, "causes.html", page)
+    return written | write_figures(store, lambda: [draw_causes(causes.budgets, names)], figures)
 
 
 def _tabulate_budgets(causes: Causes) -> pl.DataFrame:

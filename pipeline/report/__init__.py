@@ -27,7 +27,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core import SlipError, format_share, naming_os_errors, shorten
+from pipeline.core import SlipError, format_share, naming_os_errors, shorten, suffix_unit
 from pipeline.core.untrusted import mapping_in
 from pipeline.store import LOG_NOTES, Manifest, Store
 from pipeline.store.parquet_tables import scan_table
@@ -87,6 +87,11 @@ def _cut_middle(text: str, most: int) -> str:
 def set_squares(text: str) -> str:
     """Units of a text with squares as a page sets them: m/s\u00b2 for m/s^2."""
     return _SQUARE.sub("\\1\u00b2", text)
+
+
+def bracket_unit(unit: str) -> str:
+    """A unit in brackets behind the name of a quantity; empty for a plain number."""
+    return set_squares(f" [{unit}]") if suffix_unit(unit) else ""
 
 
 def format_number(value: float | None, *, digits: int = 3) -> str:
@@ -192,6 +197,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
+        "bracket_unit": bracket_unit,
         "bytes": format_bytes,
         "capital": begin_large,
         "squares": set_squares,
@@ -243,13 +249,16 @@ class Column:
 
     Attributes:
         title: its heading.
-        unit: small text after the heading.
+        unit: small text after the heading; `1` is none.
         number: whether it is right-aligned.
     """
 
     title: str
     unit: str = ""
     number: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", suffix_unit(self.unit).strip())
 
 
 @dataclass(frozen=True)

@@ -8,10 +8,21 @@ from typing import cast
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_share
+from pipeline.core import INPUT_WORDS, format_share, suffix_unit
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.fleet.terrain import SHARE_DIGITS, PassEffect, TerrainMap
-from pipeline.report import MISSING, Cell, Column, Picture, Table, format_number, theme
+from pipeline.models.catalogue import name_parameter
+from pipeline.report import (
+    MISSING,
+    Cell,
+    Column,
+    Picture,
+    Table,
+    begin_large,
+    format_number,
+    set_squares,
+    theme,
+)
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.scene import CAP_QUANTILE, format_ends
@@ -82,13 +93,20 @@ def _label(row: Mapping[str, object]) -> str:
     return f"{row['effect']}.{row['parameter']}"
 
 
+def _name(row: Mapping[str, object]) -> str:
+    """Name of a parameter in words: at its level, where that has its own."""
+    if row["name"] == row["effect"]:
+        return name_parameter(str(row["effect"]), str(row["parameter"]))
+    return begin_large(str(row["name"]).replace("_", " "))
+
+
 def _list(row: Mapping[str, object]) -> list[str | Cell]:
     spreads = [format_number(number_in(row, f"spread_{kind}")) for kind in ("terrain", "run")]
     return [
-        Cell(str(row["name"]), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
+        Cell(_name(row), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
         _format_value(row, row),
-        format_ends(row),
+        format_ends(row).replace(" ", "\u00a0"),
         *spreads,
         format_number(number_in(row, "chi_square")),
         f"{row['named']} of {row['runs']}",
@@ -100,10 +118,10 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
     means = {name: mapping_in(terrains, name) for name in terrains}
     return [
         [
-            Cell(small=_label(row)),
+            Cell(_name(row), small=_label(row)),
             name,
             _format_value(mean, row),
-            format_ends(mean),
+            format_ends(mean).replace(" ", "\u00a0"),
             str(mean["runs"]),
         ]
         for name, mean in means.items()
@@ -111,7 +129,8 @@ def _list_terrains(row: Mapping[str, object]) -> list[list[str | Cell]]:
 
 
 def _format_value(of: Mapping[str, object], row: Mapping[str, object]) -> Cell:
-    return Cell(format_number(number_in(of, "value")), small="" if row["unit"] == "1" else str(row["unit"]))
+    unit = set_squares(suffix_unit(row["unit"]).strip())
+    return Cell(format_number(number_in(of, "value")), small=unit)
 
 
 MOST_MAPS = 12
@@ -166,7 +185,10 @@ def _group_maps(drawn: TerrainMap) -> list[tuple[str, str, list[Picture]]]:
     for number, row in enumerate(order.head(MOST_MAPS).iter_rows(named=True)):
         mine = cell_table.filter(pl.col("frame") == row["frame"], pl.col("vehicle") == row["vehicle"])
         members = len(drawn.frames[row["frame"]])
-        name = f"{row['vehicle']} in the frame {row['frame']}, {members} run{'s' * (members != 1)}"
+        # A run without a shared frame has one of its own, called after it.
+        is_own = row["frame"] == f"run {next(iter(drawn.frames[row['frame']]))}"
+        name = f"{row['vehicle']}, {row['frame']}"
+        name += "" if is_own else f", {members} run{'s' * (members != 1)}"
         pictures = [
             Picture(f"map-{number}-{column}", title, _draw_cells(mine, drawn.cell_m, number, shown), "half")
             for shown in _SHOWN

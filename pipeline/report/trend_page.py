@@ -21,7 +21,7 @@ from pipeline.fleet.trend import (
     name_quantity,
 )
 from pipeline.models.catalogue import name_parameter
-from pipeline.report import Picture, begin_large, set_squares, theme
+from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, encode_column, layer
@@ -82,7 +82,7 @@ def _draw_vehicle(
     pictures = []
     for index, one in enumerate(own):
         name = f"parameter_{number}_{index}"
-        title = f"{name_parameter(one.effect, one.parameter)} ({one.label}){_format_unit(one)}"
+        title = f"{name_parameter(one.effect, one.parameter)} ({one.label}){bracket_unit(one.unit)}"
         pictures.append(Picture(name, title, _draw_parameter(one, name, grounds)))
     return pictures
 
@@ -155,10 +155,6 @@ def _draw_parameter(trend: ParameterTrend, name: str, grounds: Sequence[str]) ->
     return Drawing(chart, {f"{name}_points": rows}, set_squares(note), _describe(trend))
 
 
-def _format_unit(of: Series | ParameterTrend) -> str:
-    return f" [{set_squares(of.unit)}]" if of.unit not in ("", "1") else ""
-
-
 def _number(points: pl.DataFrame) -> pl.DataFrame:
     return points.drop("order").with_row_index("order").with_columns(pl.col("order").cast(pl.Float64))
 
@@ -181,7 +177,7 @@ def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
 def _picture(series: Series, name: str) -> Picture:
     steps = "; ".join(format_step(series, step) for step in series.steps)
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
-    title = begin_large(name_quantity(series.quantity)) + _format_unit(series)
+    title = begin_large(name_quantity(series.quantity)) + bracket_unit(series.unit)
     return Picture(name, title, _draw_series(series, name, words), "half")
 
 
