@@ -9,6 +9,7 @@ from datetime import UTC, date, datetime
 from pipeline.fleet import read_day
 
 _EARLIEST_YEAR = 2000
+"""Year before which a clock was not set: unset ones count from 1970 or 1980, no log is so old."""
 _TIME_ZONE_DAYS = 1
 """Largest difference of a local date from that in UTC [days]: time zones end at 14 h; a second day would be
 another date, and zero would refuse drives in the evening."""
