@@ -106,7 +106,7 @@ def _compare_causes(
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.fleet import MEASURES  # noqa: PLC0415 - heavy
     from pipeline.fleet.pairs import compare_orders  # noqa: PLC0415 - heavy
-    from pipeline.job.compare import NOT_VALID  # noqa: PLC0415 - heavy
+    from pipeline.job.compare import list_shown_notes  # noqa: PLC0415 - heavy
 
     datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
         "dataset", "runs", "median_window_norm"
@@ -124,8 +124,7 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
-    # The plain test is a column of the page and of the files only.
-    notes = [f"! {note}" for note in answer.notes if note != NOT_VALID]
+    notes = [f"! {note}" for note in list_shown_notes(answer)]
     return [*lines, "", *notes, f"page    {written['comparison.html']}"]
 
 

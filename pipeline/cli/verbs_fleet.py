@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from pipeline.job.check_sides import Baseline
     from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
+    from pipeline.models.parameter import Parameter as ModelParameter
     from pipeline.store import Manifest
 
 
@@ -294,8 +295,8 @@ def _format_number(row: Mapping[str, object]) -> list[str]:
 
 _WORDS = (
     ("median_modulus", "median slip speed", "m/s"),
-    ("t_mrmse_m", "error over 2 s", "m"),
-    ("ideal_t_mrmse_m", "of the ideal model", "m"),
+    ("t_mrmse_m", "position error over 2 s", "m"),
+    ("ideal_t_mrmse_m", "that of the ideal model", "m"),
 )
 
 
@@ -340,30 +341,44 @@ def predict(
 
 
 def _format_forecast(content: Mapping[str, object]) -> list[str]:
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
-    numbers: dict[str, Mapping[str, object]] = {}
+    lines += [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
+    numbers: dict[str, str] = {}
     for effect in cast("Sequence[Mapping[str, object]]", content["effects"]):
         parameters = cast("Mapping[str, Mapping[str, object]]", effect["parameters"])
-        numbers |= {f"  {effect['id']}.{name}": number for name, number in parameters.items()}
+        kind = find_effect(str(effect["id"]))()
+        numbers |= {
+            f"  {kind.id}.{name}": _format_expected(number, kind.parameter(name))
+            for name, number in parameters.items()
+        }
     width = max([_LABEL, *map(len, numbers)]) + 2
-    lines += [f"{label:<{width}}{_bound(one, str(one['unit']))}" for label, one in numbers.items()]
+    lines += [f"{label:<{width}}{text}" for label, text in numbers.items()]
     if not content["effects"]:
         lines.append("  the ideal model: most runs have no significant effect")
     lines += [
-        f"{words:<{width}}{_bound(cast('Mapping[str, object]', content[key]), unit)}"
+        f"{words:<{width}}{_format_interval(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
     ]
     lines += [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
 
 
-def _bound(number: Mapping[str, object], unit: str) -> str:
-    shown = f"{number['value']:.3g}" + suffix_unit(unit)
-    cut = " (the interval ends at a limit of the search)" if number.get("at_bound") else ""
-    cut += " (default spread between runs)" if number.get("default_spread") else ""
-    return f"{shown} [{number['low']:.3g}, {number['high']:.3g}]{cut}"
+def _format_expected(number: Mapping[str, object], parameter: ModelParameter) -> str:
+    """An expected parameter; a limit at the largest value of its search is none."""
+    low, most, unit = number["low"], parameter.bounds[1], suffix_unit(parameter.unit)
+    default = " (default spread between runs)" if number["default_spread"] else ""
+    if parameter.neutral == math.inf and number["value"] == most:
+        return f"no limit, or one of at least {low:.3g}{unit}{default}"
+    cut = " (the interval ends at a limit of the search)" if number["at_bound"] else ""
+    return f"{_format_interval(number, parameter.unit)}{cut}{default}"
+
+
+def _format_interval(number: Mapping[str, object], unit: str) -> str:
+    return f"{number['value']:.3g}{suffix_unit(unit)} [{number['low']:.3g}, {number['high']:.3g}]"
 
 
 ALERT = 4
@@ -397,17 +412,24 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.over_runs import follow_trend, summarize_trend, write_trend  # noqa: PLC0415 - heavy
+    from pipeline.job.over_runs import (  # noqa: PLC0415 - heavy
+        check_limits,
+        follow_trend,
+        summarize_trend,
+        write_trend,
+    )
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):
         raise SlipError(
             "bad_limit", f"{threshold} is not a threshold", hint="Write --threshold 0.1 for a tenth"
         )
+    limits = dict(map(_read_limit, limit))
+    check_limits(limits)
     use_key(key)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
-    followed = follow_trend(store, names, threshold=threshold, limits=dict(map(_read_limit, limit)))
+    followed = follow_trend(store, names, threshold=threshold, limits=limits)
     page = write_trend(store, followed)
     print_result(
         {**summarize_trend(followed), "page": str(page)},
@@ -434,7 +456,7 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _format_trend(followed: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import format_power, format_quiet  # noqa: PLC0415 - heavy
+    from pipeline.fleet.trend import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]
@@ -443,7 +465,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
         (
             f"{one.vehicle} {one.label}",
             one.points.height,
-            f"latest {one.latest:.3g}{suffix_unit(one.unit)}, {format_power(one)}",
+            f"latest {one.shown_latest}, {format_power(one)}",
         )
         for one in followed.parameters
         if not one.need
@@ -451,8 +473,8 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     for group in dict.fromkeys(one.group for one in followed.series):
         own = [one for one in followed.series if one.group == group]
         slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
-        name = slip.quantity.replace("median_modulus", "median slip speed")
-        rows.append((group, slip.points.height, f"{name} latest {slip.latest:.3g} {slip.unit}"))
+        latest = f"latest {slip.latest:.3g}{suffix_unit(slip.unit)}"
+        rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

@@ -11,6 +11,7 @@ import itertools
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -303,7 +304,7 @@ _MEDIANS = (
     "height_rate", "relative_slip", "slip_energy", "lost_energy", "unpredictability",
     "relative_unpredictability", "transitory_slip",
 )  # fmt: skip
-_REACH = 1.5
+WHISKER_REACH = 1.5
 """Maximum length of whiskers in box lengths (Tukey 1977); 0.7 % of normal values lie beyond."""
 _SUMS = ("samples", "windows", "distance", "duration")
 _NO_INTERVALS: Mapping[tuple[str, str], Interval] = {}
@@ -394,10 +395,10 @@ def read_day(run: str) -> str | None:
     match = _DAY.search(run)
     if match is None:
         return None
-    year, month, day = (int(part) for part in match.groups())
-    if not (1 <= month <= 12 and 1 <= day <= 31):  # noqa: PLR2004 - the calendar
+    try:
+        return date(*(int(part) for part in match.groups())).isoformat()
+    except ValueError:  # no day of the calendar
         return None
-    return f"{year:04d}-{month:02d}-{day:02d}"
 
 
 def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
@@ -414,7 +415,7 @@ def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:
     """
     norm = pl.col("window_norm")
     first, third = norm.quantile(0.25), norm.quantile(0.75)
-    span = _REACH * (third - first)
+    span = WHISKER_REACH * (third - first)
     return (
         windows.filter(~pl.col("suspect"), norm.is_finite())
         .join(groups.lazy(), on="run")

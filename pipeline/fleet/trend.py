@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core import NORMAL_95, finite_or_none, pick, suffix_unit
+from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, pick, suffix_unit
 from pipeline.fleet import UNKNOWN
 from pipeline.fleet.forecast import leave_out_odd, list_numbers
 from pipeline.fleet.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.fleet.rank_tests import LEVEL
 from pipeline.models.catalogue import find_effect
-from pipeline.models.parameter import Level
+from pipeline.models.parameter import UNDETERMINED, Level, cut_interval
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -71,9 +72,11 @@ class ParameterTrend:
         least: smallest detectable change; infinite if none is detectable.
         need: what is missing for a test; empty if it was tested.
         odd: outlying runs, excluded.
+        undetermined: runs that do not determine the parameter, excluded: at a bound of its search, or with
+            an interval that reaches one.
         named: number of runs whose diagnosis reports the effect.
         relevant: smallest change that raises an alert.
-        latest: estimate of the last run, even if it is an outlier or at a bound.
+        latest: estimate of the last run, even if it is an outlier or undetermined; `last` is that run.
     """
 
     vehicle: str
@@ -85,14 +88,22 @@ class ParameterTrend:
     least: float
     need: str
     odd: tuple[str, ...]
+    undetermined: tuple[str, ...]
     named: int
     relevant: float
     latest: float
+    last: str
 
     @property
     def label(self) -> str:
         """``effect.parameter``."""
         return f"{self.effect}.{self.parameter}"
+
+    @property
+    def shown_latest(self) -> str:
+        """The estimate of the last run as text, marked if that run does not determine it."""
+        mark = f" ({UNDETERMINED})" if self.last in self.undetermined else ""
+        return f"{self.latest:.3g}{suffix_unit(self.unit)}{mark}"
 
 
 def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
@@ -118,28 +129,49 @@ def follow_parameters(
 
     A level for each terrain removes its contribution, so that runs on several terrains are comparable; runs
     on unknown terrain count as one terrain. All parameters of a vehicle share the probability of a false
-    change. Runs that are outliers of both the runs before and after are excluded.
+    change. Excluded are runs that are outliers of both the runs before and after, and those that do not
+    determine the parameter: their intervals are no measure of how runs scatter.
 
     Args:
         estimates: rows of the table `estimates`.
         dated: ``order``, ``run``, ``day`` of all runs with a date.
         level: probability of a false change on a vehicle.
     """
+    followed = estimates.join(dated, on="run").sort("order")
+    numbers = [
+        (vehicle, effect, parameter, own.sort("order"))
+        for vehicle, effect, parameter, rows in list_numbers(followed)
+        if not (own := rows.filter(_find_determined(effect, parameter, rows))).is_empty()
+    ]
+    latest = {row[:3]: row[4:] for row in find_latest(estimates, dated).iter_rows()}
+    counts = Counter(vehicle for vehicle, *_ in numbers)
     trends = []
-    numbers = list_numbers(estimates.join(dated, on="run"))
-    latest = {row[:3]: row[4] for row in find_latest(estimates, dated).iter_rows()}
-    counts: dict[str, int] = {}
-    for vehicle, *_ in numbers:
-        counts[vehicle] = counts.get(vehicle, 0) + 1
-    for vehicle, effect, parameter, rows in numbers:
-        own = rows.sort("order")
+    for vehicle, effect, parameter, own in numbers:
+        asked = followed.filter(
+            pl.col("vehicle") == vehicle, pl.col("effect") == effect, pl.col("parameter") == parameter
+        )
+        lost = dict.fromkeys(run for run in asked["run"].to_list() if run not in set(own["run"]))
         last = latest[vehicle, effect, parameter]
-        trends.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], last))
+        trends.append(_follow(vehicle, effect, parameter, own, level / counts[vehicle], tuple(lost), last))
     return tuple(sorted(trends, key=lambda one: (one.vehicle, one.label)))
 
 
+def _find_determined(effect: str, parameter: str, rows: pl.DataFrame) -> list[bool]:
+    """Whether each run gives two limits of a parameter; see `Parameter.is_one_sided`."""
+    number = find_effect(effect)().parameter(parameter)
+    error = NORMAL_95 * rows["standard_error"]
+    ends = zip(rows["value"] - error, rows["value"] + error, strict=True)
+    return [not number.is_one_sided(*cut_interval(low, high, number.bounds)) for low, high in ends]
+
+
 def _follow(
-    vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, level: float, latest: float
+    vehicle: str,
+    effect: str,
+    parameter: str,
+    rows: pl.DataFrame,
+    level: float,
+    undetermined: tuple[str, ...],
+    last: tuple[float, str],
 ) -> ParameterTrend:
     used, odd = _leave_out_odd(rows)
     terrains = used["terrain"].to_list()
@@ -180,7 +212,7 @@ def _follow(
     need = f"{missing} more run{'s' * (missing > 1)} on ground that was driven before" if missing > 0 else ""
     return ParameterTrend(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
-        int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, latest,
+        undetermined, int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, *last,
     )  # fmt: skip
 
 
@@ -238,12 +270,21 @@ def summarize_parameter(trend: ParameterTrend) -> Mapping[str, object]:
         "least_change": finite_or_none(trend.least),
         "need": trend.need or None,
         "odd": list(trend.odd),
+        "undetermined": list(trend.undetermined),
     }
 
 
 FEWEST_RUNS = 9
 """Minimum number of runs for detecting a step of a series: with eight, even the rarest order has a
 probability of 2 in 70, more than the half of `LEVEL` that all series share; with nine, of 2 in 126."""
+_QUANTITIES = {
+    "median_modulus": "median slip speed",
+    "median_window_norm": "median norm of slip over 2 s",
+    "steady_median_modulus": "median steady slip speed",
+    "transitory_median_modulus": "median transitory slip speed",
+    "warnings": "number of warnings",
+    "suspect share": "share of suspect samples",
+}
 _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
@@ -278,6 +319,13 @@ class Alert:
     group: str
     quantity: str
     text: str
+
+
+def name_quantity(quantity: str) -> str:
+    """Name of the quantity of a series in words, as `median slip speed from commands`."""
+    name, _, source = quantity.partition(" (")
+    words = _QUANTITIES.get(name, f"value of the {name}")
+    return f"{words} {INPUT_WORDS[source.rstrip(')')]}" if source else words
 
 
 def follow_quantities(values: pl.DataFrame) -> list[Series]:
@@ -365,7 +413,8 @@ def raise_alerts(
     for group, quantity, unit, value, run in lasts:
         limit = limits.get(quantity, limits.get(quantity.split(" (")[0]))
         if limit is not None and value > limit:
-            text = f"{quantity} of {group} is {value:.3g} {unit} in {run}, above the limit of {limit:g}"
+            shown = f"{value:.3g}{suffix_unit(unit)}"
+            text = f"{quantity} of {group} is {shown} in {run}, above the limit of {limit:g}"
             alerts.append(Alert(group, quantity, text))
     return alerts
 
@@ -387,7 +436,7 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
 
 def shorten_step(series: Series, step: LevelChange) -> str:
     """Format the levels before and after."""
-    unit = f" {series.unit}" if series.unit not in ("", "1") else ""
+    unit = suffix_unit(series.unit)
     return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 

@@ -156,8 +156,14 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     written: dict[str, Path] = {}
     for name, frame in (("datasets", answer.datasets), ("comparisons", answer.comparisons)):
         written |= write_tables(store, name, frame, frame.filter(pl.col("input") == answer.input))
-    written["comparison.html"] = write_page(store, "comparison.html", render_comparison(answer))
+    page = render_comparison(answer, list_shown_notes(answer))
+    written["comparison.html"] = write_page(store, "comparison.html", page)
     return written | write_figures(store, lambda: list_pictures(answer), figures)
+
+
+def list_shown_notes(answer: Answer) -> list[str]:
+    """The notes of an answer, less that on the plain test, which only the files have."""
+    return [note for note in answer.notes if note != NOT_VALID]
 
 
 def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFrame) -> dict[str, Path]:

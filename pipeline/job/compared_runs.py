@@ -2,19 +2,19 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
 
 import polars as pl
 
 from pipeline.estimation.verdict import find_refusal
-from pipeline.fleet import label_runs, read_day
+from pipeline.fleet import label_runs
+from pipeline.fleet.run_dates import date_runs
 from pipeline.job.run_results import DIAGNOSED
 from pipeline.models.catalogue import list_effects
 from pipeline.store import Manifest, Store
 from pipeline.store.parquet_tables import scan_table
 from schemas import contract_of
 
-_EARLIEST_YEAR = 2000
+_DATES = ("day", "month", "year")
 _TABLES = ("aggregates", "slip")
 _SCHEMA = {
     "run": pl.String,
@@ -39,6 +39,7 @@ class ComparedRuns:
         store: the results.
         notes: excluded runs with the reasons.
         refusals: reasons why slip is not observable, by run.
+        date_notes: contradictory dates, and runs whose order is not known.
     """
 
     labels: pl.DataFrame
@@ -46,6 +47,7 @@ class ComparedRuns:
     store: Store
     notes: tuple[str, ...]
     refusals: Mapping[str, str] = field(default_factory=dict)
+    date_notes: tuple[str, ...] = ()
 
     def scan(self, table: str) -> pl.LazyFrame:
         """Rows of a table of these runs."""
@@ -99,14 +101,15 @@ def find_material(
             continue
         holders[digest] = manifest.run
         manifests[manifest.run] = manifest
-    rows = pl.DataFrame(
-        [_label_run(manifest) for manifest in manifests.values()], schema=_SCHEMA, orient="row"
-    )
+    dates = date_runs({run: _read_start(manifest) for run, manifest in manifests.items()})
+    notes += dates.notes if not {*by}.isdisjoint(_DATES) else ()
+    labelled = [_label_run(manifest, dates.days[run]) for run, manifest in manifests.items()]
+    rows = pl.DataFrame(labelled, schema=_SCHEMA, orient="row")
     dated = rows.with_columns(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals)
+    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, dates.notes)
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     return _leave_out_untrusted(compared) if trusted_only else compared
@@ -179,7 +182,7 @@ def read_digest(manifest: Manifest) -> str:
     return str(log.get("sha256")) if isinstance(log, dict) else manifest.run
 
 
-def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
+def _label_run(manifest: Manifest, day: str | None) -> dict[str, str | float | int | None]:
     details, facts = manifest.details, manifest.part("vehicle")
     mass = facts.get("mass_kg")
     return {
@@ -188,7 +191,7 @@ def _label_run(manifest: Manifest) -> dict[str, str | float | int | None]:
         "dataset": str(details.get("dataset") or "unknown"),
         "vehicle": str(facts.get("id") or "unknown"),
         "terrain": str(details.get("terrain") or "unknown"),
-        "day": read_day(manifest.run) or _read_day_of(_read_start(manifest)),
+        "day": day,
         "start": _read_start(manifest),
         "mass": float(mass) if isinstance(mass, (int, float)) else None,
         "squared_gyration": _square_gyration(facts),
@@ -206,14 +209,3 @@ def _read_start(manifest: Manifest) -> int | None:
     """Timestamp of the log's first sample [ns]."""
     start = manifest.part("stages", "extract", "context").get("start_ns")
     return start if isinstance(start, int) else None
-
-
-def _read_day_of(start: int | None) -> str | None:
-    """Day of a timestamp (UTC); None if the clock was not set."""
-    if start is None:
-        return None
-    try:
-        day = datetime.fromtimestamp(start / 1e9, UTC)
-    except (OverflowError, OSError, ValueError):
-        return None
-    return day.strftime("%Y-%m-%d") if day.year >= _EARLIEST_YEAR else None

@@ -4,11 +4,12 @@ import contextlib
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import finite_or_none, pick, pick_finite
+from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
 from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
@@ -37,6 +38,7 @@ from pipeline.job import FigureFormat, JobError, lack_runs
 from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
 from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
 from pipeline.job.prediction import fit_results
+from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.store import Store
 
 _EFFECT = "effect"
@@ -152,7 +154,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         figures: also write the figure to `figures/` in this format.
     """
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.comparison_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.causes_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
 
     written: dict[str, Path] = {}
     for name, frame in (
@@ -160,12 +162,15 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         ("cause_differences", _tabulate_pairs(causes)),
     ):
         written |= write_tables(store, name, frame, frame)
+    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
+    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
+    names |= {effect: name.replace("_", " ") for effect, name in causes.names.items()}
     sentences = [
-        format_difference(one, causes.names) + (f" ({one.note})" if one.note else "")
-        for one in causes.differences
+        format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
     ]
-    written["causes.html"] = write_page(store, "causes.html", render_causes(causes, sentences))
-    return written | write_figures(store, lambda: [draw_causes(causes.budgets, causes.names)], figures)
+    page = render_causes(replace(causes, names=names), sentences)
+    written["causes.html"] = write_page(store, "causes.html", page)
+    return written | write_figures(store, lambda: [draw_causes(causes.budgets, names)], figures)
 
 
 def _tabulate_budgets(causes: Causes) -> pl.DataFrame:
@@ -286,6 +291,30 @@ _SLIP = {
 }
 
 
+_HEALTH = ("warnings", "suspect share")
+_FINDING = "finding "
+
+
+def check_limits(limits: Mapping[str, float]) -> None:
+    """Refuse limits on quantities that no run can have.
+
+    Parameters of the catalogue and findings are accepted before a run has them, as a nightly check needs.
+
+    Raises:
+        JobError: ``no_such_quantity``.
+    """
+    slip = [name + suffix for name in _SLIP for suffix in ("", *(f" ({source})" for source in INPUT_WORDS))]
+    parameters = [f"{effect.id}.{one.name}" for effect in list_effects() for one in effect.parameters]
+    known = [*slip, *_HEALTH, *parameters]
+    for name in limits:
+        if name not in known and not name.startswith(_FINDING):
+            hint = (
+                f"{guess_names(name, known)}There are {', '.join([*_SLIP, *_HEALTH])}, findings "
+                "(as 'finding heading_skew') and parameters of effects (as effective_track.k)."
+            )
+            raise JobError("no_such_quantity", f"{name!r} in --limit is not a quantity", hint=hint)
+
+
 def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
     """Analyze trends over dates: of every quantity by group, and of every parameter by vehicle.
 
@@ -306,7 +335,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
     followed = set(dated["run"])
     undated = sorted(set(compared.manifests) - followed)
-    notes = list(compared.notes)
+    notes = [*compared.notes, *(note for note in compared.date_notes if note not in compared.notes)]
     if undated:
         notes.append(f"left out, because no date is known: {', '.join(undated)}")
     refused = sorted(compared.refusals.items())
@@ -333,7 +362,8 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
     numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
     names = [*(one.quantity for one in series), *numbers]
     known = {*names, *(name.split(" (")[0] for name in names)}
-    notes += [f"no run has the quantity {name!r} that a limit is for" for name in limits if name not in known]
+    missing = [name for name in limits if name not in known]
+    notes[:0] = [f"the limit on {name} is not checked: no run has this quantity" for name in missing]
     keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
     asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
     return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
@@ -355,11 +385,18 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
     if short:
         notes.append(f"too few runs to find a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
     needs: dict[str, list[str]] = {}
+    lost: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for number in parameters:
+        if number.undetermined:
+            lost.setdefault((number.vehicle, number.undetermined), []).append(number.label)
         if number.need:
             needs.setdefault(f"{number.vehicle}, {format_power(number)}", []).append(number.label)
         if number.odd:
             notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    notes += [
+        f"{', '.join(labels)} of {vehicle}, left out where a run does not determine it: {', '.join(runs)}"
+        for (vehicle, runs), labels in lost.items()
+    ]
     return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
 
 
@@ -368,7 +405,7 @@ def write_trend(store: Store, trend: Trend) -> Path:
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import render_trend  # noqa: PLC0415 - heavy
+    from pipeline.report.trend_page import render_trend  # noqa: PLC0415 - heavy
 
     return write_page(store, "trend.html", render_trend(trend))
 
@@ -433,7 +470,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .agg(pl.col("value").mean())
         .select(
             "run",
-            pl.concat_str(pl.lit("finding "), "id").alias("quantity"),
+            pl.concat_str(pl.lit(_FINDING), "id").alias("quantity"),
             pl.lit("").alias("unit"),
             "value",
         )
@@ -444,7 +481,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         .join(warnings, on="run", how="left")
         .select(
             "run",
-            pl.lit("warnings").alias("quantity"),
+            pl.lit(_HEALTH[0]).alias("quantity"),
             pl.lit("1").alias("unit"),
             pl.col("len").fill_null(0).cast(pl.Float64).alias("value"),
         )
@@ -453,7 +490,7 @@ def _read_health(compared: ComparedRuns) -> pl.DataFrame:
         compared.scan("slip")
         .group_by("run")
         .agg(pl.col("suspect").mean().alias("value"))
-        .select("run", pl.lit("suspect share").alias("quantity"), pl.lit("1").alias("unit"), "value")
+        .select("run", pl.lit(_HEALTH[1]).alias("quantity"), pl.lit("1").alias("unit"), "value")
         .collect()
     )
     return pl.concat([counts, counted, suspect])

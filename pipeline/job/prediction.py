@@ -12,11 +12,11 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none, pick
+from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none, guess_names, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.fleet import read_day
+from pipeline.fleet import UNKNOWN, read_day
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.fleet.levels import draw_run
@@ -270,7 +270,7 @@ class Prediction:
         ideal_t_mrmse_m: error over 2 s of the ideal model [m].
         median_modulus: median slip speed [m/s].
         runs_used: runs whose commands and residuals represent future runs.
-        notes: excluded runs with the reasons.
+        notes: excluded runs with the reasons, and where a forecast for a terrain without runs comes from.
     """
 
     forecast: Forecast
@@ -360,7 +360,19 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
     error, without, modulus_median = (_bound(column) for column in numbers.T)
     used = tuple(run.manifest.run for run in runs)
     vehicle = runs[0].comparison.context.vehicle
-    return Prediction(forecast, vehicle, error, without, modulus_median, used, compared.notes)
+    notes = compared.notes if forecast.here else (*compared.notes, _note_terrain(compared.labels, forecast))
+    return Prediction(forecast, vehicle, error, without, modulus_median, used, notes)
+
+
+def _note_terrain(labels: pl.DataFrame, forecast: Forecast) -> str:
+    """Note on a terrain without runs of the vehicle: whether it is known, and what the forecast is from."""
+    terrains = {str(name) for name in labels["terrain"]} - {UNKNOWN, forecast.terrain}
+    own = labels.filter(pl.col("run").is_in(list(forecast.elsewhere)))["terrain"].unique().sort()
+    source = f"the forecast is that of another ground, from {', '.join(own)}"
+    if not labels.filter(pl.col("terrain") == forecast.terrain).is_empty():
+        return f"no run of {forecast.vehicle} is on {forecast.terrain}: {source}"
+    known = f"{guess_names(forecast.terrain, terrains)}Known: {', '.join(sorted(terrains))}"
+    return f"{forecast.terrain} is an unknown terrain, no run is on it: {source}. {known}"
 
 
 def weigh_runs(there: Flags) -> Floats:

@@ -177,6 +177,18 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
     raise MotionError("unknown_effect", f"no effect is called {name!r}", where=name, hint=hint)
 
 
+def name_effect(effect: str) -> str:
+    """Name of an effect in words, as `Yaw rate limit` for `body_turn_limit`."""
+    return find_effect(effect).motion.partition(": ")[0] or effect.replace("_", " ").capitalize()
+
+
+def name_parameter(effect: str, parameter: str) -> str:
+    """Name of a parameter in words: that of its effect, with what it is if that has several."""
+    kind = find_effect(effect)
+    about = f": {kind().parameter(parameter).about}" if len(kind.parameters) > 1 else ""
+    return name_effect(effect) + about
+
+
 def refuse_taken(name: str, where: str = "effect") -> None:
     """Refuse a formula that is called like an effect of the catalogue.
 

@@ -27,7 +27,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core import SlipError, format_share, naming_os_errors, shorten
+from pipeline.core import SlipError, format_share, naming_os_errors, shorten, suffix_unit
 from pipeline.core.untrusted import mapping_in
 from pipeline.store import LOG_NOTES, Manifest, Store
 from pipeline.store.parquet_tables import scan_table
@@ -57,6 +57,8 @@ _OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
+_LABEL_LENGTH = 40
+"""Characters of an axis' label that stand beside a figure without making it narrow."""
 
 
 def begin_large(text: str) -> str:
@@ -65,9 +67,31 @@ def begin_large(text: str) -> str:
     return text if "_" in first or "." in first else text[:1].upper() + text[1:]
 
 
+def label_names(names: Sequence[str]) -> dict[str, str]:
+    """Labels for an axis, all different: names without their common folder, long ones cut in the middle."""
+    shared = os.path.commonprefix(list(names)).rpartition("/")[0]  # noqa: RUF071 - cut at a slash
+    # Labels of several columns have spaces about their slashes.
+    start = 0 if not shared or shared.endswith(" ") else len(shared) + 1
+    for most in range(_LABEL_LENGTH, max(map(len, names), default=0) + _LABEL_LENGTH):
+        labels = {name: _cut_middle(name[start:], most) for name in names}
+        if len(set(labels.values())) == len(set(names)):
+            return labels
+    return {name: name for name in names}
+
+
+def _cut_middle(text: str, most: int) -> str:
+    head = (most - 1) // 2
+    return text if len(text) <= most else f"{text[:head]}\u2026{text[head + 1 - most :]}"
+
+
 def set_squares(text: str) -> str:
     """Units of a text with squares as a page sets them: m/s\u00b2 for m/s^2."""
     return _SQUARE.sub("\\1\u00b2", text)
+
+
+def bracket_unit(unit: str) -> str:
+    """A unit in brackets behind the name of a quantity; empty for a plain number."""
+    return set_squares(f" [{unit}]") if suffix_unit(unit) else ""
 
 
 def format_number(value: float | None, *, digits: int = 3) -> str:
@@ -173,6 +197,7 @@ def _environment() -> Environment:
         keep_trailing_newline=True,
     )
     environment.filters |= {
+        "bracket_unit": bracket_unit,
         "bytes": format_bytes,
         "capital": begin_large,
         "squares": set_squares,
@@ -224,13 +249,16 @@ class Column:
 
     Attributes:
         title: its heading.
-        unit: small text after the heading.
+        unit: small text after the heading; `1` is none.
         number: whether it is right-aligned.
     """
 
     title: str
     unit: str = ""
     number: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "unit", suffix_unit(self.unit).strip())
 
 
 @dataclass(frozen=True)
@@ -377,8 +405,7 @@ def _list_cells(row: Mapping[str, object]) -> Iterator[tuple[Column, object, obj
 
 # Pages over all runs of a results folder, and their links.
 #
-# A page links the existing ones. Every page links the catalogue, which is rewritten with every page and so
-# links later ones.
+# Every page links the existing others; writing one brings the links of the others up to date.
 
 CATALOGUE = "index.html"
 PLANS = "workbench/plans"
@@ -396,15 +423,18 @@ _PLACE = re.compile(r'(<nav id="pages"[^>]*>).*?(</nav>)', re.DOTALL)
 
 
 def write_page(store: Store, name: str, page: str) -> Path:
-    """Write one of `PAGES` with links to the others, and rewrite the catalogue, which then links it.
+    """Write one of `PAGES` with links to the others, rewrite the catalogue, and renew the others' links.
 
-    Other pages are not changed: others may have written them, or they may be damaged.
+    Pages that are not as they were written, because they are damaged or of another origin, are not changed.
 
     Raises:
         StoreError: the disk reports an error.
     """
     path = store.write_results_text(name, _link(store, name, page))
     if name != CATALOGUE:
+        for other in PAGES:
+            if other not in (CATALOGUE, name):
+                store.edit_results_text(other, partial(_link, store, other))
         store.write_results_text(CATALOGUE, _link(store, CATALOGUE, render_catalogue(store)))
     return path
 

@@ -1,13 +1,11 @@
-"""Pages of `slip compare`: published figure, figure with intervals over runs, and causes."""
+"""Page of `slip compare`: published figure, and figure with intervals over runs."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, format_duration, format_share
 from pipeline.fleet import MEASURES
-from pipeline.fleet.causes import Budget, Causes, Difference
 from pipeline.fleet.pairs import (
     DIFFERENT,
     OF_TWO_RUNS,
@@ -25,8 +23,8 @@ from pipeline.report import (
     Picture,
     Table,
     format_distance,
-    format_known_share,
     format_number,
+    label_names,
     theme,
 )
 from pipeline.report.figures import Drawing
@@ -37,6 +35,7 @@ from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axi
 _ROW_HEIGHT = 34
 _GUTTER = 210
 _LABEL = 190
+_LABEL_LIMIT = 280
 
 
 def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
@@ -47,9 +46,10 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
         input_name: input u; determines the colour.
         title: title of the axis, with its unit.
     """
-    order = boxes.sort("median")["group"].to_list()
-    rows = boxes.select("group", "low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
-    base = Chart.of_rows("boxes").encode(y=_names(order))
+    labels = label_names(boxes.sort("median")["group"].to_list())
+    numbers = ("low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
+    rows = boxes.select("group", _label(labels), *numbers)
+    base = Chart.of_rows("boxes").encode(y=_names(labels))
     whiskers = base.mark("rule", color=theme.QUIET).encode(x=_axis("low", title), x2="high:Q")
     box = base.mark("bar", size=16, color=theme.INPUT_COLOURS[input_name], opacity=0.55).encode(
         x="q1:Q", x2="q3:Q"
@@ -58,7 +58,7 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
         x="median:Q",
         tooltip=["group:N", encode_column("median:Q", format=".3"), "windows:Q"],
     )
-    chart = _frame(layer(whiskers, box, middle), len(order))
+    chart = _frame(layer(whiskers, box, middle), len(labels))
     note = (
         "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
         "windows are correlated. The box says how slip is spread, not how sure its median is."
@@ -78,12 +78,13 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
         value: column with the medians.
         title: title of the axis, with its unit.
     """
-    order = datasets.sort("value")["dataset"].to_list()
-    points = runs.filter(pl.col(value).is_not_null()).select("group", "run", pl.col(value).alias("value"))
+    labels = label_names(datasets.sort("value")["dataset"].to_list())
+    points = runs.filter(pl.col(value).is_not_null(), pl.col("group").is_in(list(labels)))
+    points = points.select(_label(labels), "run", pl.col(value).alias("value"))
     highest = points["value"].max()
     end = 1.6 * float(highest) if isinstance(highest, float) else 1.0
     spans = datasets.select(
-        pl.col("dataset").alias("group"),
+        _label(labels, of="dataset"),
         "value",
         pl.col("low").clip(0.0, end),
         pl.col("high").clip(0.0, end),
@@ -97,7 +98,7 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
         Chart.of_rows("spans")
         .mark("rule", strokeWidth=5, opacity=0.75)
         .encode(
-            y=_names(order),
+            y=_names(labels),
             x=_axis("low", title, end=end),
             x2="high:Q",
             color=encode_column(
@@ -110,31 +111,41 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
     middles = (
         Chart.of_rows("spans")
         .mark("tick", size=18, thickness=2.5, color=theme.MEASURED)
-        .encode(y=_names(order), x="value:Q")
+        .encode(y=_names(labels), x="value:Q")
     )
     dots = (
         Chart.of_rows("run_medians")
         .mark("point", size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
         .encode(
-            y=_names(order),
+            y=_names(labels),
             x="value:Q",
             tooltip=["run:N", encode_column("value:Q", format=".3")],
         )
     )
-    chart = _frame(layer(bars, dots, middles), len(order))
+    chart = _frame(layer(bars, dots, middles), len(labels))
     cut = datasets.filter(pl.col("high") > end).height
     note = "A point is a run; a tick the median over runs."
     if cut:
-        note += f" Intervals that end beyond the axis: {cut}; too few runs to say more."
+        note += (
+            f" {cut} interval{'s are' if cut > 1 else ' is'} longer than the axis and cut: so few runs tell "
+            "little of others."
+        )
     sentence = ", ".join(
         f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows()
     )
     return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {sentence}.")
 
 
-def _names(order: Sequence[str]) -> Channel:
-    axis = {"title": None, "labelLimit": _LABEL, "minExtent": _LABEL, "grid": False, "labelColor": theme.INK}
-    return encode_column("group:N", sort=list(order), axis=axis, scale={"domain": list(order)})
+def _label(labels: Mapping[str, str], *, of: str = "group") -> pl.Expr:
+    return pl.col(of).replace_strict(labels, return_dtype=pl.String).alias("label")
+
+
+def _names(labels: Mapping[str, str]) -> Channel:
+    axis = {
+        "title": None, "labelLimit": _LABEL_LIMIT, "minExtent": _LABEL, "grid": False, "labelColor": theme.INK
+    }  # fmt: skip
+    order = list(labels.values())
+    return encode_column("label:N", sort=order, axis=axis, scale={"domain": order})
 
 
 def _axis(field: str, title: str, *, end: float | None = None) -> Channel:
@@ -172,12 +183,11 @@ _PAIRS = (
     Column("pair"), Column("shift b \u2212 a", "m/s", number=True), Column("95 % interval", number=True),
     Column("Cliff\u2019s delta"), Column("p corrected", number=True), Column("p of the pair", number=True),
     Column("smallest p", number=True), Column("verdict"), Column("unit"),
-    Column("plain p,", "not valid", number=True),
 )  # fmt: skip
 
 
-def render_comparison(answer: Answer) -> str:
-    """Render the complete page as HTML."""
+def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
+    """Render the complete page as HTML, with these of its notes."""
     shown = answer.datasets.filter(pl.col("input") == answer.input)
     facts = [
         f"{shown.height} datasets",
@@ -197,7 +207,7 @@ def render_comparison(answer: Answer) -> str:
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
         orders=list(dict.fromkeys(one.text for one in compare_orders(shown))),
-        notes=answer.notes,
+        notes=notes,
         counted=shown.select("dataset", "keys").to_dicts(),
     )
 
@@ -259,7 +269,7 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
         return None
     rows = [
         [
-            Cell(f"{row['a']} | {row['b']}", small=f"{row['runs_a']} + {row['runs_b']}"),
+            Cell(f"a {row['a']}", notes=[f"b {row['b']}", f"{row['runs_a']} + {row['runs_b']} runs"]),
             format_number(row["shift"]),
             _format_ends(row),
             f"{format_number(row['cliffs_delta'], digits=2)} {row['size']}",
@@ -268,7 +278,6 @@ def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
             _format_p(row["smallest_p"]),
             _format_pair(row),
             "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
-            Cell(small=_format_p(row["p_uncorrected"])),
         ]
         for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
     ]
@@ -349,128 +358,3 @@ def _rate(shown: pl.DataFrame) -> pl.DataFrame:
 #
 # The published figure (all windows of a dataset in one box), the statistically valid one beside it (runs as
 # points, with an interval over runs), the pairs with their tests, and the measures of difficulty.
-
-
-_COLOURS = (
-    theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
-    theme.MEASURED,
-)  # fmt: skip
-_LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
-_OTHERS = "other effects"
-
-
-def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
-    """Render the complete page as HTML; sentences: the differences in words."""
-    budgets, names, keys = causes.budgets, causes.names, causes.keys
-    return render_figures(
-        "report/templates/causes.html",
-        [draw_causes(budgets, names)],
-        title="Deployments compared by cause",
-        facts=[
-            f"{len(budgets)} dataset{'s' * (len(budgets) != 1)}",
-            f"{len(keys)} run{'s' * (len(keys) != 1)}",
-            f"slip {INPUT_WORDS[causes.input]}",
-        ],
-        sentence_list=sentences,
-        budgets=_tabulate_budgets(budgets, names),
-        differences=_tabulate_differences(causes.differences, names),
-        notes=causes.notes,
-        runs=keys,
-    )
-
-
-def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
-    """Draw a bar per dataset with the length of its RMS slip, split into causes; the largest are coloured."""
-    size: dict[str, float] = {}
-    for budget in budgets:
-        for part in budget.parts:
-            if part.kind == "effect":
-                size[part.name] = size.get(part.name, 0.0) + abs(part.share) * budget.total
-    shown = sorted(size, key=lambda name: -size[name])[: len(_COLOURS)]
-    rows = []
-    for budget in budgets:
-        rms = math.sqrt(budget.total)
-        for part in budget.parts:
-            known = part.kind != "effect" or part.name in shown
-            cause = names.get(part.name, part.name) if known else _OTHERS
-            rows.append(
-                (
-                    budget.dataset,
-                    cause.replace("_noise", " noise"),
-                    rms * part.share,
-                    format_known_share(part.share),
-                )
-            )
-    kinds = {"dataset": pl.String, "cause": pl.String, "slip": pl.Float64, "told": pl.String}
-    order = [*(names.get(name, name) for name in shown), _OTHERS, "disturbance", "localization noise"]
-    colours = [*_COLOURS[: len(shown)], theme.INK, *_LEFT.values()]
-    chart = (
-        Chart.of_rows("causes")
-        .mark("bar")
-        .encode(
-            y=encode_column(
-                "dataset:N",
-                sort=[budget.dataset for budget in budgets],
-                axis={"title": None, "grid": False},
-            ),
-            x=encode_column(
-                "sum(slip):Q", axis={"title": "rms slip over half a second [m/s]", "format": ",~r"}
-            ),
-            color=encode_column(
-                "cause:N",
-                scale={"domain": order, "range": colours},
-                legend={"title": None, "columns": 3},
-            ),
-            tooltip=["dataset:N", "cause:N", encode_column("told:N", title="share")],
-        )
-        .properties(width=640, height={"step": 30}, usermeta={"gutter": 150})
-    )
-    frame = pl.DataFrame(rows, schema=kinds, orient="row")
-    sentence = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
-    note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
-    return Picture(
-        "causes",
-        "Rms slip of each dataset by cause",
-        Drawing(chart, {"causes": frame}, note, f"Rms slip: {sentence}."),
-    )
-
-
-def _tabulate_budgets(budgets: Sequence[Budget], names: Mapping[str, str]) -> Table:
-    columns = (
-        Column("dataset"), Column("runs", number=True), Column("cause"), Column("share", number=True),
-        Column("95 % interval", number=True),
-    )  # fmt: skip
-    rows = [
-        (
-            one.dataset,
-            str(one.runs),
-            names.get(part.name, part.name),
-            format_known_share(part.share),
-            _format_cause_ends(part.low, part.high),
-        )
-        for one in budgets
-        for part in one.parts
-    ]
-    return Table("Budgets: shares of the mean square slip, means over runs", columns, rows)
-
-
-def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str, str]) -> Table:
-    columns = (
-        Column("difference"), Column("cause"), Column("more slip", "m/s", number=True),
-        Column("95 % interval", number=True), Column("p corrected", number=True), Column("unit"),
-    )  # fmt: skip
-    rows = [
-        (f"{one.b} \u2212 {one.a}", names.get(part.name, part.name), format_number(part.difference),
-         _format_cause_ends(part.low, part.high, format_number), format_number(part.p_adjusted), one.unit)
-        for one in differences
-        for part in one.parts
-    ]  # fmt: skip
-    return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
-
-
-def _format_cause_ends(
-    low: float, high: float, format_end: Callable[[float], str] = format_known_share
-) -> str:
-    if not (math.isfinite(low) and math.isfinite(high)):
-        return MISSING
-    return f"{format_end(low)} to {format_end(high)}"

@@ -12,7 +12,7 @@ import polars as pl
 from pipeline.core import INPUT_WORDS
 from pipeline.fleet import Measure
 from pipeline.fleet.deployments import ZONES, DeploymentMap
-from pipeline.report import Cell, Column, Picture, Table, format_number, theme
+from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
@@ -375,7 +375,7 @@ def picture_map(drawn: DeploymentMap) -> Picture:
         f"{points.height} deployments of the literature and {own.height} own datasets, by kinetic energy and "
         f"terrain complexity. At high risk: {', '.join(high) or 'none'}."
     )
-    about = f"{measure.name} {INPUT_WORDS[drawn.input]} [{measure.unit}]"
+    about = f"{measure.name} {INPUT_WORDS[drawn.input]}{bracket_unit(measure.unit)}"
     return Picture("deployment_map", "The map", draw_map(points, own, about, words))
 
 

@@ -341,6 +341,20 @@ class Store:
             self._renew_register()
         return path
 
+    def edit_results_text(self, name: str, edit: Callable[[str], str]) -> None:
+        """Edit a text of the whole results; one that is not as it was written stays as it is.
+
+        Raises:
+            StoreError: as `write_results_text`.
+        """
+        check_file_name(name)
+        path = join_inside(self.root, name)
+        with self._lock(self.root), name_disk_errors(path):
+            data = self._read_written(name)
+            if data is not None and (edited := edit(data.decode(errors="replace")).encode()) != data:
+                self._replace(path, edited)
+                self._renew_register()
+
     def notes(self, folder: str) -> Notes:
         """Small notes beside the results, in a folder of their own."""
         return Notes(self.root, folder)
@@ -427,12 +441,8 @@ class Store:
         """
         if self._key is None:
             return
-        name = (home / MANIFEST).relative_to(self.root).as_posix()
-        data, entry = self._read(name), self._read(entry_name(name))
-        with suppress(ValueError):
-            listed = parse_entry(entry or b"", entry_name(name))
-            if listed.is_sealed_with(self._key) and data and hash_bytes(data) in listed.sha256:
-                return
+        if self._read_written((home / MANIFEST).relative_to(self.root).as_posix()) is not None:
+            return
         raise StoreError(
             "not_sealed",
             "the results of the run are not what was sealed with the key",
@@ -448,6 +458,15 @@ class Store:
                 return path.read_bytes()
             except (FileNotFoundError, NotADirectoryError):
                 return None
+
+    def _read_written(self, name: str) -> bytes | None:
+        """The content of a file that is as it was written, with the key if there is one; else None."""
+        data, entry = self._read(name), self._read(entry_name(name))
+        with suppress(ValueError):
+            listed = parse_entry(entry or b"", entry_name(name))
+            if listed.is_sealed_with(self._key) and data and hash_bytes(data) in listed.sha256:
+                return data
+        return None
 
     def _replace(self, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
         replace_listed(self.root, path, data, manifest, key=self._key)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,8 @@ from pipeline.fleet import ComparisonError
 from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders, count_pairs
 from pipeline.job import JobError
 from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer
+from pipeline.report import label_names
+from pipeline.report.comparison_page import list_pictures
 from pipeline.report.scene import format_ends
 from pipeline.store import Store
 from schemas import list_contracts
@@ -317,8 +320,44 @@ def test_pages_and_terminal_count_pairs_alike(store: Store, capsys: pytest.Captu
     counted = count_pairs(ask(store).comparisons.to_dicts())
     assert counted in shown
     assert counted in (store.root / "comparison.html").read_text("utf-8")
-    # The terminal has no column of the plain test.
+    # Only the files have the plain test, which is not valid.
     assert "p_uncorrected" not in shown
+    assert not re.search(
+        "plain p|not valid|p_uncorrected", (store.root / "comparison.html").read_text("utf-8")
+    )
+    assert "p_uncorrected" in (store.root / "comparisons.csv").read_text("utf-8")
+
+
+def test_runs_with_long_names_have_different_labels(store: Store) -> None:
+    start = "logs/warthog_wheels_of_the_second_robot_on_"
+    names = [
+        f"{start}{ground}_2024_8_7_11h30s{second}" for ground in ("gravel", "ice") for second in (30, 31)
+    ]
+    for number, name in enumerate(names):
+        write_run(store, Run(name=name, median=1.0 + number, seconds=30.0))
+    for picture in list_pictures(compare_results(store, Question(by=("run",)))):
+        rows = next(rows for rows in picture.drawing.rows.values() if "label" in rows.columns)
+        labels = rows["label"].to_list()
+        assert len(set(labels)) == len(names)
+        assert all(label.startswith("warthog_wheels") and label[-2:] in {"30", "31"} for label in labels)
+
+
+@pytest.mark.parametrize(
+    ("names", "labels"),
+    [
+        (["husky_tile", "warthog_ice"], ["husky_tile", "warthog_ice"]),
+        (["husky / tile", "husky / ice"], ["husky / tile", "husky / ice"]),
+        (["logs/a", "logs/ab"], ["a", "ab"]),
+        (["logs/a", "field/a"], ["logs/a", "field/a"]),
+        (["logs/a"], ["a"]),
+        ([], []),
+        (["x" * 30 + "1" + "y" * 30, "x" * 30 + "2" + "y" * 30], None),
+    ],
+)
+def test_labels_of_an_axis_are_short_and_differ(names: list[str], labels: list[str] | None) -> None:
+    made = list(label_names(names).values())
+    assert labels is None or made == labels
+    assert len(set(made)) == len(names)
 
 
 def test_an_end_that_rounds_to_zero_has_no_sign() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from datetime import UTC, date, datetime, timedelta
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,7 @@ from pipeline.fleet import read_day
 from pipeline.fleet.rank_tests import LEVEL
 from pipeline.fleet.trend import Trend, follow_quantities, format_quiet
 from pipeline.job import JobError
-from pipeline.job.over_runs import follow_trend, write_trend
+from pipeline.job.over_runs import check_limits, follow_trend, write_trend
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -72,6 +73,14 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
     page = write_trend(store, found).read_text(encoding="utf-8")
     assert "1.8 -&gt; 2.1 since 2026-05-03" in page
+    titles = re.findall("<h3>([^<]+)</h3>", page)
+    assert titles[:2] == ["Effective track (effective_track.k)", "Median slip speed from commands [m/s]"]
+    assert titles[-3:] == [
+        "Value of the finding heading_skew",
+        "Share of suspect samples",
+        "Number of warnings",
+    ]
+    assert "Median norm of slip over 2 s from wheel encoders [m/s]" in titles
 
 
 @pytest.mark.parametrize(
@@ -213,7 +222,7 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
     )  # fmt: skip
     found = follow(store, limits={"effective_track.k": 0.7})
     assert found.parameters[0].points["run"][-1] != "last"
-    text = "effective_track.k of warthog-2 is 0.75 1 in last, above the limit of 0.7"
+    text = "effective_track.k of warthog-2 is 0.75 in last, above the limit of 0.7"
     assert text in [alert.text for alert in found.alerts]
 
 
@@ -235,11 +244,102 @@ def test_limits_that_are_not_finite_are_one_line(
     assert told in capsys.readouterr().err
 
 
-def test_several_limits_and_unknown_ones(store: Store) -> None:
+def test_limits_that_no_run_has_yet_are_said_first(store: Store) -> None:
     drive_a_season(store, [1.8, 1.8])
-    found = follow(store, limits={"warnings": 0.0, "beauty": 1.0})
-    assert [alert.quantity for alert in found.alerts] == ["warnings"]
-    assert any("'beauty'" in note for note in found.notes)
+    limits = {"warnings": 0.0, "effective_track.k": 1.7, "wheel_radius.k": 1.0, "finding time_jump": 1.0}
+    check_limits(limits)
+    found = follow(store, limits=limits)
+    assert {alert.quantity for alert in found.alerts} == {"warnings", "effective_track.k"}
+    assert "effective_track.k of warthog-2 is 1.8 in run_01, above the limit of 1.7" in [
+        alert.text for alert in found.alerts
+    ]
+    assert found.notes[:2] == tuple(
+        f"the limit on {name} is not checked: no run has this quantity"
+        for name in ("wheel_radius.k", "finding time_jump")
+    )
+
+
+@pytest.mark.parametrize(
+    ("limit", "hint"),
+    [
+        ("median_modulos=1", "Did you mean median_modulus"),
+        ("effective_track.q=1", "Did you mean effective_track.k"),
+        ("beauty=1", "There are median_modulus, "),
+    ],
+)
+def test_a_limit_on_no_quantity_is_an_error(
+    store: Store, limit: str, hint: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    drive_a_season(store, [1.8])
+    with pytest.raises(SystemExit) as ended:
+        main(["fleet", "trend", str(store.root), "--limit", limit])
+    assert ended.value.code == 1
+    told = capsys.readouterr()
+    assert "nothing" not in told.out
+    assert f"{limit.split('=', maxsplit=1)[0]!r} in --limit is not a quantity" in told.err
+    assert hint in " ".join(told.err.split())
+    assert not (store.root / "trend.html").exists()
+
+
+def test_an_undetermined_number_is_named_with_its_run(store: Store) -> None:
+    drive_a_season(store, [1.8, 1.81, 1.8, 1.81])
+    write_run(
+        store,
+        Run(
+            name="gentle", dataset="warthog-2_gravel", vehicle="warthog-2", seconds=30.0,
+            start_ns=stamp_of(FIRST + timedelta(days=9)), estimates=[("effective_track", "k", 1.8, 4e5)],
+        ),
+    )  # fmt: skip
+    found = follow(store)
+    (track,) = found.parameters
+    assert track.shown_latest == "1.8 (undetermined)"
+    assert "effective_track.k of warthog-2, left out where a run does not determine it: gentle" in found.notes
+    assert "Not drawn, undetermined: gentle." in write_trend(store, found).read_text(encoding="utf-8")
+
+
+def test_a_ground_has_one_mark_and_a_wide_interval_sets_no_axis(store: Store) -> None:
+    ends = [
+        ("asphalt", 1.5),
+        ("gravel", 1.6),
+        ("sand", 1.7),
+        ("asphalt", 1.51),
+        ("gravel", 1.61),
+        ("sand", 1.69),
+    ]
+    for i, (terrain, track) in enumerate(ends):
+        error = 0.3 if i == 2 else 0.004
+        estimates = [("effective_track", "k", track, error)]
+        estimates += [("lateral_skid", "c", 0.1, 0.01)] if terrain != "asphalt" else []
+        start = stamp_of(FIRST + timedelta(days=i))
+        write_run(
+            store, Run(name=f"r{i}", terrain=terrain, seconds=30.0, start_ns=start, estimates=estimates)
+        )
+    page = write_trend(store, follow(store)).read_text(encoding="utf-8")
+    data = json.loads(re.search('id="page-data">(.*?)</script>', page)[1])  # type: ignore[index]
+    drawn = {name: json.dumps(spec) for name, spec in data["figures"].items() if "parameter" in name}
+    track, skid = drawn["parameter_0_0"], drawn["parameter_0_1"]
+    for spec, shown in ((track, ["asphalt", "gravel", "sand"]), (skid, ["gravel", "sand"])):
+        assert '"scale": {"domain": ["asphalt", "gravel", "sand"]}' in spec
+        assert f'"values": {json.dumps(shown)}' in spec
+    low, high = json.loads(re.search(r'"domain": (\[[^]]*\]), "zero": false', track)[1])  # type: ignore[index]
+    assert 1.4 < low < 1.5
+    assert 1.7 < high < 1.8
+    assert "Intervals that are longer than the axis are cut." in page
+
+
+def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
+    for name in ("ice_2024_7_30", "gravel_2023_12_12", "asphalt"):
+        write_run(store, Run(name=name, seconds=30.0))
+    found = follow(store)
+    assert found.series[0].points["run"].to_list() == ["gravel_2023_12_12", "ice_2024_7_30"]
+    assert found.notes[:2] == (
+        (
+            "the clocks of 3 runs start at the very same instant of 2023-11-14, which names contradict: "
+            "the dates in the names of 2 count; the others have no date"
+        ),
+        "left out, because no date is known: asphalt",
+    )
+    assert "very same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
 
 
 def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
@@ -254,6 +354,7 @@ def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
         ("warthog_2024_8_7_11h30s30", "2024-08-07"),
         ("2026-05-03_gravel", "2026-05-03"),
         ("run_2024_13_40", None),
+        ("run_2024_2_31", None),
         ("run_7", None),
     ],
 )

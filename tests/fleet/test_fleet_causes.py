@@ -165,6 +165,8 @@ def test_the_answer_is_told_and_written(results: Store, capsys: pytest.CaptureFi
 
     page = Path(told["page"]).read_text(encoding="utf-8")
     assert difference["sentence"].split(":")[0].removeprefix("warthog_ice") in page
+    assert "longitudinal slip" in page
+    assert "longitudinal_slip" not in page
     table = pl.read_csv(results.root / "causes.csv")
     assert table.group_by("dataset").agg(pl.col("share").sum())["share"].to_list() == pytest.approx(
         [1.0, 1.0], abs=1e-4

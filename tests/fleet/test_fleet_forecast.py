@@ -11,6 +11,7 @@ import pytest
 from comparison_store import Run, write_run
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
+from pipeline.cli.verbs_fleet import _format_expected
 from pipeline.fleet import ComparisonError
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
@@ -19,11 +20,13 @@ from pipeline.job.over_runs import follow_trend
 from pipeline.job.prediction import (
     Expected,
     Prediction,
+    _note_terrain,
     find_estimates,
     fit_results,
     make_model_file,
     summarize_prediction,
 )
+from pipeline.models import find_effect
 from pipeline.models.parameter import Level
 from pipeline.sources import find_preset
 from pipeline.store import Store
@@ -96,6 +99,28 @@ def test_an_interval_that_a_bound_cuts_is_none_of_the_written_model() -> None:
         kept[number.label] = number.label in make_model_file(prediction).intervals
         assert f"'at_bound': {not kept[number.label]}" in str(summarize_prediction(prediction))
     assert kept == {"body_inertia.tau": False, "wheel_radius.k": True}
+
+
+def test_a_limit_that_no_run_reaches_is_said_to_be_none() -> None:
+    limit = find_effect("acceleration_limit")().parameter("limit")
+    number = {"value": 500.0, "low": 4.23, "high": 500.0, "at_bound": True, "default_spread": False}
+    assert _format_expected(number, limit) == "no limit, or one of at least 4.23 rad/s^2"
+    number["value"] = 18.0
+    assert _format_expected(number, limit) == (
+        "18 rad/s^2 [4.23, 500] (the interval ends at a limit of the search)"
+    )
+
+
+def test_a_terrain_of_other_vehicles_is_no_unknown_one() -> None:
+    labels = pl.DataFrame(
+        [("w0", "warthog", "asphalt"), ("w1", "warthog", "gravel"), ("h", "husky", "snow")],
+        schema=["run", "vehicle", "terrain"],
+        orient="row",
+    )
+    forecast = Forecast("warthog", "snow", "command", (), (), ("w0", "w1"))
+    assert _note_terrain(labels, forecast) == (
+        "no run of warthog is on snow: the forecast is that of another ground, from asphalt, gravel"
+    )
 
 
 def test_a_vehicle_without_runs_is_refused_in_one_line() -> None:

@@ -223,7 +223,13 @@ def test_what_is_fitted_is_written_and_shown_again(
         text.splitlines()[-1] == fitted["summary"] == "1 parameter in 9 runs of 1 vehicle: 1 of the terrain."
     )
     page = (results.root / "fleet.html").read_text(encoding="utf-8")
-    for word in ("longitudinal_slip", number["because"].split(" (")[0], "ice", 'href="index.html"'):
+    for word in (
+        "Longitudinal slip",
+        "wheel_radius.k",
+        number["because"].split(" (")[0],
+        "ice",
+        'href="index.html"',
+    ):
         assert word in page
     assert 'href="fleet.html"' in (results.root / "index.html").read_text(encoding="utf-8")
 

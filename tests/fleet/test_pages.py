@@ -38,7 +38,7 @@ def nav_of(path: Path) -> str:
     return nav[1]
 
 
-def test_a_page_links_those_that_are_there_and_the_catalogue_all_that_came_since(tmp_path: Path) -> None:
+def test_every_page_links_those_that_are_there_and_all_that_came_since(tmp_path: Path) -> None:
     store = make_results(tmp_path)
     assert links_of(tmp_path / "index.html") == []
     assert "slip" not in nav_of(tmp_path / "index.html")
@@ -48,6 +48,8 @@ def test_a_page_links_those_that_are_there_and_the_catalogue_all_that_came_since
     write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
     assert links_of(tmp_path / "trend.html") == ["index.html", "map.html"]
+    assert links_of(tmp_path / "map.html") == ["index.html", "trend.html"]
+    assert store.examine().problems == ()
     for page in ("index.html", "map.html", "trend.html"):
         assert all((tmp_path / link).is_file() for link in links_of(tmp_path / page))
     update_datasets(store)

@@ -98,6 +98,22 @@ def test_runs_say_what_change_they_would_tell() -> None:
     assert sum(told) >= 15
 
 
+def test_a_run_that_does_not_determine_a_number_sets_no_scale() -> None:
+    estimates, days = make_season(np.random.default_rng(8), ["asphalt"] * 12)
+    is_last = pl.col("run") == "r11"
+    others = follow_one((estimates.filter(~is_last), days))
+    wide = estimates.with_columns(standard_error=pl.when(is_last).then(4e5).otherwise("standard_error"))
+    bound = estimates.with_columns(at_bound=is_last)
+    for season in (wide, bound):
+        trend = follow_one((season, days))
+        assert trend.undetermined == ("r11",)
+        assert "r11" not in trend.points["run"].to_list()
+        assert trend.least == others.least < 0.1
+        assert trend.shown_latest.endswith(" (undetermined)")
+    alone = follow_parameters(wide.filter(is_last), days, level=0.05)
+    assert alone == ()
+
+
 def test_grounds_driven_once_cannot_be_compared_over_time() -> None:
     trend = follow_one(make_season(np.random.default_rng(7), ["asphalt", "gravel", "sand"]))
     assert trend.changes == ()

@@ -183,7 +183,20 @@ def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.Captu
     other = elsewhere["effects"][0]["parameters"]["k"]
     assert other["high"] - other["low"] > k["high"] - k["low"]
     assert (elsewhere["runs_on_terrain"], elsewhere["runs_elsewhere"]) == (0, 3)
+    assert elsewhere["notes"] == [
+        (
+            "ice is an unknown terrain, no run is on it: the forecast is that of another ground, from tile. "
+            "Known: tile"
+        )
+    ]
+    assert told["notes"] == []
+    typo = run_slip(capsys, *chosen, "--terrain", "tille")[1].splitlines()
+    assert typo[0] == "husky_a200 on tille: 0 runs there, 3 elsewhere"
+    assert typo[1].startswith("! tille is an unknown terrain, no run is on it")
+    assert "Did you mean tile?" in typo[1]
     text = run_slip(capsys, *chosen, "--terrain", "tile")[1]
+    assert "position error over 2 s" in text
+    assert "that of the ideal model" in text
     assert "husky_a200 on tile: 3 runs there, 0 elsewhere" in text
     assert "effective_track.k" in text
 
