@@ -2,102 +2,24 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING
-from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
-import yaml
-from motion_runs import vehicle_of
+from exported_files import CAR, F1TENTH, FIT, HUSKY, make, make_full, predict, read, take
 from target_schemas import ALL, SCHEMAS
 from verbs import run_verb
 
 from pipeline import export
 from pipeline.estimation.estimates import format_parameters, list_parameters
 from pipeline.export import export_model, find_target, list_targets, read_current
-from pipeline.models import Model, ModelFile, Place, find_effect, list_effects
+from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.run import MotionError
-
-if TYPE_CHECKING:
-    from pipeline.models import Effect
-
-HUSKY, CAR, F1TENTH = (vehicle_of(name) for name in ("husky_a200", "ackermann_car", "f1tenth"))
-FIT = {
-    "input": "measured",
-    "runs": [{"run": "yard/monday"}],
-    "ladder": [
-        {"effects": [], "velocity_rms": [0.3, 0.2, 0.4], "t_mrmse_m": 0.5},
-        {"effects": ["drive_lag"], "velocity_rms": [0.02, 0.03, 0.05], "t_mrmse_m": 0.1},
-        {"effects": ["drive_lag", "icr_offset"], "velocity_rms": [0.02, 0.01, 0.05], "t_mrmse_m": 0.05},
-    ],
-}
-
-
-def make(*effects: Effect, vehicle: object = HUSKY, **more: object) -> ModelFile:
-    return ModelFile(Model(vehicle, effects), **more)  # type: ignore[arg-type]
-
-
-def make_full(vehicle: object) -> ModelFile:
-    """A model with every effect that its vehicle can have, at a usual size."""
-    effects = [
-        kind().change(**{p.name: p.typical for p in kind.parameters if not p.instead_of})
-        for kind in list_effects()
-        if vehicle.kind in kind.kinds  # type: ignore[attr-defined]
-    ]
-    known = {
-        f"{effect.id}.{name}": (0.9 * value, 1.1 * value)
-        for effect in effects
-        for name, value in effect.values.items()
-    }
-    return make(*effects, vehicle=vehicle, fit=FIT, intervals=known)
-
-
-def flatten(tree: object, path: str = "") -> dict[str, object]:
-    if not isinstance(tree, dict):
-        return {path: tree}
-    return {
-        k: v for name, item in tree.items() for k, v in flatten(item, f"{path}.{name}".strip(".")).items()
-    }
-
-
-def read(name: str, text: str) -> dict[str, object]:
-    """The parameters of an exported file, read as those who take it read it."""
-    if name == "gazebo":
-        root = ET.fromstring(text)  # noqa: S314 - it is our own
-        assert root.tag == "plugin"
-        assert set(root.attrib) == {"filename", "name"}
-        return {element.tag: float(element.text or "nan") for element in root}
-    if name == "px4":
-        # QGroundControl's documented columns: vehicle, component, name, value, MAV_PARAM_TYPE.
-        rows = list(csv.reader((line for line in text.splitlines() if line[:1] != "#"), delimiter="\t"))
-        assert {tuple(row[:2]) for row in rows} == {("1", "1")}
-        assert {row[4] for row in rows} == {"9"}
-        return {row[2]: float(row[3]) for row in rows}
-    # The parser of ROS 2 is libyaml; launch files use PyYAML's own.
-    tree = yaml.load(text, Loader=yaml.CSafeLoader)
-    assert tree == yaml.safe_load(text)
-    return flatten(tree)
-
-
-def take(name: str, file: ModelFile) -> dict[str, float]:
-    """The parameters by the last part of their names."""
-    found = read(name, export_model(file, name))
-    return {path.split("ros__parameters.")[-1]: value for path, value in found.items()}  # type: ignore[misc]
-
-
-def predict(file: ModelFile, commands: list[tuple[float, ...]], until_s: float) -> np.ndarray:
-    """Motion of the vehicle that the model describes: time, x, y, yaw, v_x, v_y, v_w."""
-    space: dict[str, object] = {}
-    exec(compile(export_model(file, "python"), "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    return np.array(space["predict"](commands, until_s))  # type: ignore[operator]
-
 
 PARAMETERS = sorted(SCHEMAS)
 CASES = [
@@ -262,76 +184,6 @@ def test_a_rover_of_px4_turns_as_it_is_asked() -> None:
     throttle = 0.6 * p["RD_WHEEL_TRACK"] / 2.0 * p["RO_YAW_RATE_CORR"] / p["RO_MAX_THR_SPEED"]
     wheel = throttle * 8.0
     assert predict(file, [(-1.0, -wheel, wheel)], 1.0)[-1, 6] == pytest.approx(0.6, rel=1e-3)
-
-
-def test_limits_are_reached_and_not_more() -> None:
-    effects = (
-        find_effect("effective_track")(k=1.8),
-        find_effect("wheel_radius")(k=0.9),
-        find_effect("wheel_speed_limit")(limit=6.0),
-        find_effect("acceleration_limit")(limit=3.0),
-        find_effect("body_turn_limit")(limit=5.0),
-    )
-    file = make(*effects)
-    p, q, degrees = take("nav2", file), take("gazebo", file), take("px4", file)
-    straight = predict(file, [(-1.0, 99.0, 99.0)], 4.0)
-    spin = predict(make(*effects[:-1]), [(-1.0, -99.0, 99.0)], 4.0)
-    assert straight[-1, 4] == pytest.approx(p["FollowPath.vx_max"], rel=1e-4)
-    assert spin[-1, 6] == pytest.approx(p["FollowPath.wz_max"], rel=1e-4)
-    assert np.diff(straight[:100, 4]).max() / 0.005 == pytest.approx(p["FollowPath.ax_max"], rel=1e-4)
-    assert np.diff(spin[:100, 6]).max() / 0.005 == pytest.approx(p["FollowPath.az_max"], rel=1e-4)
-    assert p["max_velocity"] == [p["FollowPath.vx_max"], 0.0, p["FollowPath.wz_max"]]  # type: ignore[comparison-overlap]
-    assert q["max_linear_velocity"] == -q["min_linear_velocity"] == p["FollowPath.vx_max"]
-    assert math.radians(degrees["RO_YAW_RATE_LIM"]) == pytest.approx(p["FollowPath.wz_max"], rel=1e-4)
-
-
-def test_ramps_of_the_command_are_limits_of_acceleration() -> None:
-    effects = (
-        find_effect("effective_track")(k=1.8),
-        find_effect("wheel_radius")(k=0.9),
-        find_effect("body_acceleration_limit")(limit=1.0),
-        find_effect("turn_acceleration_limit")(limit=2.0),
-    )
-    file = make(*effects)
-    p, degrees = take("nav2", file), take("px4", file)
-    straight, spin = predict(file, [(-1.0, 9.0, 9.0)], 1.0), predict(file, [(-1.0, -9.0, 9.0)], 1.0)
-    assert np.diff(straight[:100, 4]).max() / 0.005 == pytest.approx(p["FollowPath.ax_max"], rel=1e-4)
-    assert np.diff(spin[:100, 6]).max() / 0.005 == pytest.approx(p["FollowPath.az_max"], rel=1e-4)
-    assert math.radians(degrees["RO_YAW_ACCEL_LIM"]) == pytest.approx(p["FollowPath.az_max"], rel=1e-4)
-    # Of two limits the smaller one holds; ros2_control has a parameter for both.
-    steep = make(*effects, find_effect("acceleration_limit")(limit=99.0))
-    assert take("nav2", steep)["FollowPath.ax_max"] == p["FollowPath.ax_max"]
-    assert "No parameter there stands for" not in export_model(make(*effects[2:]), "ros2_control")
-
-
-def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
-    """Wet grass: a command that is clipped at 1.01 rad/s turns a track twice as wide by .5 rad/s."""
-    effects = (find_effect("effective_track")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
-    file = make(*effects)
-    spin = predict(file, [(-1.0, -99.0, 99.0)], 4.0)
-    assert spin[-1, 6] == pytest.approx(take("nav2", file)["FollowPath.wz_max"], rel=1e-4)
-    assert "# No parameter there stands for:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
-    # What the body reaches is not known with a track that is not: the command's own limit is written.
-    leo = vehicle_of("leo_rover")
-    fit = FIT | {"undecided": [["effective_track", "icr_lateral"]]}
-    known = {"effective_track.k": (1.9, 2.1), "body_turn_limit.limit": (0.9, 1.1)}
-    open_track = make(*effects, vehicle=leo, fit=fit, intervals=known)
-    assert take("nav2", open_track)["FollowPath.wz_max"] == 1.0
-    assert take("nav2", make(effects[1], vehicle=leo))["FollowPath.wz_max"] == 1.0
-    # The controller that is told of the track asks for no more than its limit lets through.
-    control = take("ros2_control", file)
-    asked = control["angular.z.max_velocity"] * control["wheel_separation_multiplier"]
-    assert asked == pytest.approx(1.0, rel=1e-4)
-
-
-def test_a_car_with_a_longer_wheelbase_reaches_less_than_its_limit() -> None:
-    longer = (find_effect("effective_wheelbase")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
-    assert take("nav2", make(*longer, vehicle=CAR))["FollowPath.wz_max"] == 0.5
-
-
-def test_of_two_limits_the_smaller_one_holds() -> None:
-    limits = (find_effect("body_speed_limit")(limit=0.5), find_effect("wheel_speed_limit")(limit=99.0))
-    assert take("nav2", make(*limits))["FollowPath.vx_max"] == 0.5
 
 
 @pytest.mark.parametrize("name", ["drive_lag", "body_inertia", "turn_lag"])
