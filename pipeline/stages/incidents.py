@@ -97,7 +97,7 @@ class Rims:
         command: commanded speed, zero without a valid command.
         asked: (f_x, f_y, f_w times half the track) of the command, shape (n, 3).
         is_known: whether a command is valid, or the topic is silent after its first one.
-        kept: what the last command asked where it is too old to be valid, else zero, shape (n, 3).
+        expired: what the last command asked where it is too old to be valid, else zero, shape (n, 3).
         wheels: measured; None without encoders.
         driven: (f_x, f_y, f_w times half the track) of the wheels, zero where unknown, shape (n, 3).
         body: speed of the poses.
@@ -109,7 +109,7 @@ class Rims:
     command: Floats
     asked: Floats
     is_known: Flags
-    kept: Floats
+    expired: Floats
     wheels: Floats | None
     driven: Floats
     body: Floats
@@ -119,8 +119,8 @@ class Rims:
     @property
     def goes_on(self) -> Flags:
         """Whether the vehicle moves as its last command asked, which is too old to be valid."""
-        apart = np.linalg.norm((self.moved if self.wheels is None else self.driven) - self.kept, axis=1)
-        goes_on: Flags = self.kept.any(axis=1) & (apart < _ALIKE * np.linalg.norm(self.kept, axis=1))
+        apart = np.linalg.norm((self.moved if self.wheels is None else self.driven) - self.expired, axis=1)
+        goes_on: Flags = self.expired.any(axis=1) & (apart < _ALIKE * np.linalg.norm(self.expired, axis=1))
         return goes_on
 
 
@@ -155,10 +155,10 @@ def find_incidents(
             if inside.size and inside.mean() < _MOSTLY:
                 incidents.append((kind, start, end))
                 inside[:] = True
-    kept = _report_kept(rims)
+    lasting = _report_expired(rims)
     moving = (rims.body > LIVE_SHARE * rims.top) | (rims.command > LIVE * rims.top)
     if taken.sum() > _LARGEST_SHARE * max(int((moving | taken).sum()), 1):
-        return replace(nothing, findings=kept)
+        return replace(nothing, findings=lasting)
     excluded = mark_excluded(times, incidents)
     findings = [
         Finding(
@@ -169,12 +169,12 @@ def find_incidents(
         for kind, start, end in sorted(incidents, key=lambda one: one[1])
     ]  # fmt: skip
     ordered = tuple(sorted(incidents, key=lambda one: one[1]))
-    return Incidents(excluded, (*kept, *findings), ordered)
+    return Incidents(excluded, (*lasting, *findings), ordered)
 
 
-def _report_kept(rims: Rims) -> tuple[Finding, ...]:
+def _report_expired(rims: Rims) -> tuple[Finding, ...]:
     """Report a vehicle that mostly goes on as its last command asked when that is too old to be valid."""
-    stale = np.asarray(rims.kept.any(axis=1), dtype=bool)
+    stale = np.asarray(rims.expired.any(axis=1), dtype=bool)
     share = float(np.mean(rims.goes_on[stale])) if stale.any() else 0.0
     spans = _list_spans(rims.times, stale, _SHOWS_S)
     if not spans or share < _MOSTLY:
@@ -215,14 +215,14 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
         driven = np.nan_to_num(measured.velocity) * scale
         wheels = np.abs(driven).sum(axis=1)
         known = known & np.isfinite(measured.velocity).all(axis=1)
-    kept = np.zeros((times.size, 3)) if command is None else command.expired * scale
+    expired = np.zeros((times.size, 3)) if command is None else command.expired * scale
     size = np.abs(asked).sum(axis=1)
     largest = [one[one > 0.02] for one in (size, wheels) if one is not None]  # noqa: PLR2004 - asked at all
     if all(one.size < _FEWEST_ALIKE for one in largest):
         return None
     top = max(float(np.quantile(one, 0.95)) for one in largest if one.size)
     body = np.abs(moved).sum(axis=1)
-    return Rims(times, size, asked, known, kept, wheels, driven, body, moved, top)
+    return Rims(times, size, asked, known, expired, wheels, driven, body, moved, top)
 
 
 def _smooth(times: Floats, values: Floats) -> Floats:
