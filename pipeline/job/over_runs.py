@@ -154,7 +154,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         figures: also write the figure to `figures/` in this format.
     """
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.causes_page import draw_causes, render_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import draw_causes, render_causes  # noqa: PLC0415 - heavy
 
     written: dict[str, Path] = {}
     for name, frame in (

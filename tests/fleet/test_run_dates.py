@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.fleet import read_day
-from pipeline.fleet.run_dates import date_runs
+from pipeline.job.compared_runs import date_runs
 
 PLACEHOLDER = 1_700_000_000_000_000_000
 HOUR = 3_600_000_000_000
