@@ -67,6 +67,7 @@ def find_material(
     *,
     trusted_only: bool,
     tables: Sequence[str] = _TABLES,
+    optional: Sequence[str] = (),
 ) -> ComparedRuns:
     """Select the current runs of the results, each recording once.
 
@@ -79,10 +80,13 @@ def find_material(
         by: columns that define a group.
         trusted_only: whether findings of severity `error` exclude a run.
         tables: tables that a run must have.
+        optional: tables that a run need not have, but whose file may not be missing if it does; with
+            ``trusted_only`` these include the findings.
 
     Raises:
         ComparisonError: ``by`` names no column.
     """
+    optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
     manifests: dict[str, Manifest] = {}
@@ -90,7 +94,7 @@ def find_material(
     refusals: dict[str, str] = {}
     for manifest in survey.manifests:
         digest = read_digest(manifest)
-        reason = _doubt(manifest, tables)
+        reason = _doubt(manifest, tables) or _describe_damage(manifest, (*tables, *optional))
         if refusal := find_run_refusal(manifest):
             refusals[manifest.run] = refusal
             reason = reason and f"no effect can be estimated: {refusal}"
@@ -160,19 +164,19 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
                 f"its table {name} has contract version {entry.contract_version} instead of "
                 f"{contract_of(name).version}; analyze its log again"
             )
-    return _describe_damage(manifest)
+    return ""
 
 
 def find_run_refusal(manifest: Manifest) -> str:
     """Reason why slip is not observable in a run; empty if it is."""
-    if "findings" not in manifest.tables or manifest.find_damage():
+    if "findings" not in manifest.tables or manifest.find_damage(["findings"]):
         return ""
     return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
 
 
-def _describe_damage(manifest: Manifest) -> str:
+def _describe_damage(manifest: Manifest, needed: Sequence[str]) -> str:
     """What is wrong with the first damaged table of a run, and what to do; empty if all are intact."""
-    damage = manifest.find_damage()
+    damage = manifest.find_damage(needed)
     return f"{damage.what}; {damage.hint[0].lower()}{damage.hint[1:]}" if damage else ""
 
 

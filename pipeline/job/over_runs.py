@@ -331,7 +331,7 @@ def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: M
         JobError: ``nothing_to_follow``: no run has a date.
         ComparisonError: ``no_such_column``.
     """
-    compared = find_material(store, by, trusted_only=False)
+    compared = find_material(store, by, trusted_only=False, optional=("findings", "estimates"))
     dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
     followed = set(dated["run"])
     undated = sorted(set(compared.manifests) - followed)

@@ -27,7 +27,7 @@ from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import COLUMNS, load_motion_run, load_vehicle
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
@@ -87,8 +87,8 @@ def _lack_estimates(compared: ComparedRuns) -> SlipError:
     return lack_runs("nothing_to_fit", what, compared.store.root, hint, compared.notes)
 
 
-def _find_runs(store: Store) -> ComparedRuns:
-    return find_material(store, ("vehicle",), trusted_only=True, tables=_TABLES)
+def _find_runs(store: Store, optional: Sequence[str] = ()) -> ComparedRuns:
+    return find_material(store, ("vehicle",), trusted_only=True, tables=_TABLES, optional=optional)
 
 
 def _list_keys(compared: ComparedRuns) -> tuple[str, ...]:
@@ -323,7 +323,7 @@ def predict_deployment(store: Store, forecast: Forecast, *, seed: int = 0) -> Pr
         forecast: forecast of the vehicle on the terrain.
         seed: seed of the draws.
     """
-    compared = _find_runs(store)
+    compared = _find_runs(store, tuple(COLUMNS))
     runs = _load_runs(compared, forecast)
     rng = np.random.default_rng(seed)
     paces = np.log([max(run.pace, 1e-6) for run in runs])

@@ -14,7 +14,7 @@ import os
 import platform
 import secrets
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
@@ -352,13 +352,18 @@ class Manifest:
         entry = self.tables.get(table.removeprefix(QUARANTINE))
         return None if entry is None else entry.quarantined
 
-    def find_damage(self) -> StoreError | None:
-        """What `read` raises of the first table whose file is missing or of another size; nothing is read."""
-        for entry in self.tables.values():
+    def find_damage(self, needed: Collection[str] = ()) -> StoreError | None:
+        """What `read` raises of the first table whose file is of another size; nothing is read.
+
+        Args:
+            needed: tables whose files may not be missing either; a mirror has only those that were asked for.
+        """
+        for name, entry in self.tables.items():
             path = self.folder / entry.file
             if not path.exists():
-                return file_missing(path)
-            if path.stat().st_size != entry.bytes:
+                if name in needed:
+                    return file_missing(path)
+            elif path.stat().st_size != entry.bytes:
                 return table_damaged(NOT_AS_WRITTEN, path)
         return None
 

@@ -19,7 +19,7 @@ from pipeline.job.compare import Question, compare_results, summarize_answer, wr
 from pipeline.report import label_names
 from pipeline.report.comparison_page import list_pictures
 from pipeline.report.scene import format_ends
-from pipeline.store import Store
+from pipeline.store import Store, StoreError
 from schemas import list_contracts
 from schemas.run_tables import Slip
 
@@ -167,6 +167,10 @@ def test_groups_may_be_any_labels(store: Store) -> None:
 
 
 def test_nothing_to_compare_is_one_clear_line(store: Store) -> None:
+    with pytest.raises(StoreError, match="there is no such folder") as caught:
+        ask(store)
+    assert caught.value.code == "no_results"
+    store.root.mkdir()
     with pytest.raises(JobError, match="no run whose numbers can be compared"):
         ask(store)
 

@@ -228,6 +228,11 @@ def test_a_run_with_a_damaged_table_is_left_out_and_named_by_all_of_the_fleet(
     assert (code, out) == (1, "")
     assert error.endswith(f"/poses.parquet: {why}. Analyze the log again with --force.\n")
     assert [one.name for one in tmp_path.iterdir()] == ["results"]
+    path.unlink()
+    code, out, error = run_slip(capsys, "fleet", "predict", *there, "--results", str(known), "--json")
+    assert (code, error) == (0, "")
+    gone = "left out, the file poses.parquet of the results is gone; slip results verify"
+    assert [note for note in json.loads(out)["notes"] if note.startswith(gone)]
 
 
 def test_a_few_seconds_are_fitted_with_the_fleet_before(
