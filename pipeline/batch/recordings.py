@@ -166,8 +166,8 @@ class Looker:
             kind, leads_to = known
             if kind in kinds:
                 kinds[kind][entry.name] = leads_to
-            # Whether a link that leads nowhere was one to a folder, its name does not tell.
-            elif kind in _DEAD or entry.name.endswith(SUFFIXES):
+            # A link that leads nowhere, of another suffix, was one to neither a log nor a folder.
+            elif entry.name.endswith(SUFFIXES) or (kind in _DEAD and not path.suffix):
                 self.skip(path, kind)
         return number, Folder(folder, kinds["folder"], kinds["file"])
 

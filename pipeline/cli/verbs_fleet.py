@@ -363,7 +363,6 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
         f"{words:<{width}}{_format_interval(cast('Mapping[str, object]', content[key]), unit)}"
         for key, words, unit in _WORDS
     ]
-    lines += [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
     return lines if content["model"] is None else [*lines, f"written: {content['model']}"]
 
 

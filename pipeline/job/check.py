@@ -291,6 +291,23 @@ class Check:
         names = [name for name, change in self.changes.items() if change.status == status]
         return sorted(names, key=lambda name: (self.changes[name].p, self.changes[name].p_within))
 
+    def is_unseen(self, name: str) -> bool:
+        """Whether no change of a quantity was shown, and one of its own size could have been missed.
+
+        That size is its distance from the neutral value, at least the usual one; errors have none.
+        """
+        change = self.changes[name]
+        if change.status != "unchanged" or name in ERRORS:
+            return False
+        parameter = next(label.parameter for label in self.sides.labels if label.name == name)
+        neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+        distances = (abs(change.before - neutral), abs(change.after - neutral))
+        return not change.smallest <= max(*distances, parameter.usual_size)
+
+    def name_outcome(self, name: str) -> str:
+        """Status of a quantity; `not shown` in place of unchanged where a change could have been missed."""
+        return "not shown" if self.is_unseen(name) else self.changes[name].status
+
     @property
     def code(self) -> int:
         """Exit code: by the limits if any are given, else by the changes."""
@@ -416,7 +433,10 @@ def check_as_json(check: Check, lines: Sequence[tuple[str, str]]) -> dict[str, o
         lines: lines from `check_text.list_lines`, the verdict first.
     """
     sides = check.sides
-    rows = [tabulate_change(sides, name, change) for name, change in check.changes.items()]
+    rows = [
+        tabulate_change(sides, name, change) | {"status": check.name_outcome(name)}
+        for name, change in check.changes.items()
+    ]
     moves = None if check.moves is None else {"position_m": check.moves[0], "heading_rad": check.moves[1]}
     return {
         "verdict": lines[0][1],

@@ -162,12 +162,12 @@ def read_sides(
     known = before.readings if isinstance(before, Baseline) else ()
     _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
-    starts: dict[str, Model] = {}
     if file is None:
         models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
         file = ModelFile(Model(vehicle, unite_effects(*models)))
-        own = zip(everything, (model for side in models for model in side), strict=True)
-        starts = {manifest.run: model for manifest, model in own if model is not None}
+    diagnoses = {one.run: find_diagnosis(store.root, one) for one in everything}
+    files = {run: read_model_text(content) for run, content in diagnoses.items() if content is not None}
+    starts = {run: own.model for run, own in files.items() if own is not None}
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     if isinstance(before, Baseline):
         file = replace(file, fit={**file.fit, "input": before.source.value})

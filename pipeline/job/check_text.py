@@ -107,7 +107,7 @@ def _name(check: Check, name: str) -> str:
 def _format_unchanged(check: Check, changed: Sequence[str]) -> str:
     """`, ground unchanged` if none of its parameters changed and at least one is known."""
     is_ground = {label.name: label.effect.place > Place.DRIVE for label in check.sides.labels}
-    known = {name for name, change in check.changes.items() if change.status == "unchanged"} & set(is_ground)
+    known = {name for name in check.list_status("unchanged") if not check.is_unseen(name)} & set(is_ground)
     for ground, word in ((True, "ground"), (False, "drivetrain")):
         mine = {name for name, which in is_ground.items() if which is ground}
         if mine & known and not mine & {*changed, *check.list_status("differs")}:
@@ -182,7 +182,7 @@ def list_lines(check: Check) -> list[Line]:
     pairs = max((len(_format_pair(check, name)) for name in _list_known(check)), default=0)
     for status in STATUSES:
         for name in check.list_status(status):
-            lines.append((_name_outcome(check, name), _format_row(check, name, names, pairs)))
+            lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
             if status != "unknown":
                 lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
     lines += [("may be", text) for text in _list_readings(check)]
@@ -211,21 +211,8 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
     within = f", {change.p_within:.2g} within these recordings" if change.status == "differs" else ""
-    few = "; too few runs to see one of its own size" if _is_unseen(check, name) else ""
+    few = "; too few runs to see one of its own size" if check.is_unseen(name) else ""
     return f"{text}  p = {change.p:.2g}{within}{few}"
-
-
-def _name_outcome(check: Check, name: str) -> str:
-    return "not shown" if _is_unseen(check, name) else check.changes[name].status
-
-
-def _is_unseen(check: Check, name: str) -> bool:
-    """Whether a change of a parameter's own size could have been missed, and none was shown."""
-    change = check.changes[name]
-    if change.status != "unchanged" or name in ERRORS:
-        return False
-    usual = _find(check, name).parameter.usual_size
-    return not change.smallest <= max(abs(change.before), abs(change.after), usual)
 
 
 def _format_resolution(check: Check, name: str) -> str:
@@ -284,7 +271,7 @@ def format_markdown(check: Check) -> str:
             change = check.changes[name]
             known = status != "unknown"
             pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
-            rows.append(f"| {_escape(name)} | {pair} | {p} | {_name_outcome(check, name)} |")
+            rows.append(f"| {_escape(name)} | {pair} | {p} | {check.name_outcome(name)} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
 
@@ -307,7 +294,7 @@ def format_junit(check: Check) -> str:
     gate = not check.limits
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
-        kind = "skipped" if _is_unseen(check, name) else kind
+        kind = "skipped" if check.is_unseen(name) else kind
         text = _format_row(check, name)
         text += "" if change.status == "unknown" else f"; {_format_resolution(check, name)}"
         cases.append(("number", name, kind, text))

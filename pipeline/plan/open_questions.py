@@ -77,8 +77,8 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
             seconds = math.ceil(LEAD_S + float(chooser.durations[list(drive)].sum()) + TAIL_S)
             return _because(question, advice.format(seconds=seconds), question.reached)
         best = weight if _is_better(one, weight, best) else best
-    if float(one.answer(library)) >= 1.0:
-        seconds = math.ceil(float(chooser.durations.sum()))
+    if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
+        seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
         return _because(question, f"give a larger --area, and up to --time {seconds}s", question.reached)
     return _because(question, _advise(one.question, longest_s), f"at best {_format_reached(one, best)}")
 
@@ -123,5 +123,6 @@ def _advise(question: Question, longest_s: float) -> str:
     """Why no drive answers a question, and what shows it."""
     effects = [find_effect(name)() for name in question.effects]
     on_slope = any(Excitation.SLOPE in effect.needs for effect in effects)
-    where = "on level ground" if on_slope else f"of up to {longest_s:.0f} s within these limits"
-    return f"no drive {where} decides it; what shows it: {suggest_manoeuvre(*effects)}"
+    tried = f"none of the drives that were tried, of up to {LEAD_S + longest_s + TAIL_S:.0f} s, decides it"
+    why = "no drive on level ground decides it" if on_slope else tried
+    return f"{why}; what shows it: {suggest_manoeuvre(*effects)}"

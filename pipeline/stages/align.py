@@ -84,7 +84,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
             "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
             f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
         )
-        text += _contradict_scale(samples, both & samples.steady) if turning is None else ""
+        text += _contradict_scale(samples, both & samples.steady, forward)
         finding = Finding("command_scale", "warning", text, where="command", value=forward)
         return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
@@ -100,25 +100,24 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     return CommandScale(1.0, multiplier, (finding,))
 
 
-def _contradict_scale(samples: Samples, steady: Flags) -> str:
+def _contradict_scale(samples: Samples, steady: Flags, forward: float) -> str:
     asked, got = _average(samples, steady, samples.step.astype(np.int64))[1]
-    if not (slow := _find_slow(asked)).any():
+    slow = _find_slow(asked)
+    turning = float(np.median(got[slow] / asked[slow])) if slow.sum() >= _FEWEST_STEPS else forward
+    if turning > 0.0 and abs(np.log(turning / forward)) < _SCALED:
         return ""
-    times = f"{np.median(got[slow] / asked[slow]):.2f} times as much as commanded in the median turn"
+    times = f"{turning:.2f} times as much as commanded in the median turn"
     return f"; the sides differ {times}: no single scale holds, and slip from commands in turns depends on it"
 
 
 def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
     """Ratio of measured to commanded speed and yaw rate; None if it cannot be determined."""
-    steady = both & samples.steady
+    steady, forward, turning = both & samples.steady, None, None
     if steady.any():
-        forward, turning = (
-            _find_ratio(asked, got) for asked, got in _average(samples, steady, samples.step.astype(np.int64))
-        )
+        steps = _average(samples, steady, samples.step.astype(np.int64))
+        forward, turning = (_find_ratio(asked, got) for asked, got in steps)
         if forward is not None and turning is not None:
             return forward, turning
-    else:
-        forward = turning = None
     if samples.body_commanded and both.any():
         blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
         along, across = (_find_gain(asked, got) for asked, got in blocks)
@@ -168,10 +167,11 @@ def _find_ratio(asked: Floats, got: Floats) -> float | None:
     middle = float(np.median(ratio))
     spread = robust_spread(ratio - middle)
     # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
-    mean = float(inverse.mean())
-    (level, slope), _ = fit_robustly(np.column_stack((np.ones(inverse.size), inverse - mean)), ratio)
-    is_constant = max(spread, abs(level - slope * mean - middle)) < ONE_SCALE * middle
-    return middle if middle > _LEAST_RATIO and is_constant else None
+    apart = inverse - inverse.mean()
+    (level, slope), rest = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
+    is_sloped = float(rest.std()) < 0.5 * float(ratio.std())
+    changed = abs(level - slope * inverse.mean() - middle) if is_sloped else 0.0
+    return middle if middle > _LEAST_RATIO and max(spread, changed) < ONE_SCALE * middle else None
 
 
 def _find_slow(asked: Floats) -> Flags:

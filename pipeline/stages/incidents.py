@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.core import arrays, format_share
+from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import find_runs
 from pipeline.run import read_wheel_times
@@ -173,19 +173,20 @@ def find_incidents(
 
 
 def _report_expired(rims: Rims) -> tuple[Finding, ...]:
-    """Report a vehicle that mostly goes on as its last command asked when that is too old to be valid."""
+    """Report a vehicle that mostly goes on as its last command asked until the next one comes."""
     stale = np.asarray(rims.expired.any(axis=1), dtype=bool)
-    share = float(np.mean(rims.goes_on[stale])) if stale.any() else 0.0
     spans = _list_spans(rims.times, stale, _SHOWS_S)
-    if not spans or share < _MOSTLY:
+    lasting = [bool(rims.goes_on[last]) for _, last in spans]
+    if len(spans) < 2 or float(np.mean(lasting)) < _MOSTLY:  # noqa: PLR2004 - one may be chance
         return ()
-    longest = max(float(rims.times[last] - rims.times[first]) for first, last in spans)
+    goes_on = _list_spans(rims.times, rims.goes_on, 0.0)
+    longest = max(float(rims.times[last] - rims.times[first]) for first, last in goes_on)
     text = (
-        f"where the last command is too old to count, the vehicle goes on as it asked ({format_share(share)} "
-        f"of the time, for up to {longest:.1f} s): the base keeps its last command; set command.hold_s to "
-        "the longest pause between commands, and these stretches are compared, too"
+        f"in {sum(lasting)} of {len(spans)} pauses the vehicle goes on as the last command asked, until the "
+        f"next one comes, for up to {longest:.1f} s after that is too old to count: the base keeps its last "
+        "command; set command.hold_s to the longest pause, and these stretches are compared, too"
     )
-    return (Finding("kept_command", "warning", text, where="command", value=longest, count=len(spans)),)
+    return (Finding("kept_command", "warning", text, where="command", value=longest, count=sum(lasting)),)
 
 
 def mark_excluded(times: Floats, spans: Sequence[Span]) -> Flags:

@@ -149,9 +149,10 @@ class PreparedRun:
             return apportion(judgement, length_scale_m=length_scale_m)
 
     def note_fit(self, file: ModelFile) -> ModelFile:
-        """A model file with the data of its fit to this run."""
+        """A model file with the data of its fit to this run, if a fit to it gives these values."""
         with self.lock:
-            return note_fit(file, self._judge_ladder(file.model))
+            noted = note_fit(file, self._judge_ladder(file.model))
+            return noted if _list_keys(noted.model) == _list_keys(file.model) else file
 
     def _judge_ladder(self, model: Model) -> Judgement:
         whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
@@ -168,10 +169,13 @@ class PreparedRun:
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model with its present values: held out where a fit gave these, else as they are."""
         with self.lock:
-            known = self._fits.get(model.effects)
-            if known is not None and _list_keys(known.fitted.model) == _list_keys(model):
-                return known.errors
-            return score(self.problem, self.state(model, timing)).pooled
+            known = self.find_fit(model)
+            return score(self.problem, self.state(model, timing)).pooled if known is None else known.errors
+
+    def find_fit(self, model: Model) -> Judged | None:
+        """The known fit that gave a model its present values; None if none did."""
+        known = self._fits.get(model.effects)
+        return known if known is not None and _list_keys(known.fitted.model) == _list_keys(model) else None
 
     def state(self, model: Model, timing: Sequence[float]) -> State:
         """A model with the recording's delays."""
@@ -398,13 +402,16 @@ class Editor:
     def _score_by_hand(self, model: Model, said: str, off: list[str]) -> Session:
         step = self.session.step
         errors = self.prepared.score(switch_off(model, off), step.timing)
+        known = self.prepared.find_fit(switch_off(model, off))
         _require_numbers(errors, self.session.run)
         shown = [name for name in step.order if name not in off]
         ladder = [ladder_step for ladder_step in step.ladder if set(_effects_of(ladder_step)) < set(shown)]
         ladder.append(step_as_json(shown, errors))
-        text = format_step(model, {})
+        text = format_step(model, {} if known is None else known.intervals)
         return self.session.push(
-            msgspec.structs.replace(step, said=said, model=text, off=off, ladder=ladder, by_hand=True)
+            msgspec.structs.replace(
+                step, said=said, model=text, off=off, ladder=ladder, by_hand=known is None
+            )
         )
 
     def fit_anew(

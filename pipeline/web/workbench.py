@@ -324,11 +324,14 @@ class Sessions:
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
         missing = self._list_missing(editor.prepared, editor.session)
         if not missing:
+            is_diagnosed = read_diagnosis(self.results, editor.prepared.manifest) is not None
             raise WorkbenchError(
-                "not_diagnosed",
-                "the diagnosis of this run found no effect that the model lacks",
+                "nothing_to_add" if is_diagnosed else "not_diagnosed",
+                "the model has all effects that the diagnosis found"
+                if is_diagnosed
+                else "this run was not diagnosed",
                 where=ask.run,
-                hint="Diagnose it first.",
+                hint="Look for other effects." if is_diagnosed else "Diagnose it first.",
             )
         return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=True)
 

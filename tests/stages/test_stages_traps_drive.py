@@ -306,8 +306,13 @@ def test_trap_21_a_dead_band_is_no_scale() -> None:
     asked = np.array([0.3, -0.35, 0.42, -0.5, 0.58, 0.64, -0.7, 1.5])
     assert _find_ratio(asked, asked - 0.14 * np.sign(asked)) is None
     assert _find_ratio(asked, 0.7 * asked) == pytest.approx(0.7)
-    alike = np.array([0.5, -0.5, 0.5, -0.5, 0.5, -0.5, 1.5])
-    assert _find_ratio(alike, 0.7 * alike) == pytest.approx(0.7)
+    # Steps of one speed show no dead band, whatever their noise is.
+    draw = np.random.default_rng(5)
+    for _ in range(20):
+        alike = 0.5 * np.array([1.0, -1.0] * 4) * (1.0 + 0.01 * draw.normal(size=8))
+        noisy = 1.8 * alike * (1.0 + 0.02 * draw.normal(size=8))
+        found = _find_ratio(np.append(alike, 1.5), np.append(noisy, 2.7))
+        assert found == pytest.approx(1.8, rel=0.05)
 
 
 def test_a_joint_state_without_wheels_is_left_out_and_the_command_serves(drive: TakeThrough) -> None:
