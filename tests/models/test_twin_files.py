@@ -181,7 +181,7 @@ def test_every_effect_is_in_the_twin_or_said_not_to_be(vehicle: Vehicle, to: str
     outside = {effect.id for group in groups for effect in group}
     limits = {
         "body_speed_limit", "body_turn_limit", "wheel_speed_limit", "wheel_speed_scaling",
-        "acceleration_limit",
+        "acceleration_limit", "body_acceleration_limit", "turn_acceleration_limit",
     }  # fmt: skip
     assert all(f"{name}(" in text for name in outside - (limits if to == "sdf" else set()))
     assert to == "mjcf" or ("<max_" in text and "acceleration>" in text)
@@ -196,6 +196,14 @@ def test_every_effect_is_in_the_twin_or_said_not_to_be(vehicle: Vehicle, to: str
     assert slides == ({"effective_track", "body_inertia"} <= {effect.id for effect in body.missing})
     assert {"speed_slip", "yaw_drift", "slope_drift"} <= {effect.id for effect in body.missing}
     assert all(effect.place <= Place.DRIVE for effect in body.controller)
+
+
+def test_ramps_of_commands_are_limits_of_the_plugin() -> None:
+    ramps = make(HUSKY, body_acceleration_limit=0.9, turn_acceleration_limit=1.7, effective_track=1.8)
+    text = export_model(ramps, "sdf")
+    assert "<max_linear_acceleration>0.9<" in text
+    assert "<max_angular_acceleration>1.7<" in text
+    assert "acceleration_limit(" not in text
 
 
 def test_servos_stand_for_the_end_of_the_drivetrain_only() -> None:
