@@ -405,16 +405,21 @@ def raise_alerts(
         alerts.append(
             Alert(head.group, head.quantity, head.text + (f"; with it: {others}" if others else ""))
         )
-    lasts = [(one.group, one.quantity, one.unit, one.latest, one.points["run"][-1]) for one in series]
+    lasts = [
+        (one.group, one.quantity, name_quantity(one.quantity), one.unit, one.latest, one.points["run"][-1])
+        for one in series
+    ]
     lasts += [
-        (vehicle, f"{effect}.{parameter}", unit, value, run)
+        (vehicle, label := f"{effect}.{parameter}", label, unit, value, run)
         for vehicle, effect, parameter, unit, value, run in latest.iter_rows()
     ]
-    for group, quantity, unit, value, run in lasts:
+    unsure = {(one.vehicle, one.label, run) for one in parameters for run in one.undetermined}
+    for group, quantity, name, unit, value, run in lasts:
         limit = limits.get(quantity, limits.get(quantity.split(" (")[0]))
         if limit is not None and value > limit:
             shown = f"{value:.3g}{suffix_unit(unit)}"
-            text = f"{quantity} of {group} is {shown} in {run}, above the limit of {limit:g}"
+            mark = ", which does not determine it" if (group, quantity, run) in unsure else ""
+            text = f"{name} of {group} is {shown} in {run}{mark}, above the limit of {limit:g}"
             alerts.append(Alert(group, quantity, text))
     return alerts
 
@@ -437,7 +442,8 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
 def shorten_step(series: Series, step: LevelChange) -> str:
     """Format the levels before and after."""
     unit = suffix_unit(series.unit)
-    return f"{series.quantity} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
+    name = name_quantity(series.quantity)
+    return f"{name} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
 
 
 def format_step(series: Series, step: LevelChange) -> str:

@@ -126,7 +126,7 @@ def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:
     (kind,) = kinds
     assert kind == ("since", "run", "before", "after", "runs_before", "runs_after", "p", "likely", "text")
     with_it = alert.text.split("; with it: ")[1]
-    assert with_it.startswith("median_modulus (command) of warthog-2 ")
+    assert with_it.startswith("median slip speed from commands of warthog-2 ")
     assert "finding heading_skew of warthog-2 0.1 -> 0.3" in with_it
 
 
