@@ -162,12 +162,11 @@ def read_sides(
     known = before.readings if isinstance(before, Baseline) else ()
     _refuse_shared([*map(_digest, manifests), *(one.sha256 for one in known)], after)
     vehicle, runs = read_runs(everything, None if file is None else file.model.vehicle, owner)
+    models = {one.run: _find_model(one, store, is_needed=file is None) for one in everything}
+    starts = {run: model for run, model in models.items() if model is not None}
     if file is None:
-        models = [[_find_model(one, store) for one in side] for side in (manifests, after)]
-        file = ModelFile(Model(vehicle, unite_effects(*models)))
-    diagnoses = {one.run: find_diagnosis(store.root, one) for one in everything}
-    files = {run: read_model_text(content) for run, content in diagnoses.items() if content is not None}
-    starts = {run: own.model for run, own in files.items() if own is not None}
+        united = unite_effects(*([models[one.run] for one in side] for side in (manifests, after)))
+        file = ModelFile(Model(vehicle, united))
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     if isinstance(before, Baseline):
         file = replace(file, fit={**file.fit, "input": before.source.value})
@@ -256,9 +255,17 @@ def _refuse_shared(before: Sequence[str], after: Sequence[Manifest]) -> None:
         raise JobError("same_run", what, hint="Give runs before the change, and others after it.")
 
 
-def _find_model(manifest: Manifest, store: Store) -> Model | None:
-    """The model from the diagnosis of a run; None if it identified no effect or refused the run."""
+def _find_model(manifest: Manifest, store: Store, *, is_needed: bool) -> Model | None:
+    """The model from the diagnosis of a run; None if it identified no effect or refused the run.
+
+    Args:
+        manifest: the run.
+        store: the results.
+        is_needed: whether a run without a diagnosis is diagnosed; otherwise it has no model.
+    """
     diagnosis = find_diagnosis(store.root, manifest)
+    if diagnosis is None and not is_needed:
+        return None
     if diagnosis is None:
         diagnosis = diagnose_stored([manifest], INPUTS, None, None, None)
         keep_diagnosis(store.root, manifest, diagnosis)

@@ -175,12 +175,12 @@ def find_incidents(
 def _report_expired(rims: Rims) -> tuple[Finding, ...]:
     """Report a vehicle that mostly goes on as its last command asked until the next one comes."""
     stale = np.asarray(rims.expired.any(axis=1), dtype=bool)
-    spans = _list_spans(rims.times, stale, _SHOWS_S)
-    lasting = [bool(rims.goes_on[last]) for _, last in spans]
+    spans, follows = _list_spans(rims.times, stale, _SHOWS_S), rims.goes_on
+    lasting = [bool(follows[last]) for _, last in spans]
     if len(spans) < 2 or float(np.mean(lasting)) < _MOSTLY:  # noqa: PLR2004 - one may be chance
         return ()
-    goes_on = _list_spans(rims.times, rims.goes_on, 0.0)
-    longest = max(float(rims.times[last] - rims.times[first]) for first, last in goes_on)
+    stretches = _list_spans(rims.times, follows, 0.0)
+    longest = max(float(rims.times[last] - rims.times[first]) for first, last in stretches)
     text = (
         f"in {sum(lasting)} of {len(spans)} pauses the vehicle goes on as the last command asked, until the "
         f"next one comes, for up to {longest:.1f} s after that is too old to count: the base keeps its last "

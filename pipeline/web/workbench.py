@@ -13,7 +13,6 @@ from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model, write_model
-from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import read_model_text
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
@@ -307,24 +306,16 @@ class Sessions:
         }
         return changes[ask.action]()
 
-    def _find_named(self, prepared: PreparedRun) -> ModelFile | None:
-        """The model of the diagnosis, whose effects were tested there together with all others."""
-        diagnosis = read_diagnosis(self.results, prepared.manifest)
-        return None if diagnosis is None else read_model_text(diagnosis)
-
     def _is_named(self, editor: Editor, ask: Ask) -> bool:
-        named = self._find_named(editor.prepared)
-        return named is not None and ask.effect in named.model
-
-    def _list_missing(self, prepared: PreparedRun, session: Session) -> list[Effect]:
-        """Effects of the diagnosis that the session's model lacks."""
-        named = self._find_named(prepared)
-        return [] if named is None else [one for one in named.model if one.id not in session.step.order]
+        """Whether the model lacks an effect that the diagnosis tested together with all others."""
+        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
+        return ask.effect in {effect.id for effect in _list_missing(diagnosis, editor.session)}
 
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
-        missing = self._list_missing(editor.prepared, editor.session)
+        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
+        missing = _list_missing(diagnosis, editor.session)
         if not missing:
-            is_diagnosed = read_diagnosis(self.results, editor.prepared.manifest) is not None
+            is_diagnosed = diagnosis is not None
             raise WorkbenchError(
                 "nothing_to_add" if is_diagnosed else "not_diagnosed",
                 "the model has all effects that the diagnosis found"
@@ -374,14 +365,15 @@ class Sessions:
         parsed = file.parse(session.step.model)
         model = switch_off(parsed.model, session.step.off)
         trial = self._trials.find(prepared, model)
+        diagnosis = read_diagnosis(self.results, prepared.manifest)
         return {
             "session": show_session(session, parsed),
             "run": summarize_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
-            "diagnosis": read_diagnosis(self.results, prepared.manifest),
+            "diagnosis": diagnosis,
             "named": self._list_named(prepared, session, model),
-            "missing": [effect.id for effect in self._list_missing(prepared, session)],
+            "missing": [effect.id for effect in _list_missing(diagnosis, session)],
             "plan": find_plan(self.results, prepared.manifest),
             "trial": trial.show() if trial is not None else None,
             "slot": file.slot,
@@ -410,3 +402,9 @@ def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:
     step = session.step
     model = switch_off(file.parse(step.model).model, step.off)
     return prepared.show(model, step.timing, step.ladder, session.floor or None)
+
+
+def _list_missing(diagnosis: Mapping[str, object] | None, session: Session) -> list[Effect]:
+    """Effects of a run's diagnosis that the session's model lacks."""
+    named = None if diagnosis is None else read_model_text(diagnosis)
+    return [] if named is None else [one for one in named.model if one.id not in session.step.order]
