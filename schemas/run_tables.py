@@ -134,10 +134,13 @@ class Power(Table):
 class Alignments(Table):
     """One row a run."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     hold_time = schemas.optional("s", "the controller stops this long after its last command")
-    command_scale = schemas.number("1", "factor by which the recorded command was multiplied")
+    command_scale = schemas.number(
+        "1", "factor by which the recorded command was multiplied; of commanded sides, their mean"
+    )
+    command_turn_scale = schemas.number("1", "factor by which the sides' difference was multiplied")
     track_multiplier = schemas.number(
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
     )

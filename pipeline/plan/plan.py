@@ -257,8 +257,10 @@ def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floa
     if is_steered(knowledge.vehicle) or kinematics.has_inputs("sideways"):
         return None
     vehicle = msgspec.structs.replace(knowledge.vehicle, controller_track_multiplier=1.0)
-    driven, scale = drive(commands, vehicle), knowledge.senses.command_scale
-    return driven.left / scale, driven.right / scale
+    driven, senses = drive(commands, vehicle), knowledge.senses
+    ahead = 0.5 * (driven.left + driven.right) / senses.command_scale
+    apart = 0.5 * (driven.right - driven.left) / senses.command_turn_scale
+    return ahead - apart, ahead + apart
 
 
 @dataclass(frozen=True)

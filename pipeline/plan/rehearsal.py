@@ -42,13 +42,15 @@ class Senses:
         gyro: fit of the gyro to the poses; None without a good one.
         encoders: whether wheels are measured.
         track_multiplier: multiplier of the controller.
-        command_scale: factor on the recorded commands.
+        command_scale: factor on the recorded commands; of commanded sides, on their mean.
+        command_turn_scale: factor on the difference of commanded sides.
     """
 
     gyro: GyroFit | None = None
     encoders: bool = False
     track_multiplier: float = 1.0
     command_scale: float = 1.0
+    command_turn_scale: float = 1.0
 
 
 def read_senses(runs: Sequence[MotionRun]) -> Senses:
@@ -57,7 +59,7 @@ def read_senses(runs: Sequence[MotionRun]) -> Senses:
     gyro = None if any(fit is None for fit in fits) else fits[0]
     encoders = all(run.wheels is not None for run in runs)
     known = runs[0].alignment
-    return Senses(gyro, encoders, known.track_multiplier, known.command_scale)
+    return Senses(gyro, encoders, known.track_multiplier, known.command_scale, known.command_turn_scale)
 
 
 class Rehearsal:

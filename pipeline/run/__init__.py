@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -95,24 +95,26 @@ class Alignment:
 
     Attributes:
         hold_s: time from the last command until the controller stops; None without commands.
-        command_scale: factor by which the recorded command was multiplied.
+        command_scale: factor by which the recorded command was multiplied; of commanded sides, their mean.
+        command_turn_scale: factor by which the difference of commanded sides was multiplied.
         track_multiplier: factor by which the controller multiplies the track width.
-        gyro: fit of the gyro to the poses; None without a good one.
-        heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
         wheel_delay_s: delay of the encoders relative to the gyro, removed from the wheels.
         latency_spread_s: standard deviation of the latencies removed from the poses.
         outlier_s: duration of contradictions of localization and wheels, except bad stretches.
+        gyro: fit of the gyro to the poses; None without a good one.
+        heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
         recorded_moduli: median slip speed with L = 1 m by input before the corrections [m/s].
     """
 
     hold_s: float | None = None
     command_scale: float = 1.0
+    command_turn_scale: float = 1.0
     track_multiplier: float = 1.0
-    gyro: GyroFit | None = None
-    heading_delay_s: float = 0.0
     wheel_delay_s: float = 0.0
     latency_spread_s: float = 0.0
     outlier_s: float = 0.0
+    gyro: GyroFit | None = None
+    heading_delay_s: float = 0.0
     recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
 
 
@@ -331,6 +333,13 @@ def _measure_repeats(poses: pl.DataFrame) -> float:
     return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
+_ALIGNED = (
+    *("hold_time", "command_scale", "command_turn_scale", "track_multiplier"),
+    *("wheel_delay", "latency_spread", "outlier_time"),
+)
+"""Columns of table `alignments` that are the first attributes of `Alignment`, in their order."""
+
+
 def read_alignment(table: pl.DataFrame) -> Alignment:
     """The only row of table `alignments`."""
     row = table.row(0, named=True)
@@ -340,30 +349,20 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
         gyro = GyroFit(
             *fitted, 0.0, row["heading_delay_error"], row["gyro_residual"], row.get("gyro_delay") or 0.0
         )
-    return Alignment(
-        row["hold_time"],
-        row["command_scale"],
-        row["track_multiplier"],
-        gyro,
-        row["heading_delay"] or 0.0,
-        row["wheel_delay"],
-        row["latency_spread"],
-        row["outlier_time"],
-        {name: row[f"recorded_modulus_{name}"] for name in _INPUTS},
-    )
+    # Tables of before have no scale of the difference: it was that of the whole.
+    row = {"command_turn_scale": row["command_scale"], **row}
+    moduli = {name: row[f"recorded_modulus_{name}"] for name in _INPUTS}
+    first = Alignment(*(row[name] for name in _ALIGNED))
+    return replace(first, gyro=gyro, heading_delay_s=row["heading_delay"] or 0.0, recorded_moduli=moduli)
 
 
 def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     """Table `alignments` of one run, without the columns of the run."""
     from schemas import tabulate  # noqa: PLC0415 - only where tables are written
 
+    firsts = fields(alignment)[: len(_ALIGNED)]
     row = {
-        "hold_time": alignment.hold_s,
-        "command_scale": alignment.command_scale,
-        "track_multiplier": alignment.track_multiplier,
-        "wheel_delay": alignment.wheel_delay_s,
-        "latency_spread": alignment.latency_spread_s,
-        "outlier_time": alignment.outlier_s,
+        **{name: getattr(alignment, one.name) for name, one in zip(_ALIGNED, firsts, strict=True)},
         **{f"recorded_modulus_{name}": alignment.recorded_moduli.get(name) for name in _INPUTS},
     }
     fit = alignment.gyro

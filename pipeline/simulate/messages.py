@@ -265,9 +265,10 @@ def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, comma
         return [_write_ackermann(topic.topics[0], log, time, commands.speed_mps, commands.turn)]
     if topic.form == "float_speed_steering":
         return _write_floats(topic.topics, log, (commands.speed_mps, commands.turn))
-    left, right = (
-        side * run.scenario.recording.command_scale
-        for side in invert_ideal_model(vehicle, commands.speed_mps, commands.turn)
+    recording = run.scenario.recording
+    turned = recording.command_scale if recording.command_turn_scale is None else recording.command_turn_scale
+    left, right = invert_ideal_model(
+        vehicle, recording.command_scale * commands.speed_mps, turned * commands.turn
     )
     if topic.form == "float_sides":
         return _write_floats(topic.topics, log, (left, right))

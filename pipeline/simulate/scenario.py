@@ -379,6 +379,8 @@ class Recording:
         hand_driven_s: for this long at the start a person drives by radio while the command topic is stale;
             a ``calib_state`` topic says which part counts. None leaves that topic out.
         command_scale: factor on recorded wheel commands (a topic made with another vehicle's radius).
+        command_turn_scale: factor on the difference of the recorded sides (made with another vehicle's
+            track); None for that of the whole command.
         command_latency_s: from a command's stamp to the recorder.
         gaps: how many holes of ``gap_s`` the whole recording has.
         zero_stamps: topics whose headers say zero throughout.
@@ -390,6 +392,7 @@ class Recording:
     decoys: Literal["none", "odometry", "commands", "both"] = "none"
     hand_driven_s: float | None = None
     command_scale: float = 1.0
+    command_turn_scale: float | None = None
     command_latency_s: float = 0.001
     gaps: int = 0
     gap_s: float = 2.0

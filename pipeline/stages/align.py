@@ -11,14 +11,13 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import NORMAL_95, arrays
-from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
+from pipeline.core.arrays import Flags, Floats
 from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, read_drive, tabulate_alignment
 from pipeline.run.heading import fit_gyro
-from pipeline.run.signals import STILL_MPS
-from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
+from pipeline.stages.command_scale import CommandScale, correct_commands, measure_command_scale
 from pipeline.stages.drive import interpolate_readings
 from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
 from pipeline.stages.incidents import find_incidents
@@ -27,172 +26,12 @@ from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, kee
 from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
-    ONE_SCALE,
     Samples,
     check_independence,
     estimate_delay,
     gather_samples,
 )
 from pipeline.stages.velocity import MotionEvents, differentiate_poses, find_events, report_gyro, smooth_gyro
-
-_LEAST_RATIO = 0.02
-"""Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
-_FEWEST_STEPS = 6
-"""Least number of slow steady steps for a median; half and double change no finding of two recordings."""
-_SCALED = 0.18
-"""Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.81
-on `husky_snow_boreal` and 0.95 to 1.04 on the other recordings."""
-_FEWEST_BLOCKS = 60
-"""Half seconds that tell a gain from a lag; half and double change no finding of two recordings."""
-
-
-@dataclass(frozen=True)
-class CommandScale:
-    """Correction factors of commands.
-
-    Attributes:
-        scale: factor on the whole command.
-        track_multiplier: factor on the track width in the controller's conversion of yaw rates.
-        findings: findings on it.
-    """
-
-    scale: float
-    track_multiplier: float
-    findings: tuple[Finding, ...] = ()
-
-
-def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
-    """Compare steady commanded wheel speeds with measured ones.
-
-    Only the slower half of the steps is used: there the drive does not saturate. If a body command has too
-    few steady steps, the gain of a lag from command to wheels gives the controller's multiplier.
-
-    Args:
-        samples: of the run, before any correction.
-        vehicle: as configured.
-    """
-    unscaled = CommandScale(1.0, vehicle.controller_track_multiplier)
-    if samples.measured is None or samples.command is None:
-        return unscaled
-    both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
-    forward, turning = _measure_ratios(samples, both)
-    if forward is None:
-        return unscaled
-    if abs(np.log(forward)) > _SCALED:
-        text = (
-            f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded: the recorded "
-            "command is in another scale (another vehicle's wheel radius, a unit, or a gain of the drive); "
-            f"commands are multiplied by {forward:.2f} before everything else, also for models and exports"
-        )
-        text += _contradict_scale(samples, both & samples.steady, forward)
-        finding = Finding("command_scale", "warning", text, where="command", value=forward)
-        return CommandScale(forward, vehicle.controller_track_multiplier, (finding,))
-    if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
-        return unscaled
-    used = vehicle.controller_track_multiplier
-    multiplier = turning / forward * used
-    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
-    text = (
-        f"in turns the wheels differ {turning / forward:.2f} times as much as the command asks "
-        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
-    )
-    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
-    return CommandScale(1.0, multiplier, (finding,))
-
-
-def _contradict_scale(samples: Samples, steady: Flags, forward: float) -> str:
-    asked, got = _average(samples, steady, samples.step.astype(np.int64))[1]
-    slow = _find_slow(asked)
-    turning = float(np.median(got[slow] / asked[slow])) if slow.sum() >= _FEWEST_STEPS else forward
-    if turning > 0.0 and abs(np.log(turning / forward)) < _SCALED:
-        return ""
-    times = f"{turning:.2f} times as much as commanded in the median turn"
-    return f"; the sides differ {times}: no single scale holds, and slip from commands in turns depends on it"
-
-
-def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
-    """Ratio of measured to commanded speed and yaw rate; None if it cannot be determined."""
-    steady, forward, turning = both & samples.steady, None, None
-    if steady.any():
-        steps = _average(samples, steady, samples.step.astype(np.int64))
-        forward, turning = (_find_ratio(asked, got) for asked, got in steps)
-        if forward is not None and turning is not None:
-            return forward, turning
-    if samples.body_commanded and both.any():
-        blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
-        along, across = (_find_gain(asked, got) for asked, got in blocks)
-        # Limits and droops lower the gain of fast turns; only a multiplier raises it.
-        if along is not None and across is not None and abs(np.log(along)) < _SCALED and across > along:
-            return along, across
-    return forward, turning
-
-
-def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
-    """Whether turns show another multiplier than the configured one.
-
-    A controller widens the track or leaves it unchanged: a smaller wheel difference is due to the drive.
-    """
-    multiplier = ratio * vehicle.controller_track_multiplier
-    return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
-
-
-def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
-    """Means over stretches of one label, in their order.
-
-    Args:
-        samples: of the run.
-        counts: samples to use, shape (n,).
-        label: label of each sample's stretch, shape (n,).
-
-    Returns:
-        Speed and yaw rate, each commanded and measured, shape (2, 2, stretches).
-    """
-    _, number, size = np.unique(label[counts], return_inverse=True, return_counts=True)
-    means = [
-        [
-            np.zeros(0) if values is None else np.bincount(number, values[counts, channel]) / size
-            for values in (samples.command, samples.measured)
-        ]
-        for channel in (0, 2)
-    ]
-    return np.array(means, dtype=np.float64)
-
-
-def _find_ratio(asked: Floats, got: Floats) -> float | None:
-    """Median ratio of measured to commanded over the slower half of the steps; None if they disagree."""
-    slow = _find_slow(asked)
-    if slow.sum() < _FEWEST_STEPS:
-        return None
-    ratio, inverse = got[slow] / asked[slow], 1.0 / np.abs(asked[slow])
-    middle = float(np.median(ratio))
-    spread = robust_spread(ratio - middle)
-    # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
-    apart = inverse - inverse.mean()
-    (level, slope), rest = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
-    is_sloped = float(rest.std()) < 0.5 * float(ratio.std())
-    changed = abs(level - slope * inverse.mean() - middle) if is_sloped else 0.0
-    return middle if middle > _LEAST_RATIO and max(spread, changed) < ONE_SCALE * middle else None
-
-
-def _find_slow(asked: Floats) -> Flags:
-    """The slower half of steps, without those near a standstill."""
-    size, most = np.abs(asked), float(np.abs(asked).max(initial=0.0))
-    slow: Flags = (size > max(0.1 * most, STILL_MPS)) & (size < 0.5 * most)
-    return slow
-
-
-def _find_gain(asked: Floats, got: Floats) -> float | None:
-    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None if the fit is poor."""
-    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < STILL_MPS:
-        return None
-    change = 0.5 * (got[2:] - got[:-2])
-    inner = got[1:-1]
-    design = np.column_stack((asked[1:-1], change))
-    fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
-    gain, rest = float(fitted[0]), inner - design @ fitted
-    agrees = float(np.sum(rest**2)) < ONE_SCALE**2 * float(np.sum(inner**2))
-    return gain if gain > _LEAST_RATIO and agrees else None
-
 
 _LEAST_S = 0.05
 """Least delay of encoders [s] that is corrected here; fits find shorter ones (six of twelve recordings)."""
@@ -282,7 +121,7 @@ def align_tables(
         inputs = read_inputs(times, commands, wheels, vehicle, hold)
     known = keep_known(inputs)
     grid = _Grid(velocities, np.zeros(velocities.height, dtype=bool), pl.DataFrame())
-    scale = CommandScale(1.0, vehicle.controller_track_multiplier)
+    scale = CommandScale(1.0, 1.0, vehicle.controller_track_multiplier)
     events = MotionEvents()
     if known:
         cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
@@ -303,12 +142,12 @@ def align_tables(
         findings += [*scale.findings, *independent]
         grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
     aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
-    asked, late_starts = mark_late_starts(
-        _correct_commands(commands, vehicle, scale), wheels, aligned_vehicle
-    )
+    asked, late_starts = mark_late_starts(correct_commands(commands, vehicle, scale), wheels, aligned_vehicle)
     findings += late_starts
     corrected = {**tables, "commands": asked}
-    alignment = Alignment(hold, scale.scale, scale.track_multiplier, recorded_moduli=grid.recorded)
+    alignment = Alignment(
+        hold, scale.scale, scale.turn_scale, scale.track_multiplier, recorded_moduli=grid.recorded
+    )
     poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
     imu = tables.get("imu")
     if not wheels.is_empty():
@@ -377,30 +216,6 @@ def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
             mask = np.isfinite(modulus) & ~bad
             medians[name] = float(np.median(modulus[mask])) if mask.any() else None
     return medians
-
-
-def _correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
-    """Table `commands` with the drive's inputs after correction of scale and track multiplier."""
-    if commands.is_empty():
-        return commands
-    columns = {
-        name: commands[name].cast(pl.Float64).to_numpy()
-        if name in commands.columns
-        else np.full(commands.height, np.nan)
-        for name in ("left", "right", "speed", "sideways", "body_x", "body_y", "body_w")
-    }
-    left, right = columns["left"], columns["right"]
-    if scale.track_multiplier != vehicle.controller_track_multiplier:
-        there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
-        body = (columns["body_x"], np.nan_to_num(columns["body_y"]), columns["body_w"])
-        asked = there.kinematics.inverse(body, there)
-        left, right = asked["left"], asked["right"]
-    aligned = {"left_aligned": left, "right_aligned": right}
-    aligned |= {f"{name}_aligned": columns[name] for name in ("sideways", "speed")}
-    return commands.with_columns(
-        pl.Series(name, scale.scale * values, dtype=pl.Float64).fill_nan(None)
-        for name, values in aligned.items()
-    )
 
 
 def _align_poses(

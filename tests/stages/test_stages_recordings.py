@@ -126,10 +126,11 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(results: Path) -> None:
     findings = summary["findings"]
     assert isinstance(findings, list)
     (found,) = [each for each in findings if isinstance(each, dict) and each["id"] == "command_scale"]
-    # Made with the Warthog's radius, the stored command is too small: the wheels turn faster than it says.
-    assert found["value"] == pytest.approx(0.30 / 0.165, rel=0.03)
-    # In turns the wheels differ by half of what it says: no one scale explains both.
-    assert "the sides differ 0.53 times as much as commanded" in found["text"]
+    # Made with the Warthog's wheels, the stored command is too small: the wheels turn faster than it says.
+    assert found["value"] == pytest.approx(0.30 / 0.165, rel=1e-6)
+    # In turns the wheels differ by half of what it says: its track, too, is the Warthog's.
+    assert "differ 0.53 times as much" in found["text"]
+    assert "wheels of 0.3 m radius on a track of 1.08 m, as those of Clearpath Warthog" in found["text"]
 
 
 @pytest.mark.parametrize("name", ["husky_wheels_wetgrass", "warthog_wheels_asphalt_2024_9_20_8h13s12"])

@@ -12,7 +12,7 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
-from pipeline.stages.align import _find_ratio
+from pipeline.stages.command_scale import _find_ratio
 from pipeline.stages.drive import interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
@@ -281,6 +281,27 @@ def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale:
     assert taken.finding("command_scale").value == pytest.approx(1.0 / scale, rel=0.02)
     assert "no single scale holds" not in taken.finding("command_scale").text
     assert "controller_multiplier" not in taken.ids()
+
+
+@pytest.mark.parametrize("reached", [1.0, 0.6])
+def test_trap_21_commands_of_another_vehicle_are_those_of_its_wheels_and_track(
+    drive: TakeThrough, reached: float
+) -> None:
+    """Whether the sides reach the difference or, against the ground, less of it."""
+    husky, warthog = VEHICLES["husky"], VEHICLES["warthog"]
+    radii = warthog.wheel_radius_m / husky.wheel_radius_m
+    tracks = radii * husky.lever_m / warthog.lever_m
+    recording = Recording(command_scale=1.0 / radii, command_turn_scale=1.0 / tracks)
+    effects = {} if reached == 1.0 else {"difference_gain": reached}
+    taken = drive(replace(LONGER, effects=effects, recording=recording))
+    finding = taken.finding("command_scale")
+    assert "as those of Clearpath Warthog" in finding.text
+    assert finding.value == pytest.approx(radii, rel=1e-6)
+    aligned = drive(replace(LONGER, effects=effects)).aligned.tables["commands"]
+    for side in ("left_aligned", "right_aligned"):
+        assert taken.aligned.tables["commands"][side].to_numpy() == pytest.approx(
+            aligned[side].to_numpy(), rel=1e-3, abs=1e-6, nan_ok=True
+        )
 
 
 @pytest.mark.parametrize(
