@@ -205,7 +205,7 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
     half = 0.5 * vehicle.kinematics.turning_width_m(vehicle)
     scale = np.array([1.0, 1.0, half])
     command, measured = inputs.get("command"), inputs.get("measured")
-    moved = _smooth(times, velocities.select("v_x", "v_y", "v_w").to_numpy() * scale)
+    moved = _smooth(times, velocities.select("v_x", "v_y", "v_w").to_numpy() * scale, _SMOOTH_S)
     asked, known = np.zeros((times.size, 3)), np.zeros(times.size, dtype=bool)
     if command is not None:
         counts = np.asarray(np.isfinite(command.velocity).all(axis=1), dtype=bool)
@@ -226,9 +226,9 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
     return Rims(times, size, asked, known, expired, wheels, driven, body, moved, top)
 
 
-def _smooth(times: Floats, values: Floats) -> Floats:
-    """Running mean over `_SMOOTH_S`, shape (n, k)."""
-    steps = arrays.count_steps(times, _SMOOTH_S)
+def _smooth(times: Floats, values: Floats, width_s: float) -> Floats:
+    """Running mean over a width [s], shape (n, k)."""
+    steps = arrays.count_steps(times, width_s)
     total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
     low = np.maximum(np.arange(times.size) - steps // 2, 0)
     high = np.minimum(np.arange(times.size) + steps // 2 + 1, times.size)
@@ -355,15 +355,24 @@ def _find_manual(rims: Rims) -> list[Span]:
 
 
 def _find_stuck(rims: Rims) -> list[Span]:
-    """Wheels that turn as usual without moving the body."""
+    """Wheels that turn as usual and bring the body hardly anywhere, which a noisy pose may sway meanwhile."""
     if rims.wheels is None:
         return []
-    brought = np.abs(rims.driven) @ np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
-    still = rims.body < LIVE_SHARE * rims.top
-    stuck = (rims.wheels > LIVE * rims.top) & (brought > 0.5 * LIVE * rims.top)
-    stuck &= rims.body < _SHARE_OF_GAIN * brought
-    shows = (rims.wheels > LIVE_SHARE * rims.top) & (rims.body < 2.0 * _SHARE_OF_GAIN * brought)
-    return _grow("stuck", rims, still | stuck, shows, _list_spans(rims.times, stuck, ANSWERS_S))
+    usual = rims.driven * np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
+    share, size = _find_share(usual, rims.moved), np.linalg.norm(usual, axis=1)
+    turns = (rims.wheels > LIVE * rims.top) & (size > 0.5 * LIVE * rims.top)
+    shows = (rims.wheels > LIVE_SHARE * rims.top) & (share < 2.0 * _SHARE_OF_GAIN)
+    lasting = turns & (_smooth(rims.times, share[:, None], ANSWERS_S)[:, 0] < _SHARE_OF_GAIN)
+    lasts = lasting | (turns & (share < _SHARE_OF_GAIN)) | (rims.body < LIVE_SHARE * rims.top)
+    spans = _grow("stuck", rims, lasts, shows, _list_spans(rims.times, lasting, _SHOWS_S))
+    return [span for span in spans if span[2] - span[1] >= ANSWERS_S]
+
+
+def _find_share(brought: Floats, moved: Floats) -> Floats:
+    """Share of what wheels bring that a body moves that way, at least half of any: sliding is not stuck."""
+    size = np.maximum(np.linalg.norm(brought, axis=1), STILL_MPS)
+    along, speed = np.sum(brought * moved, axis=1) / size, np.linalg.norm(moved, axis=1)
+    return np.asarray(np.maximum(along, 0.5 * speed) / size, dtype=np.float64)
 
 
 def measure_gain(rims: Rims, axis: int) -> float:

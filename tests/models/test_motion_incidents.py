@@ -257,10 +257,10 @@ def test_an_incident_of_a_log_stands_in_its_findings_its_slip_and_its_report(tmp
     assert "Red bands: incidents and suspect poses" in report
 
 
-# Looked at one by one in the recordings' speeds: the Husky digs itself into snow, twice, the Warthog stands
-# under commands on asphalt, and is driven by hand until its commands begin on sand.
+# Looked at one by one in the recordings' speeds: the Husky digs itself into snow, five times, the Warthog
+# stands under commands on asphalt, and is driven by hand until its commands begin on sand.
 KNOWN = {
-    ("husky_snow_boreal", "stuck"): 2,
+    ("husky_snow_boreal", "stuck"): 5,
     ("warthog_wheels_asphalt_2024_9_20_8h13s12", "emergency_stop"): 1,
     ("warthog_wheels_sand_2024_9_25_14h32s32", "manual_driving"): 1,
 }
@@ -301,3 +301,24 @@ def test_thousands_of_incidents_take_seconds() -> None:
     begin = process_time()
     find_incidents(velocities, tables, inputs, HUSKY, 0.5)
     assert process_time() - begin < 10.0
+
+
+@pytest.mark.parametrize(("motion", "kinds"), [("sways", ["stuck"]), ("slides", [])])
+def test_a_pose_that_sways_while_the_wheels_turn_is_stuck_and_one_that_slides_on_is_not(
+    motion: str, kinds: list[str]
+) -> None:
+    """As a Husky in deep snow, and a Warthog on ice whose wheels turn back already."""
+    times = np.arange(0.0, 90.0, 0.05)
+    ordinary = np.column_stack((np.full(times.size, 0.4), np.zeros(times.size), np.full(times.size, 1.8)))
+    still = ((times > 50.0) & (times < 54.0))[:, None]
+    sway = 0.07 * np.column_stack([np.sin(rate * times) for rate in (7.0, 5.0, 3.0)])
+    body = np.array([0.9, 1.0, 0.4]) * ordinary
+    moved = np.where(still & (motion == "sways"), sway, body)
+    wheels = np.where(still & (motion == "slides"), -ordinary, ordinary)
+    known = np.ones(times.size, dtype=bool)
+    inputs = {"measured": Ideal(wheels, ~known, known)}
+    velocities = pl.DataFrame(dict(zip(("t", "v_x", "v_y", "v_w"), (times, *moved.T), strict=True)))
+    tables = {"poses": pl.DataFrame({"t": times, "held": ~known})}
+    stuck = find_incidents(velocities, tables, inputs, HUSKY, 0.5).spans
+    assert [kind for kind, _, _ in stuck] == kinds
+    assert all(start == pytest.approx(50.0, abs=0.5) for _, start, _ in stuck)
