@@ -1,4 +1,4 @@
-"""Error budget of a run: the share of its slip, and of its 2 s error, due to each effect of a model.
+"""Error budget of a run: the share of its slip, and of its 2 s error, by effects of a model, and by times.
 
 An effect's share of the mean square is its Shapley value: the fall of the held-out error when it is added,
 averaged over the orders in which the effects of the model can be added (Shapley, Contributions to the Theory
@@ -7,23 +7,38 @@ whole. For up to five effects all orders are used; for more, the cyclic orders i
 then takes each position equally often, which is exact if effects interact only in pairs.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise, permutations
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.core import FEWEST_OF_SPREAD
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    JSON_DIGITS,
+    enumerate_texts,
+    finite_or_none,
+    format_share,
+    pick_finite,
+)
 from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
 from pipeline.core.compute import map_parallel
+from pipeline.core.rigid import find_runs
+from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.proposals import TERM
 from pipeline.estimation.verdict import FORMULA
+from pipeline.run.windows import HORIZON_S
+
+if TYPE_CHECKING:
+    from pipeline.estimation.diagnosis import Json
 
 Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]
@@ -78,6 +93,29 @@ class SlipBudget:
     unit: str
     shares: tuple[Share, ...]
     stretches: int
+
+    def to_json(self) -> dict[str, Json]:
+        """The keys of `slip compare --causes` for one run, for each input and quantity."""
+        rest: dict[str, Json] = {
+            share.kind: _numbers(share) for share in self.shares if share.kind != "effect"
+        }
+        return {
+            "input": self.input,
+            "quantity": self.quantity,
+            "total": finite_or_none(self.total, JSON_DIGITS),
+            "unit": self.unit,
+            "stretches": self.stretches,
+            "shares": [
+                {"effect": share.name, **_numbers(share, "alone", "last")}
+                for share in self.shares
+                if share.kind == "effect"
+            ],
+            **rest,
+        }
+
+
+def _numbers(share: Share, *others: str) -> dict[str, Json]:
+    return {**pick_finite(share, "share", "low", "high", *others, digits=JSON_DIGITS)}
 
 
 def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
@@ -259,3 +297,78 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     without = (part.sum() - part) / np.maximum(total - whole, 1e-300)
     error = jackknife_deviation(without)
     return ratio, student_quantile(0.95, count - 1) * error
+
+
+@dataclass(frozen=True)
+class Moments:
+    """The times of a run in which half of the squared error of the 2 s predictions of a model arises.
+
+    Attributes:
+        run: number of the run.
+        quantity: `position` or `heading`.
+        time_share: of the predictions.
+        spans: start and end [s], and share of the squared error; the largest share first.
+    """
+
+    run: int
+    quantity: str
+    time_share: float
+    spans: tuple[tuple[float, float, float], ...]
+
+    @property
+    def sentence(self) -> str:
+        """Sentence: the share of the time, and the spans with the largest shares."""
+        return (
+            f"half of the {self.quantity} error that is left over {HORIZON_S:g} s arises in "
+            f"{format_share(self.time_share, 0)} of the time; its largest parts: "
+            f"{enumerate_texts([_name_span(*span) for span in self.spans[:_SPANS]])}"
+        )
+
+    def to_json(self) -> dict[str, Json]:
+        """Keys `quantity`, `time_share`, `spans` and `text`."""
+        spans: list[Json] = [
+            {"t_start": start, "t_end": end, "share": round(share, 4), "text": _name_span(start, end, share)}
+            for start, end, share in self.spans
+        ]
+        share = finite_or_none(self.time_share, JSON_DIGITS)
+        return {"quantity": self.quantity, "time_share": share, "spans": spans, "text": self.sentence}
+
+
+_SPANS = 3
+"""Number of spans in a sentence."""
+
+
+def _name_span(start: float, end: float, share: float) -> str:
+    return f"{start:.0f} to {end:.0f} s ({format_share(share, 0)})"
+
+
+def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
+    """When half of the squared held-out error of each run arises, where it is above the noise floor."""
+    moments, floor, reached = list[Moments](), judgement.floor, judgement.whole.held_out
+    sides = (
+        ("heading", reached.yaw, floor.r_mrmse_rad),
+        ("position", reached.position, floor.t_mrmse_m),
+    )
+    for number, comparison in enumerate(judgement.problem.comparisons):
+        stretch = np.floor(comparison.horizons.times.mean(axis=1) / HORIZON_S).astype(np.int64)
+        for quantity, errors, least in sides:
+            square = errors[number] ** 2
+            known = np.isfinite(square)
+            if known.any() and float(square[known].mean()) > (ABOVE_FLOOR * least) ** 2:
+                moments.append(Moments(number, quantity, *_find_half(stretch[known], square[known])))
+    return tuple(moments)
+
+
+def _find_half(stretch: Ints, square: Floats) -> tuple[float, tuple[tuple[float, float, float], ...]]:
+    """The fewest stretches with half of a sum: their share of the time, and spans of adjacent ones."""
+    first = int(stretch.min())
+    sums, counts = np.bincount(stretch - first, square) / square.sum(), np.bincount(stretch - first)
+    order = np.argsort(-sums)
+    half = order[: int(np.searchsorted(np.cumsum(sums[order]), 0.5)) + 1]
+    inside = np.isin(np.arange(sums.size), half)
+    spans = [
+        (HORIZON_S * (first + begin), HORIZON_S * (first + end), float(sums[begin:end].sum()))
+        for begin, end in find_runs(inside)
+    ]
+    spans.sort(key=lambda span: -span[2])
+    return float(counts[half].sum() / counts.sum()), tuple(spans)

@@ -23,7 +23,7 @@ from pipeline.estimation.ambiguity import (
     list_equivalents,
     take_judged,
 )
-from pipeline.estimation.apportion import apportion
+from pipeline.estimation.apportion import apportion, find_moments
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Unexplained
 from pipeline.estimation.error_regions import (
@@ -143,8 +143,7 @@ def summarize(
         hidden.update(one.id for _, one in conditions)
     stated = hidden.union(*(effect.contains for effect in taken))
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
-    shares = () if judgement is None else judgement.ladder.explained_shares(judgement.floor)
-    last = shares[-1] if shares else None
+    last = None if judgement is None else judgement.ladder.explained_shares(judgement.floor)[-1]
     return RunDiagnosis(
         run="",
         input=source.value,
@@ -166,6 +165,7 @@ def summarize(
         explained_share=math.nan if last is None else last,
         learned={} if judgement is None else learn_beyond(judgement),
         where=tuple(pick_regions(map_errors(part, residual, places), residual, part.noise)),
+        when=() if judgement is None else find_moments(judgement),
         timing={"runs": cast("Json", clocks.list_runs(judgement.fitted if judgement else None))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(
@@ -246,8 +246,8 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
         (late,) = clock.parameters.values()
         timing["pose_delay_s"] = round(late.value, 4)
     return replace(
-        common, run=recording.name, effects=effects, immaterial=immaterial,
-        findings=tuple(findings), timing=timing,
+        common, run=recording.name, effects=effects, immaterial=immaterial, findings=tuple(findings),
+        timing=timing, when=tuple(one for one in common.when if one.run == number),
     )  # fmt: skip
 
 

@@ -20,14 +20,13 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.estimation.ambiguity import Undecided
-    from pipeline.estimation.apportion import SlipBudget
+    from pipeline.estimation.apportion import Moments, SlipBudget
     from pipeline.estimation.estimates import Unless
     from pipeline.estimation.search import Detectable, Unobservable
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
-_ENDS = ("share", "low", "high")
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
 
@@ -286,7 +285,8 @@ class RunDiagnosis:
         ladder: steps with their held-out errors.
         noise_floor: repeatability of the motion under the same input, as errors.
         explained_share: of the removable error; NaN where the ideal model is at the noise floor.
-        where: the few regions with most of the error.
+        where: the few regions with most of the error of the ideal model.
+        when: the times with half of the error that the model leaves.
         timing: delays, and the source of the heading.
         by_path: separate ladders of the drivetrain and of the ground, where there are encoders.
         disturbance: RMS of the residual in x, y, w, and its part that is correlated over seconds.
@@ -312,6 +312,7 @@ class RunDiagnosis:
     noise_floor: Mapping[str, Json] = field(default_factory=dict)
     explained_share: float = math.nan
     where: tuple[Region, ...] = ()
+    when: tuple[Moments, ...] = ()
     timing: Mapping[str, Json] = field(default_factory=dict)
     by_path: Mapping[str, Json] = field(default_factory=dict)
     disturbance: Mapping[str, Json] = field(default_factory=dict)
@@ -375,11 +376,12 @@ class RunDiagnosis:
                 }
                 for region in self.where
             ],
+            "when": [one.to_json() for one in self.when],
             "timing": dict(self.timing),
             "by_way": dict(self.by_path),
             "disturbance": dict(self.disturbance),
             "model": None if self.proposal is None else format_model(self.proposal),
-            "budget": [budget_as_json(budget) for budget in self.budgets],
+            "budget": [budget.to_json() for budget in self.budgets],
             "enough": format_enough(self.effects, self.findings) or None,
             "learned": dict(self.learned),
         }
@@ -451,7 +453,7 @@ def _budget_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
             "name": share.name,
             "mean_square": share.share * budget.total,
             "unit": budget.unit,
-            **_numbers(share, *_ENDS, "alone", "last"),
+            **_numbers(share, "share", "low", "high", "alone", "last"),
             "stretches": budget.stretches,
         }
         for budget in item.budgets
@@ -465,26 +467,6 @@ _ROWS: Mapping[str, Callable[[RunDiagnosis], list[dict[str, Json]]]] = {
     "budget": _budget_rows,
     "estimates": lambda item: [vars(number) for number in item.estimates],
 }
-
-
-def budget_as_json(budget: SlipBudget) -> dict[str, Json]:
-    """The keys of `slip compare --causes` for one run, for each input and quantity."""
-    residual: dict[str, Json] = {
-        share.kind: _numbers(share, *_ENDS) for share in budget.shares if share.kind != "effect"
-    }
-    return {
-        "input": budget.input,
-        "quantity": budget.quantity,
-        "total": _clean(budget.total),
-        "unit": budget.unit,
-        "stretches": budget.stretches,
-        "shares": [
-            {"effect": share.name, **_numbers(share, *_ENDS, "alone", "last")}
-            for share in budget.shares
-            if share.kind == "effect"
-        ],
-        **residual,
-    }
 
 
 def _clean(value: float) -> float | None:

@@ -159,6 +159,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, (_, unit) in ERRORS_OVER_2S.items())
     lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
     lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
+    lines += _label("when", [one.sentence for one in run.when])
     lines += _label("budget", [_format_budget(run)])
     lines += _label("data", [format_enough(run.effects, run.findings)])
     lines += _label("minor", _format_immaterial(run))

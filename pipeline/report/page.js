@@ -13,6 +13,13 @@
     to: find("mark-to"),
     set: find("mark-set"),
   });
+  for (const moment of document.querySelectorAll(".moment")) {
+    moment.addEventListener("click", () => {
+      find("mark-from").value = moment.dataset.from;
+      find("mark-to").value = moment.dataset.to;
+      find("mark-set").click();
+    });
+  }
   // What the reader chose, or else the stretch that a figure shows first.
   const zoomOf = (meta) => marks.zoomOf() ?? meta.window ?? null;
   const plots = slipPlots(page, { own: marks.own, zoomOf });

@@ -184,18 +184,19 @@ def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
 
 def view_where(page: Page) -> dict[str, object]:
     """Regions with the largest error, linked figures, and controls to mark time without a mouse."""
-    return {"regions": list_regions(page.report), "pictures": page.pictures[Section.WHERE]}
+    report, pictures = page.report, page.pictures[Section.WHERE]
+    moments = objects_in(report.diagnosis, "when")
+    return {"regions": list_regions(report), "moments": moments, "pictures": pictures}
 
 
 def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
     """Regions of the ideal model's error, as on the screen: each with its part of the error."""
     if report.is_refused:
         return []
-    regions = []
-    for entry in objects_in(report.diagnosis, "where")[:most]:
-        region, text = str(entry.get("region", "")), str(entry.get("text", ""))
-        regions.append((region, text.removeprefix(region).removeprefix(": ")))
-    return regions
+    texts = [
+        [str(one.get(key, "")) for key in ("region", "text")] for one in objects_in(report.diagnosis, "where")
+    ]
+    return [(region, text.removeprefix(region).removeprefix(": ")) for region, text in texts[:most]]
 
 
 def view_what_now(page: Page) -> dict[str, object]:

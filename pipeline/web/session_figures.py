@@ -11,7 +11,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.untrusted import number_in
-from pipeline.estimation.diagnosis import budget_as_json
 from pipeline.job.work import find_residual_modulus
 from pipeline.report import figures, theme
 from pipeline.report.figures import Drawing, Figure, Section, list_figures, slip_figures
@@ -331,7 +330,7 @@ class FigureCache:
         if source not in self._caps:
             self._caps[source] = Scene(RunReport(summary, self._tables)).modulus_cap
         tables = {**self._tables, "slip": self._leave(shown)} if "slip" in self._tables else self._tables
-        budget = [budget_as_json(one) for one in shown.apportion(self._length)] if with_budget else []
+        budget = [one.to_json() for one in shown.apportion(self._length)] if with_budget else []
         report = RunReport(summary, tables, {"input": source, "budget": budget}, motion=shown.view)
         ranked = rank_stretches(shown.view)
         return StretchScene(report, self._caps[source], ranked[stretch % len(ranked)] if ranked else None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
 from math import factorial
 
@@ -12,7 +13,14 @@ from hypothesis import strategies as st
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.estimation.apportion import QUANTITIES, apportion, jackknife_ratio, list_subsets, share_out
+from pipeline.estimation.apportion import (
+    QUANTITIES,
+    apportion,
+    find_moments,
+    jackknife_ratio,
+    list_subsets,
+    share_out,
+)
 from pipeline.estimation.estimates import estimate_unnamed
 from pipeline.estimation.ladder import Judgement, judge_model
 from pipeline.models import Model, find_effect
@@ -97,6 +105,23 @@ def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(
     assert shares["effective_track"].share > 0.5
     assert shares["lateral_skid"].low > 0.0
     assert abs(shares["speed_slip"].share) < 0.001
+
+
+def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(judged: Judgement) -> None:
+    assert find_moments(judged) == ()
+    held, floor = judged.whole.held_out, judged.floor.r_mrmse_rad
+    middle = judged.problem.comparisons[0].horizons.times.mean(axis=1)
+    size = np.select(
+        [(middle > 20.0) & (middle < 24.0), (middle > 40.0) & (middle < 42.0)], [30.0, 20.0], 1.0
+    )
+    worse = replace(judged, whole=replace(judged.whole, held_out=replace(held, yaw=(floor * size,))))
+    (heading,) = find_moments(worse)
+    (start, end, share), *_ = heading.spans
+    assert (heading.run, heading.quantity, start, end) == (0, "heading", 20.0, 24.0)
+    whole = float(np.sum(size**2))
+    assert share == pytest.approx(float(np.sum(size[(middle >= 20.0) & (middle < 24.0)] ** 2)) / whole)
+    assert heading.time_share < 0.1
+    assert heading.sentence.endswith(f"its largest parts: 20 to 24 s ({100.0 * share:.0f} %)")
 
 
 def test_intervals_of_a_ratio_hold_it_as_often_as_they_say() -> None:

@@ -83,6 +83,15 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "text": "turning faster than 1 rad/s: 74 % of the yaw error in 21 % of the time",
             }
         ],
+        "when": [
+            {
+                "quantity": "heading",
+                "time_share": 0.05,
+                "spans": [{"t_start": 12.0, "t_end": 16.0, "share": 0.3, "text": "12 to 16 s (30 %)"}],
+                "text": "half of the heading error that is left over 2 s arises in 5 % of the time; "
+                "its largest parts: 12 to 16 s (30 %)",
+            }
+        ],
         "unexplained": None,
         "findings": [],
         "ladder": [

@@ -74,6 +74,9 @@ PROBE = """
     dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
     document.dispatchEvent(new KeyboardEvent("keydown", {key: "Escape"}));
     await wait(() => plot("trajectory").querySelectorAll("path").length === empty);
+    document.querySelector(".moment").click();
+    await wait(() => plot("trajectory").querySelectorAll("path").length > empty);
+    seen.moment = document.querySelector("#marked span").textContent;
     seen.requests = performance.getEntriesByType("resource").map((entry) => entry.name);
     parent.postMessage(JSON.stringify(seen), "*");
   });
@@ -167,6 +170,8 @@ def test_nothing_is_cut_or_wider_than_the_screen(seen: dict[str, object]) -> Non
 def test_a_marked_stretch_shows_on_the_map_and_can_be_zoomed_into(seen: dict[str, object]) -> None:
     assert str(seen["marked"]).startswith("Marked 10.0\u201320.0 s: 10.0 s, highest slip")
     assert seen["onMap"] == 201
+    # The times with the largest errors can be marked, too.
+    assert str(seen["moment"]).startswith("Marked 12.0\u201316.0 s")
     assert "100" in seen["before"]  # type: ignore[operator]
     assert "100" not in seen["zoomed"]  # type: ignore[operator]
     assert {"12", "18"} <= set(seen["zoomed"])  # type: ignore[call-overload]
