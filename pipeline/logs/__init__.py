@@ -5,7 +5,8 @@ around it are read. The package does not interpret the values of messages. Here 
 between frames, from ``/tf`` and ``/tf_static``.
 
 Every frame has one parent. A chain is evaluated at the stamps of its last moving link, the one next to the
-child; slower links above it, such as map to odom, are interpolated there.
+child; slower links above it, such as map to odom, are corrections of it: each counts from when it was
+recorded, even if it is dated ahead, and what it corrects arose along the path since the one before.
 """
 
 from collections.abc import Iterable
@@ -16,7 +17,14 @@ from typing import Any, Final
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.rigid import interpolate_poses, invert_quaternions, multiply_quaternions, rotate
+from pipeline.core.rigid import (
+    find_held,
+    interpolate_poses,
+    invert_quaternions,
+    measure_increments,
+    multiply_quaternions,
+    rotate,
+)
 from pipeline.logs.bags import ROS1_BAG, SQLITE_BAG
 from pipeline.logs.catalog import OVER_BUDGET
 from pipeline.logs.columns import Ragged, RaggedStrings, Strings, join_stamp
@@ -36,6 +44,8 @@ _NUMBERS: Final = (
 )
 _LEAST_NORM: Final = 1e-6
 _HELD_INTERVALS: Final = 3.0
+_SMALLEST_LEAD_NS: Final = 1_000_000
+"""Time between stamp and recording that means nothing: recorders write down messages a millisecond apart."""
 
 TRANSFORM_FIELDS: Final = (
     f"{_TRANSFORM}header",
@@ -137,32 +147,38 @@ class TransformBuffer:
         Args:
             parent: frame in which the poses are expressed.
             child: frame whose poses they are.
-            at: stamps of the poses [ns]; by default those of the moving link next to the child.
+            at: stamps of the poses [ns]; by default those of the link next to the child that moves.
 
         Returns:
             Poses at the times where every link of the chain is known. A link is interpolated between its
-            stamps. Beyond its first and last stamp it is held for three of its intervals plus the time by
-            which its stamps are ahead of their log times (a future-dated map to odom); others are omitted.
+            stamps, a correction of the moving link next to the child between its changes, in proportion to
+            the path of that link. Beyond its first and last stamp it is held for three of its intervals plus
+            the time by which its stamps are ahead of their log times; others are omitted.
 
         Raises:
             LogError: ``frame_not_found``.
         """
         steps = self._steps(self.chain(parent, child))
-        leading = next((link for link, _ in reversed(steps) if not link.fixed), None)
+        dynamic = [(link, forward) for link, forward in steps if not link.fixed]
+        moving = [step for step in dynamic if not _is_still(step[0])] or dynamic
+        # Of a chain up from the vehicle the first link is its own.
+        leading = moving[-1 if moving[-1][1] else 0][0] if moving else None
         if at is None:
             time = leading.time if leading is not None else np.zeros(1, dtype=np.int64)
         else:
             time = np.asarray(at, dtype=np.int64)
         known = np.ones(time.size, dtype=np.bool_)
+        notes = list(self._notes)
+        if leading is not None:
+            steps = [(_date_back(link, leading, notes), forward) for link, forward in steps]
         for link, _ in steps:
             known &= _covers(link, time)
-        notes = list(self._notes)
         if not known.all():
             notes.append(f"{int((~known).sum())} of {known.size} stamps lie where the chain is not known")
         time = time[known]
         position, quaternion = np.zeros((time.size, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (time.size, 1))
         for link, forward in steps:
-            step_position, step_quaternion = _pose_at(link, time)
+            step_position, step_quaternion = _pose_at(link, leading, time)
             if not forward:
                 step_quaternion = invert_quaternions(step_quaternion)
                 step_position = -rotate(step_quaternion, step_position)
@@ -275,6 +291,10 @@ def _join(links: list[Link]) -> Link:
     return replace(links[0], **arrays)
 
 
+def _is_still(link: Link) -> bool:
+    return bool(find_held(link.position, link.quaternion)[1:].all())
+
+
 def _covers(link: Link, time: Ints) -> Flags:
     """Stamps at which a link is known: within its own, and as far beyond as it is held."""
     if link.fixed or link.time.size == 1:
@@ -286,11 +306,53 @@ def _covers(link: Link, time: Ints) -> Flags:
     return covered
 
 
-def _pose_at(link: Link, time: Ints) -> tuple[Floats, Floats]:
-    start = link.time[0]
-    return interpolate_poses(
-        (time - start) * 1e-9, (link.time - start) * 1e-9, link.position, link.quaternion
+def _date_back(link: Link, leading: Link, notes: list[str]) -> Link:
+    """A correction of the leading link, without the time by which it is dated ahead of its recording."""
+    if link is leading or link.fixed or not leading.time.size:
+        return link
+    start = leading.time[0]
+    recorded = np.maximum.accumulate(leading.log_time) - start
+    there = np.interp(link.log_time - start, recorded, leading.time - start)
+    ahead = int(np.median(link.time - start - there))
+    if ahead < _SMALLEST_LEAD_NS:
+        return link
+    notes.append(
+        f"{link.parent} to {link.child} is dated {ahead * 1e-9:.2g} s ahead: it counts from its recording on"
     )
+    return replace(link, time=link.time - ahead)
+
+
+def _pose_at(link: Link, leading: Link | None, time: Ints) -> tuple[Floats, Floats]:
+    """Positions (n, 3) and quaternions (n, 4) of a link at stamps.
+
+    Between two changes of a correction, its share is that of the path of the leading link [m + rad]: so much
+    of the drift had arisen. A change of more than that path is a jump of the localization.
+    """
+    start = link.time[0]
+    at, known = (time - start) * 1e-9, (link.time - start) * 1e-9
+    if leading is None or link is leading or link.time.size == 1 or leading.time.size == 1:
+        return interpolate_poses(at, known, link.position, link.quaternion)
+    fresh = np.flatnonzero(~find_held(link.position, link.quaternion))
+    before, after = fresh[:-1], fresh[1:]
+    stamps = (leading.time - start) * 1e-9
+    moved = np.diff(leading.position, axis=0)
+    _, turned = measure_increments(leading.position, leading.quaternion)
+    odometer = np.append(0.0, np.cumsum(np.linalg.norm(moved, axis=1) + np.linalg.norm(turned, axis=1)))
+    path = np.interp(known, stamps, odometer)
+    driven = path[after] - path[before]
+    vehicle, _ = interpolate_poses(known[after], stamps, leading.position, leading.quaternion)
+    old, new = (link.position[rows] + rotate(link.quaternion[rows], vehicle) for rows in (before, after))
+    _, turn = measure_increments(link.position[fresh], link.quaternion[fresh])
+    arose = np.linalg.norm(new - old, axis=1) + np.linalg.norm(turn, axis=1) < driven
+    rows, here = (np.searchsorted(known[fresh], times, side="right") - 1 for times in (known, at))
+    arose = np.append(arose, False)
+    needed = ~arose[rows]
+    needed[fresh] = True
+    spread = arose[here]
+    row = here[spread]
+    share = (np.interp(at[spread], stamps, odometer) - path[before[row]]) / driven[row]
+    at[spread] = known[before[row]] + share * (known[after[row]] - known[before[row]])
+    return interpolate_poses(at, known[needed], link.position[needed], link.quaternion[needed])
 
 
 def _clean(frame: str) -> str:

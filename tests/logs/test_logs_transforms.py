@@ -66,7 +66,12 @@ def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(
     assert (series.log_time - series.time == 7).all()
     assert series.time.size >= 160
     rows = (series.time - START) // STEP
-    fraction = np.interp(series.time - START, slow + lead - START, np.linspace(0.0, 1.0, slow.size))
+    # Dated ahead of its recording, a correction counts from there; what it corrects arose along the path.
+    known = slow - START + (lead if lead + 7 < 1_000_000 else -7)
+    steps = np.linalg.norm(np.diff(moved, axis=0), axis=1) + np.abs(np.diff(turned))
+    path = np.append(0.0, np.cumsum(steps))
+    along, reached = (np.interp(at, times - START, path) for at in (series.time - START, known))
+    fraction = np.interp(along, reached, np.linspace(0.0, 1.0, slow.size))
     outer = quaternions_from_yaw(0.4 * fraction)
     inner = quaternions_from_yaw(turned[rows])
     reach = moved[rows] + rotate(inner, np.tile([0.1, 0.2, 0.3], (rows.size, 1)))
@@ -92,6 +97,37 @@ def test_a_future_dated_correction_serves_from_the_start(tmp_path: Path) -> None
     series = buffer_of(path).lookup_series("map", "base_link")
     assert series.time.tolist() == times.tolist()
     assert np.allclose(series.position, 1.0)
+
+
+def test_a_correction_that_waits_for_motion_is_the_drift_along_the_path(tmp_path: Path) -> None:
+    times = START + np.arange(600) * STEP // 2
+    # Straight on, a stop of 4 s, and on; the odometry is a tenth short until a jump of the map by 3 m.
+    truth = np.cumsum(np.where((np.arange(600) > 200) & (np.arange(600) < 360), 0.0, 0.01))
+    odometry = 0.9 * truth
+    scans = np.arange(0, 600, 4)
+    since, held = 0.0, np.zeros(scans.size)
+    for row, scan in enumerate(scans):
+        if odometry[scan] - since > 0.2:
+            since, held[row:] = odometry[scan], (truth - odometry)[scan] + 3.0 * (scan > 480)
+    path = tmp_path / "log.mcap"
+    with LogWriter(path) as writer:
+        correction = transforms("map", "odom", np.outer(held, [1.0, 0.0, 0.0]), 0 * held)
+        writer.write_columns("/tf", KIND, times[scans], correction, header_time=times[scans] + 1_000_000_000)
+        motion = transforms("odom", "base_link", np.outer(odometry, [1.0, 0.0, 0.0]), 0 * odometry)
+        writer.write_columns("/tf", KIND, times, motion, header_time=times)
+        joint = transforms("base_link", "wheel", np.zeros((600, 3)), np.zeros(600))
+        writer.write_columns("/tf", KIND, times, joint, header_time=times - STEP)
+    series = buffer_of(path).lookup_series("map", "wheel")
+    rows = np.searchsorted(times, series.time)
+    off = series.position[:, 0] - truth[rows]
+    changes = scans[np.flatnonzero(np.diff(held)) + 1]
+    jump = int(np.argmax(changes > 480))
+    known = (rows > changes[0]) & (rows <= changes[jump - 1])
+    moved = (rows >= changes[jump]) & (rows <= changes[-1])
+    assert np.abs(off[known]).max() < 1e-9
+    assert np.allclose(off[moved], 3.0)
+    assert np.abs(off[(rows > changes[jump - 1]) & (rows < changes[jump] - 4)]).max() < 0.05
+    assert [note for note in series.notes if "dated 1 s ahead" in note]
 
 
 def test_a_missing_chain_names_the_known_frames(tmp_path: Path) -> None:
