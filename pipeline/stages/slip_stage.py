@@ -355,11 +355,15 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
 
 def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
     ideal = ideals.get("command")
-    if ideal is None or not ideal.stale.any():
+    if ideal is None:
         return []
-    count = int(ideal.stale.sum())
+    # A command of zero does not lapse: a vehicle that is asked to stand needs no second one.
+    lapsed = ideal.expired.any(axis=1)
+    if not lapsed.any():
+        return []
+    count = int(lapsed.sum())
     text = f"in {count} time steps the last command is too old (command.hold_s holds it longer): left out"
-    first = float(times[np.flatnonzero(ideal.stale)[0]])
+    first = float(times[np.flatnonzero(lapsed)[0]])
     return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
 
 

@@ -159,6 +159,29 @@ def test_a_command_is_held_until_the_next_one_or_until_it_is_stale() -> None:
     assert found.stale.tolist() == [False, False, False, False, True, False]
 
 
+@pytest.mark.parametrize(("last", "is_reported"), [(0.0, False), (1.0, True)])
+def test_silence_after_a_stop_is_no_stale_command(
+    drive: TakeThrough, last: float, *, is_reported: bool
+) -> None:
+    # Nav2 ends each goal with a zero, and is silent until the next one.
+    taken = drive(FIELD)
+    stamps = np.arange(0.0, 5.0, 0.05)
+    speeds = np.where(stamps < 4.0, 1.0, last)
+    commands = make_drive(stamps.tolist(), speeds.tolist())
+    made = compute_slip(
+        taken.velocities,
+        commands,
+        pl.DataFrame(),
+        vehicle=HUSKY,
+        configuration=convert({}, "test"),
+        hold_s=0.5,
+        inputs=("command",),
+        where="a.mcap",
+    )
+    assert made.slip["t"].max() < 5.5
+    assert bool([one for one in made.findings if one.id == "stale_command"]) is is_reported
+
+
 def test_a_pair_of_topics_at_2_hz_is_held_for_its_own_period() -> None:
     stamps = np.sort(np.concatenate((np.arange(20) * 0.5, np.arange(20) * 0.5 + 1e-4)))
     commands = make_drive(stamps.tolist(), [1.0] * 40)
