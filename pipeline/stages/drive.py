@@ -179,14 +179,24 @@ def _recognize_unit(times: Floats, joints: Sequence[tuple[Floats, Floats]]) -> s
 
 
 def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic: str) -> Floats:
-    """Steering angle [rad] of the configured joint, else the mean of the joints with steering names."""
+    """Steering angle [rad] of the configured joint, else of the middle of those with steering names.
+
+    Wheels of one axle that roll about one centre have that centre's distance in common, not the angle: the
+    cotangent in the middle is the mean of theirs. Of other joints it is the mean of the angles.
+    """
     names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
     angles = [position[joint] for joint in names if joint in position]
     if not angles:
         hint = f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}."
         raise StageError("no_steering", f"{topic} needs a steering joint", where=topic, hint=hint)
-    mean: Floats = np.mean(angles, axis=0)
-    return mean
+    if len(angles) != 2:  # noqa: PLR2004 - the wheels of one axle
+        mean: Floats = np.mean(angles, axis=0)
+        return mean
+    first, second = np.tan(angles)
+    middle, half = 0.5 * (first + second), 0.5 * (first - second)
+    to_one_side = np.abs(half) < np.abs(middle)
+    bent = np.divide(half**2, middle, out=np.zeros_like(middle), where=to_one_side)
+    return np.arctan(middle - bent)
 
 
 def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Floats]]:

@@ -13,7 +13,7 @@ from pipeline.core import SlipError
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
 from pipeline.stages.command_scale import _find_ratio
-from pipeline.stages.drive import interpolate_readings
+from pipeline.stages.drive import _mean_steering, interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
 
@@ -45,6 +45,19 @@ def test_trap_7_positions_are_differentiated_where_there_is_no_velocity(drive: T
     steady = taken.slip("measured").filter(~pl.col("transitory"))
     both = steady.join(plain, on="stamp", suffix="_plain")
     assert rms(both["f_x"] - both["f_x_plain"]) < 5e-3
+
+
+@pytest.mark.parametrize("track", [0.0, 0.45])
+def test_trap_7_steered_wheels_about_one_centre_steer_as_the_one_between_them(track: float) -> None:
+    asked, wheelbase = np.linspace(-0.6, 0.6, 25), 0.6
+    slope = np.tan(asked)
+    inner, outer = (np.arctan(slope / (1.0 + side * slope * track / wheelbase)) for side in (-0.5, 0.5))
+    joints = {"front_left_steering_joint": inner, "front_right_steering_joint": outer, "rear_left": asked}
+    assert np.allclose(_mean_steering(joints, None, "/joint_states"), asked)
+    # Toed in by a play of the rods the wheels have no centre; and one sensor is its wheel's.
+    toed = {"left_steer": np.full(3, 0.01), "right_steer": np.full(3, -0.01)}
+    assert np.allclose(_mean_steering(toed, None, "/joint_states"), 0.0)
+    assert np.array_equal(_mean_steering({"steering": asked}, None, "/joint_states"), asked)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("rad/s", 1.0), ("rpm", 2.0 * np.pi / 60.0), ("m/s", 1 / 0.3)])
