@@ -40,6 +40,7 @@ class Description:
         kind: ``differential``, ``ackermann`` or ``mecanum``.
         wheel_radius_m, track_width_m, wheelbase_m: geometry.
         base_to_rear_axle_m: distance of base_link ahead of the rear axle (Ackermann).
+        max_steering_rad: limit of the steering joints.
         wheels: names of the wheel joints.
     """
 
@@ -49,6 +50,7 @@ class Description:
     track_width_m: float | None
     wheelbase_m: float | None
     base_to_rear_axle_m: float
+    max_steering_rad: float | None
     wheels: tuple[str, ...]
 
 
@@ -61,6 +63,7 @@ class _Joint:
     position: Floats
     turn: Floats
     axis: Floats
+    largest_rad: float
 
 
 def read_description(text: str) -> Description | None:
@@ -118,25 +121,26 @@ def _make_vehicle(
         track_width_m=float(np.mean(left) - np.mean(right)) if left and right else None,
         wheelbase_m=float(front - rear) if front - rear > _APART_M else None,
         base_to_rear_axle_m=-float(rear) if steering else 0.0,
+        max_steering_rad=max((joint.largest_rad for joint, _ in steering), default=0.0) or None,
         wheels=tuple(joint.name for joint, _ in wheels),
     )
 
 
 def _read_joint(element: ET.Element) -> _Joint | None:
     parent, child, origin = element.find("parent"), element.find("child"), element.find("origin")
-    axis = element.find("axis")
+    axis, limits = element.find("axis"), element.findall("limit")
     if parent is None or child is None:
         return None
     try:
         position = _numbers(origin, "xyz", (0.0, 0.0, 0.0))
         turn = rigid.quaternions_from_euler(*_numbers(origin, "rpy", (0.0, 0.0, 0.0)))
         along = _numbers(axis, "xyz", (1.0, 0.0, 0.0))
+        ends = [abs(float(limit.get(name, "nan"))) for limit in limits for name in ("lower", "upper")]
     except ValueError:
         return None
-    kind = element.get("type", "")
-    return _Joint(
-        element.get("name", ""), kind, parent.get("link", ""), child.get("link", ""), position, turn, along
-    )
+    name, kind = element.get("name", ""), element.get("type", "")
+    largest = max((end for end in ends if end < math.pi / 2.0), default=0.0)
+    return _Joint(name, kind, parent.get("link", ""), child.get("link", ""), position, turn, along, largest)
 
 
 def _numbers(element: ET.Element | None, name: str, usual: tuple[float, float, float]) -> Floats:
@@ -288,7 +292,9 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
 
 def _build(description: Description) -> Recognized | None:
     """A vehicle from a description alone, if it is complete."""
-    values = {name: getattr(description, name) for name in (*_GEOMETRY, "base_to_rear_axle_m")}
+    values = {
+        name: getattr(description, name) for name in (*_GEOMETRY, "base_to_rear_axle_m", "max_steering_rad")
+    }
     vehicle = make_vehicle(description.name or "robot", description.kind, values)
     return None if vehicle is None else Recognized(vehicle, "robot_description")
 

@@ -59,6 +59,22 @@ def test_a_car_is_told_by_its_steering_joints() -> None:
     assert found.track_width_m == pytest.approx(platform.vehicle.track_width_m)
     assert found.wheel_radius_m == pytest.approx(platform.vehicle.wheel_radius_m)
     assert found.base_to_rear_axle_m == 0.0
+    assert found.max_steering_rad is None
+
+
+@pytest.mark.parametrize(
+    ("limit", "largest"), [('lower="-0.5" upper="0.6"', 0.6), ('lower="-3.2" upper="3.2"', None), ("", None)]
+)
+def test_a_car_turns_its_wheels_as_far_as_its_description_says(limit: str, largest: float | None) -> None:
+    platform = PLATFORMS["ackermann_steering_controller"]
+    (text,) = [one.fields["data"] for one in platform.topics if one.topic == "/robot_description"]
+    joint = f"<limit {limit} effort='10' velocity='2'/></joint>"
+    found = read_description(str(text).replace("</joint>", joint))
+    assert found is not None
+    assert found.max_steering_rad == largest
+    recognized = recognize_vehicle([], {}, found)
+    assert recognized is not None
+    assert recognized.vehicle.max_steering_rad == largest
 
 
 @pytest.mark.parametrize(
