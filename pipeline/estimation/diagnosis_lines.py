@@ -286,7 +286,10 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
     if not learned.get("kept"):
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
     shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
-    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one is not None}
+    # Below the noise floor a share is of nothing.
+    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one and one["physics"] < 1.0}
+    if not known:
+        return ""
     explained = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
     with_learned = " and ".join(format_share(one["with_learned"]) for one in known.values())
     beyond = f"with a function learned from the data, which gives no cause, {with_learned}"

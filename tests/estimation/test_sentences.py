@@ -8,9 +8,14 @@ import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
-from pipeline.estimation.diagnosis_lines import choose_lines, format_unexplained, list_lines
+from pipeline.estimation.diagnosis_lines import (
+    choose_lines,
+    format_learned_share,
+    format_unexplained,
+    list_lines,
+)
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
-from pipeline.estimation.ladder import format_rises
+from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
 from pipeline.estimation.search import Detectable
 from pipeline.estimation.verdict import FORMULA
 from pipeline.models import find_effect
@@ -240,3 +245,21 @@ def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_
         "formula",
         f"a formula explains 66 % of what the effects leave: {where}; formula in the model",
     ) in [(label, text) for label, text, _ in _list_open(report)]
+
+
+@pytest.mark.parametrize(
+    ("position", "heading", "said"),
+    [
+        ((0.9, 0.95), (0.8, 0.82), "90 % of the position error and 80 % of the heading error"),
+        ((1.84, 1.85), (0.82, 0.84), "the effects explain 82 % of the heading error; "),
+        ((1.2, 1.3), (1.1, 1.1), ""),
+    ],
+)
+def test_no_effect_explains_more_than_the_whole_error(
+    position: tuple[float, float], heading: tuple[float, float], said: str
+) -> None:
+    shares = [dict(zip(("physics", "with_learned"), pair, strict=True)) for pair in (position, heading)]
+    learned = {"kept": True, "explained_share": dict(zip(ERRORS_OVER_2S, shares, strict=True))}
+    text = format_learned_share(learned)
+    assert said in text
+    assert bool(text) == bool(said)
