@@ -23,6 +23,7 @@ from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
 from pipeline.stages import Finding
 from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.pose_topics import SLOW_HZ
 from pipeline.stages.reading import FEWEST_MESSAGES
 from pipeline.stages.satellite import estimate_noise
 from pipeline.stages.trust import ONE_SCALE, measure_rest
@@ -38,8 +39,6 @@ _SIDEWAYS_MPS: Final = 2e-3
 """Sideways speed [m/s] below which a pose may be computed from the wheels: a localization has more noise."""
 _ASTRAY: Final = 0.3
 """Fraction of a pose's turning that may differ from the gyro's: its noise, and the loss of a tilted gyro."""
-_SLOW_HZ: Final = 4.0
-"""Least rate of new poses [Hz]: fewer are insufficient for a velocity over 0.75 s."""
 _SPARSE: Final = 0.5
 """Coverage of the log below which a topic often lacks poses."""
 _STILL_M: Final = 1e-4
@@ -163,7 +162,7 @@ def _rate(
     if astray is not None and astray > _ASTRAY:
         score -= 1.5
         reasons.append(f"{format_share(astray)} of its turning differs from the gyro's")
-    if rate < _SLOW_HZ:
+    if rate < SLOW_HZ:
         score -= 5.0
         reasons.append("too slow for velocities")
     if coverage < _SPARSE:

@@ -150,6 +150,10 @@ def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags
     return scaled, usable, findings
 
 
+SLOW_HZ: Final = 4.0
+"""Least rate of new poses [Hz]: fewer are insufficient for a velocity over 0.75 s."""
+
+
 def cut_track(
     times: Floats,
     position: Floats,
@@ -234,12 +238,24 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
         )
         where = float(t[np.flatnonzero(jumps)[0]])
         findings.append(Finding("pose_jump", "warning", text, where=topic, t_start=where, count=count))
-    share = float(held.mean())
+    fresh = rigid.select_fresh_poses(t, held)
+    period = float(np.median(np.diff(t[fresh]))) if fresh.size > 1 else 0.0
+    if period * SLOW_HZ > 1.0:
+        text = (
+            f"{topic} gives a new pose every {period:.2g} s: too slow for velocities, and much driving cannot "
+            "be compared; record a faster localization, or the transforms (/tf): the odometry in them fills "
+            "the time between its poses"
+        )
+        findings.append(Finding("slow_poses", "warning", text, where=topic, value=period))
+    # A vehicle at rest repeats its pose, too.
+    share = 1.0 - fresh.size / held.size
     if share > 0.05:  # noqa: PLR2004 - fewer repeats are chance
         text = (
             f"{format_share(share)} of the poses of {topic} repeat the one before: the localization is slower"
         )
-        findings.append(Finding("held_poses", "info", text, where=topic, value=share, count=int(held.sum())))
+        findings.append(
+            Finding("held_poses", "info", text, where=topic, value=share, count=held.size - fresh.size)
+        )
     return findings
 
 

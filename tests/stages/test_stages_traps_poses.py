@@ -31,6 +31,18 @@ def test_trap_1_held_poses_do_not_double_velocities(drive: TakeThrough) -> None:
     assert rms(fast["g_x"]) < 0.05
 
 
+@pytest.mark.parametrize(("period", "said"), [(1.0, {"slow_poses"}), (0.1, set())])
+def test_trap_1_poses_that_are_too_slow_are_said_to_be_and_rest_is_no_repeat(
+    period: float, said: set[str]
+) -> None:
+    times = np.arange(0.0, 60.0, period)
+    # It stands for half of the time: its poses are the same then, and new.
+    position = np.outer(np.minimum(0.3 * times, 9.0), [1.0, 0.0, 0.0])
+    quaternion = np.tile([0.0, 0.0, 0.0, 1.0], (times.size, 1))
+    track = cut_track(times, position, quaternion, np.zeros(times.size, dtype=bool), SETTINGS, "/amcl_pose")
+    assert {finding.id for finding in track.findings} == said
+
+
 def test_trap_1_a_standing_vehicle_is_no_gap_and_has_no_velocity(drive: TakeThrough) -> None:
     standing = replace(PLAIN, program=Program("stop_and_go"), pose=replace(EXACT, update_hz=5.0))
     taken = drive(standing)
