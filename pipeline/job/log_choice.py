@@ -57,6 +57,7 @@ from pipeline.sources import (
     resolve_vehicle,
 )
 from pipeline.sources.candidates import LOCALIZED
+from pipeline.sources.configuration import BODY_STAND_IN
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
@@ -436,7 +437,7 @@ def _fit_vehicle(
         vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
     if drive is None:
         values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
-        name = "fitted_body"
+        name = BODY_STAND_IN
         text = (
             "no vehicle is given and none is needed: the drive is commanded and measured as body motion, "
             "whose slip does not depend on wheel radius and track width"

@@ -288,6 +288,15 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         """Kinematics of its kind."""
         return find_kinematics(self.kind)
 
+    @property
+    def is_stand_in(self) -> bool:
+        """Whether only body motion was commanded and measured: the geometry is then none of a vehicle."""
+        return self.id == BODY_STAND_IN
+
+
+BODY_STAND_IN: Final = "fitted_body"
+"""Id of a vehicle of which nothing is known but its body motion."""
+
 
 @functools.cache
 def list_presets() -> tuple[Vehicle, ...]:

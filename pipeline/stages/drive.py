@@ -196,7 +196,8 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
     middle, half = 0.5 * (first + second), 0.5 * (first - second)
     to_one_side = np.abs(half) < np.abs(middle)
     bent = np.divide(half**2, middle, out=np.zeros_like(middle), where=to_one_side)
-    return np.arctan(middle - bent)
+    between: Floats = np.arctan(middle - bent)
+    return between
 
 
 def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Floats]]:

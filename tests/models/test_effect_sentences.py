@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from pipeline.models import find_effect, list_effects
@@ -66,6 +67,13 @@ def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind
         low, high = parameter.bounds
         other = min(max(1.7 * parameter.typical, low), high)
         assert effect.change(**{parameter.name: other}).describe_motion(vehicle) != sentence, parameter.name
+
+
+def test_no_metres_are_said_of_a_vehicle_of_which_only_the_body_motion_is_known() -> None:
+    stand_in = msgspec.structs.replace(HUSKY, id="fitted_body", name="fitted vehicle")
+    assert find_effect("effective_track")().change(k=1.08).describe_motion(stand_in) == (
+        "Effective track 1.08 times the controller's: the robot turns at 93 % of the ideal rate"
+    )
 
 
 def test_understeer_is_told_at_a_speed() -> None:

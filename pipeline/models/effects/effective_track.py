@@ -71,8 +71,11 @@ class EffectiveTrack(KinematicEffect):
         others = {_BESIDE[one.id]: next(iter(one.values.values())) for one in beside if one.id in _BESIDE}
         names = enumerate_texts([name for name, value in others.items() if value != 1.0])
         reached = math.prod(others.values()) / k
+        track = f"{k * nominal:.2f} m (nominal {nominal:.2f})"
+        if vehicle.is_stand_in:
+            track = f"{k:.3g} times the controller's"
         return (
-            f"Effective track {k * nominal:.2f} m (nominal {nominal:.2f}){names and f', with {names}'}: "
+            f"Effective track {track}{names and f', with {names}'}: "
             f"the robot turns at {format_share(reached)} of the ideal rate"
         )
 
