@@ -77,7 +77,7 @@ def query(  # noqa: D417 - arguments document themselves
         vehicle: only runs of this vehicle; files of other runs are not opened.
         terrain: only runs on this terrain.
         dataset: only runs of this dataset.
-        day: only runs of this UTC day, 2026-07-31, or of a month, 2026-07.
+        day: only runs of this day, 2026-07-31, or of a month, 2026-07.
         to: how to print the answer.
         allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
         timeout: longest time for the answer [s].
@@ -107,7 +107,7 @@ def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None])
 
         wanted = Partition(**partition)
         words = re.findall(r"\w+", sql.lower())
-        opened.mirror.pull_tables(words, filter(wanted.holds, opened.open_store().manifests()))
+        opened.mirror.pull_tables(words, wanted.select(opened.open_store().manifests()))
     return opened.root
 
 

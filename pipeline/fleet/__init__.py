@@ -8,10 +8,8 @@ datasets into which runs are pooled.
 from __future__ import annotations
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import date
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -385,20 +383,6 @@ def _name_ends(
             return {low: None, high: None, about: ""}
         interval, about_which = one, THIS_RUN
     return {low: interval.low, high: interval.high, about: about_which}
-
-
-_DAY = re.compile(r"(?<!\d)(20\d\d)[-_](\d{1,2})[-_](\d{1,2})(?!\d)")
-
-
-def read_day(run: str) -> str | None:
-    """Date in the name of a run (`2024_8_7` or `2024-08-07`) as `2024-08-07`; None without one."""
-    match = _DAY.search(run)
-    if match is None:
-        return None
-    try:
-        return date(*(int(part) for part in match.groups())).isoformat()
-    except ValueError:  # no day of the calendar
-        return None
 
 
 def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:

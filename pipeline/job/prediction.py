@@ -16,7 +16,7 @@ from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.fleet import UNKNOWN, read_day
+from pipeline.fleet import UNKNOWN
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.fleet.levels import draw_run
@@ -31,7 +31,7 @@ from pipeline.report.motion_view import COLUMNS, load_motion_run, load_vehicle
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store
-from pipeline.store.names import no_results
+from pipeline.store.names import no_results, read_day
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)

@@ -30,6 +30,7 @@ import polars as pl
 from pipeline.core import SlipError, format_share, naming_os_errors, shorten, suffix_unit
 from pipeline.core.untrusted import mapping_in
 from pipeline.store import LOG_NOTES, Manifest, Store
+from pipeline.store.names import date_runs
 from pipeline.store.parquet_tables import scan_table
 
 if TYPE_CHECKING:
@@ -138,10 +139,14 @@ def count_serious(findings: Iterable[Mapping[str, object]]) -> dict[str, str]:
     return {name: f"{count} {name}{'s' if count > 1 else ''}" for name, count in counts.items() if count}
 
 
-def format_date(nanoseconds: int | None) -> str:
-    """Date and time (UTC) of a stamp; empty if the clock was never set."""
-    if nanoseconds is None:
-        return ""
+def format_date(run: str, nanoseconds: int | None) -> str:
+    """Start of a run: date and time (UTC) of its first stamp; empty if the clock was never set.
+
+    Where a date in the name contradicts the clock, that date counts, as everywhere.
+    """
+    dates = date_runs({run: nanoseconds})
+    if dates.notes or nanoseconds is None:
+        return dates.days[run] or ""
     try:
         day = datetime.fromtimestamp(nanoseconds / 1e9, UTC)
     except (OverflowError, OSError, ValueError):

@@ -371,7 +371,7 @@ def _list_facts(page: Page) -> list[str]:
     line = [
         report.text("vehicle_name") or report.text("vehicle"),
         report.text("terrain"),
-        format_date(_first_stamp(page)),
+        format_date(report.text("run"), _first_stamp(page)),
         format_recorded(duration, report.number("duration_s")) if isinstance(duration, int | float) else "",
         format_distance(distance) if distance is not None else "",
     ]

@@ -19,8 +19,9 @@ from pathlib import Path
 from stat import S_ISDIR
 
 from pipeline.logs import list_files
-from pipeline.store.files import JSON, Manifest, Partition, hash_bytes
+from pipeline.store.files import JSON, Manifest, hash_bytes
 from pipeline.store.generation import STEPS, Generation
+from pipeline.store.listing import Partition
 from pipeline.store.names import StoreError, TableReport
 from pipeline.store.results import Store
 from pipeline.store.seals import LOG_NOTES

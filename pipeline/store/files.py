@@ -18,7 +18,6 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TypeAlias
 
@@ -420,18 +419,22 @@ class Manifest:
             raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
         return content
 
-    def summarize(self) -> dict[str, JSON]:
-        """The row of a run in the table ``runs``."""
-        details, log = self.details, self.part("log")
+    @property
+    def start_ns(self) -> int | None:
+        """Timestamp of the log's first sample [ns]; None if it is not known."""
         start = self.part("stages", "extract", "context").get("start_ns")
-        stamp = start if isinstance(start, int) and start > 0 else None
+        return start if isinstance(start, int) and start > 0 else None
+
+    def summarize(self, day: str | None) -> dict[str, JSON]:
+        """The row of a run in the table ``runs``, with the date that `date_runs` gives it."""
+        details, log = self.details, self.part("log")
         return {
             "run": self.run,
             "dataset": _text(details.get("dataset")),
             "vehicle": _text(self.part("vehicle").get("id")),
             "terrain": _text(details.get("terrain")),
-            "day": None if stamp is None else f"{datetime.fromtimestamp(stamp // 10**9, UTC):%Y-%m-%d}",
-            "start_ns": stamp,
+            "day": day,
+            "start_ns": self.start_ns,
             "duration_s": log.get("duration_s"),
             "complete": log.get("complete"),
             "bytes": log.get("bytes"),
@@ -467,30 +470,6 @@ def read_parquet(path: Path) -> pl.DataFrame:
 
     with name_damage(path):
         return pl.read_parquet(path, glob=False)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Partition:
-    """The part of the runs that a question is about; what is not said is not asked.
-
-    Attributes:
-        vehicle: id of the vehicle.
-        terrain: name of the terrain.
-        dataset: name of the dataset.
-        day: UTC day of the log's start, ``2026-07-31``; a beginning such as ``2026-07`` stands for all in it.
-    """
-
-    vehicle: str | None = None
-    terrain: str | None = None
-    dataset: str | None = None
-    day: str | None = None
-
-    def holds(self, manifest: Manifest) -> bool:
-        """Whether a run belongs to it."""
-        summary = manifest.summarize()
-        plain = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
-        is_like = all(wanted is None or summary[name] == wanted for name, wanted in plain.items())
-        return is_like and (self.day is None or str(summary["day"] or "").startswith(self.day))
 
 
 def _text(content: object) -> str | None:

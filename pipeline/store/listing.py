@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,7 +10,7 @@ from pathlib import Path
 from pipeline.core.untrusted import PathError, check_name
 from pipeline.store import files
 from pipeline.store.files import MANIFEST, Manifest, hash_bytes
-from pipeline.store.names import StoreError, join_inside
+from pipeline.store.names import StoreError, date_runs, join_inside
 from pipeline.store.seals import Key, seal, unseal
 
 # The list of what stands in the results under a fixed name: manifests of runs, and files over all runs.
@@ -336,3 +336,32 @@ def require_unsealed(data: bytes | None, key: Key | None, where: str) -> Key:
         )
         raise StoreError("sealed_already", what, where=where, hint=hint)
     return key
+
+
+@dataclass(frozen=True, kw_only=True)
+class Partition:
+    """The part of the runs that a question is about; what is not said is not asked.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        terrain: name of the terrain.
+        dataset: name of the dataset.
+        day: date of the run, ``2026-07-31``; a beginning such as ``2026-07`` stands for all in it.
+    """
+
+    vehicle: str | None = None
+    terrain: str | None = None
+    dataset: str | None = None
+    day: str | None = None
+
+    def select(self, manifests: Sequence[Manifest]) -> tuple[Manifest, ...]:
+        """The runs that belong to it."""
+        days = date_runs({one.run: one.start_ns for one in manifests}).days
+        wanted = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
+        asked = {name: value for name, value in wanted.items() if value is not None}
+        begins = self.day or ""
+        return tuple(
+            one
+            for one in manifests
+            if asked.items() <= one.summarize(None).items() and (days[one.run] or "").startswith(begins)
+        )

@@ -21,6 +21,7 @@ from pipeline.store.names import (
     QUARANTINE,
     StoreError,
     TableReport,
+    date_runs,
     file_missing,
     join_inside,
     name_damage,
@@ -312,7 +313,8 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
         StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
     """
     if table == RUNS_TABLE:
-        return pl.LazyFrame([manifest.summarize() for manifest in manifests], schema=_RUNS_SCHEMA)
+        days = date_runs({one.run: one.start_ns for one in manifests}).days
+        return pl.LazyFrame([one.summarize(days[one.run]) for one in manifests], schema=_RUNS_SCHEMA)
     schema = schema_of(table)
     present = find_contract(table.removeprefix(QUARANTINE)).version
     current: list[Path] = []

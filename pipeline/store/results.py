@@ -10,12 +10,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
-from pipeline.store.files import MANIFEST, MARKER, Manifest, Partition, hash_bytes, hash_file, hold_lock
+from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_bytes, hash_file, hold_lock
 from pipeline.store.generation import Generation, point_latest, remove_orphans
 from pipeline.store.listing import (
     KEY_MARK,
     LIST,
     REGISTER,
+    Partition,
     encode_mark,
     entry_name,
     is_run_manifest,
@@ -226,7 +227,8 @@ class Store:
         return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
 
     def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
-        return tuple(one for one in self.manifests() if partition is None or partition.holds(one))
+        manifests = self.manifests()
+        return tuple(manifests) if partition is None else partition.select(manifests)
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""

@@ -2,10 +2,17 @@
 
 from __future__ import annotations
 
-import pytest
+from typing import TYPE_CHECKING
 
-from pipeline.fleet import read_day
-from pipeline.job.compared_runs import date_runs
+import pytest
+from comparison_store import Run, write_run
+
+from pipeline.report import format_date, render_catalogue
+from pipeline.store import Partition, Store
+from pipeline.store.names import date_runs, read_day
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 PLACEHOLDER = 1_700_000_000_000_000_000
 HOUR = 3_600_000_000_000
@@ -57,3 +64,19 @@ def test_runs_of_one_instant_are_ordered_by_name_and_that_is_said() -> None:
             "and are in the order of their names: a, b"
         ),
     )
+
+
+def test_the_table_of_runs_the_list_of_runs_and_a_report_have_the_dates_of_the_trend(tmp_path: Path) -> None:
+    store = Store(tmp_path)
+    for name in ("ice_2024_7_30", "gravel"):
+        write_run(store, Run(name=name, start_ns=PLACEHOLDER))
+    days = {"gravel": None, "ice_2024_7_30": "2024-07-30"}
+    rows = store.query("SELECT run, day FROM runs ORDER BY run")
+    assert dict(rows.iter_rows()) == days
+    page = render_catalogue(store)
+    assert "2024-07-30" in page
+    assert "2023-11-14" not in page
+    assert store.scan("runs", Partition(day="2024-07")).collect()["run"].to_list() == ["ice_2024_7_30"]
+    assert store.scan("runs", Partition(day="2023-11")).collect().is_empty()
+    assert format_date("ice_2024_7_30", PLACEHOLDER) == "2024-07-30"
+    assert format_date("ice_2023_11_15", PLACEHOLDER) == "2023-11-14 22:13 UTC"
