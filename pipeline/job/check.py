@@ -294,11 +294,11 @@ class Check:
     def is_unseen(self, name: str) -> bool:
         """Whether no change of a quantity was shown, and one of its own size could have been missed.
 
-        That size is its distance from the neutral value, at least the usual one; errors have none.
+        That size is its distance from the neutral value, at least the usual one; of an error a doubling.
         """
         change = self.changes[name]
         if change.status != "unchanged" or name in ERRORS:
-            return False
+            return change.status == "unchanged" and change.smallest > math.log(2.0)
         parameter = next(label.parameter for label in self.sides.labels if label.name == name)
         neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
         distances = (abs(change.before - neutral), abs(change.after - neutral))

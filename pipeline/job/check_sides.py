@@ -312,10 +312,16 @@ def _average(effects: Sequence[Effect]) -> Effect:
 
 
 def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
-    """The values of a model file as the estimates of one run; those without an interval count as exact."""
+    """The values of a model file as the estimates of one run.
+
+    Without any interval they count as exact. Else those that are not fixed and have none are undetermined.
+    """
     count = len(labels) + len(ERRORS)
     values, deviations = np.full(count, np.nan), np.full(count, np.nan)
     for index, label in enumerate(labels):
+        is_stated = not file.intervals or label.name in file.intervals
+        if not (is_stated or label.parameter.name in label.effect.fixed):
+            continue
         low, high = file.intervals.get(label.name, (0.0, 0.0))
         values[index] = label.effect.values[label.parameter.name]
         deviations[index] = max(0.5 * (high - low) / NORMAL_95, 0.0)

@@ -149,10 +149,11 @@ def _format_power(check: Check) -> list[str]:
         return []
     asked.sort(key=lambda name: _share(check, name))
     text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
-    count = len(check.sides.before) + len(check.sides.after)
+    count = len(check.sides.after) + (len(check.sides.before) if check.sides.kind != "model" else 0)
     default = any(check.changes[name].is_default for name in asked)
     spread = " at the default spread between runs" if default and not check.simulated else ""
-    first = f"A change of less than {text} is not detectable with these {count} runs{spread}"
+    runs = "this run" if count == 1 else f"these {count} runs"
+    first = f"A change of less than {text} is not detectable with {runs}{spread}"
     missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
     if missing is None:
         return [first]
@@ -211,7 +212,8 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
     within = f", {change.p_within:.2g} within these recordings" if change.status == "differs" else ""
-    few = "; too few runs to see one of its own size" if check.is_unseen(name) else ""
+    size = "it double" if name in ERRORS else "one of its own size"
+    few = f"; too few runs to see {size}" if check.is_unseen(name) else ""
     return f"{text}  p = {change.p:.2g}{within}{few}"
 
 

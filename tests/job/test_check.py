@@ -123,12 +123,31 @@ def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> N
     assert ("unchanged", name) in {(label, text.split()[0]) for label, text in list_lines(check)}
     blind = replace(check.changes[name], smallest=10.0)
     unseen = replace(check, changes={**check.changes, name: blind})
-    (row,) = (text for label, text in list_lines(unseen) if label == "not shown")
-    assert row.startswith(name)
+    rows = [text for label, text in list_lines(unseen) if label == "not shown"]
+    (row,) = (text for text in rows if text.startswith(name))
     assert row.endswith("too few runs to see one of its own size")
     (case,) = (one for one in read_suite(unseen).iter("testcase") if one.get("name") == name)
     assert case.find("skipped") is not None
     assert "| not shown |" in format_markdown(unseen)
+
+
+def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) -> None:
+    check = compare(same)
+    for smallest, outcome in ((0.5, "unchanged"), (3.4, "not shown")):
+        one = replace(check.changes[POSITION_ERROR], status="unchanged", smallest=smallest)
+        changed = replace(check, changes={**check.changes, POSITION_ERROR: one})
+        (row,) = ((label, text) for label, text in list_lines(changed) if text.startswith(POSITION_ERROR))
+        assert row[0] == outcome
+        assert row[1].endswith("too few runs to see it double") == (outcome == "not shown")
+
+
+def test_what_a_model_states_without_an_interval_beside_others_is_not_compared(model: ModelFile) -> None:
+    stated = replace(model, intervals={"drive_lag.tau": (0.28, 0.32)})
+    run = drive(USUAL, 50)[:1]
+    for file, unknown in ((model, []), (stated, ["effective_track.k"])):
+        found = compare(replace(read_under(file, {BEFORE: (), AFTER: run}), kind="model"))
+        assert [name for name in found.list_status("unknown") if not name.startswith("error")] == unknown
+        assert "is not detectable with this run" in format_verdict(found)
 
 
 def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
