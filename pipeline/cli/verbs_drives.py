@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -25,6 +26,7 @@ from pipeline.cli.conventions import (
     print_note,
     print_result,
     show_progress,
+    spell_choices,
     summarize_error,
 )
 from pipeline.cli.model_runs import gather_runs, open_model
@@ -96,13 +98,15 @@ def plan(  # noqa: D417 - the runs document themselves
         quiet: print no progress and no summary.
     """
     options = build_options(Choices(vehicle=vehicle, config=config, results=results, key=key))
+    said = spell_choices(Choices(results=results, key=key))
     at_work = runs[0] if runs else str(check or vehicle or "plan")
     try:
         names = list(runs or [])
         if check is not None:
-            return _check(check, names, options, json=json, quiet=quiet)
+            return _check(check, names, options, said, json=json, quiet=quiet)
         from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
-        from pipeline.job.next_drive import Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
+        from pipeline.job.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
+        from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
         from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
         from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
 
@@ -123,16 +127,19 @@ def plan(  # noqa: D417 - the runs document themselves
             type_name,
             seed,
         )
-        if gathered is None:
-            studied = expect(chosen, terrain, known or results)
-        else:
-            with show_progress(names[0], quiet=quiet or json) as progress:
-                progress("diagnosis")
+        for name in {*wish.wanted} - {UNDECIDED, ALL}:
+            find_effect(name)
+        with show_progress(at_work, quiet=quiet or json) as progress:
+            progress("diagnosis")
+            if gathered is None:
+                studied = expect(chosen, terrain, known or results)
+            else:
                 studied = study(recordings, chosen, terrain, known or results)
-        command = {} if gathered is None else gathered.command
-        planned = plan_drive(chosen, studied, wish, recordings, command)
-        made, forecast = planned.plan, studied.forecast
-        others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
+            command = {} if gathered is None else gathered.command
+            progress("choosing manoeuvres")
+            planned = plan_drive(chosen, studied, wish, recordings, command)
+            made, forecast = planned.plan, studied.forecast
+            others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
         asked = [question.text for question in planned.questions]
         files = write_drive(made, folder, results)
         shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
@@ -148,7 +155,7 @@ def plan(  # noqa: D417 - the runs document themselves
         written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
         print_json({**made.to_json(), **({"compare": content} if others else {}), **written})
     elif not quiet:
-        lines = [*_format_known(forecast), *format_plan(made, studied.diagnosis, files), *shown]
+        lines = [*_format_known(forecast), *format_plan(made, studied.diagnosis, files, said), *shown]
         print_lines([*lines, *_list_others(made, asked, others)])
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
@@ -248,7 +255,7 @@ def _find_vehicle(name: str | None) -> Vehicle:
     return vehicle
 
 
-def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet: bool) -> int:
+def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.plan.plan_files import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
@@ -260,18 +267,18 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     drive = _gather(names, options, quiet=quiet)
     new = len(drive.recordings)
     before = [name for name in promised.runs if name not in {*names, *(one.name for one in drive.recordings)}]
-    vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
-    if promised.vehicle != vehicle.id:
-        what = f"the plan is for {promised.vehicle}, and the log is of {vehicle.id}"
+    if promised.vehicle != drive.vehicle.id:
+        what = f"the plan is for {promised.vehicle}, and the log is of {drive.vehicle.id}"
         hint = "Check a plan with logs of the vehicle it was made for."
         raise SlipError("other_vehicle", what, where=str(path), hint=hint)
+    vehicle, recordings, _, _, lossy = _gather(before, options, quiet=quiet, known=drive)
     with show_progress(names[0], quiet=quiet or json) as progress:
         progress("diagnosis")
         driven = [load_recording(recording, vehicle) for recording in drive.recordings]
         require_played((path if path.is_dir() else path.parent) / "plan.csv", driven, vehicle)
         diagnosis = diagnose_runs([*recordings[new:], *drive.recordings], vehicle).runs[0]
     checked = check_plan(promised, diagnosis)
-    following = f"slip plan {' '.join(dict.fromkeys([*before, *names]))}"
+    following = f"slip plan {shlex.join(dict.fromkeys([*before, *names]))}{said}"
     if json:
         print_json({**checked.to_json(), "next": following if diagnosis.undecided else None, "errors": []})
     elif not quiet:
@@ -285,8 +292,10 @@ def _check(path: Path, names: list[str], options: Options, *, json: bool, quiet:
     return LOSSY if lossy else CLEAN
 
 
-def format_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path]) -> list[str]:
-    """The plan on one screen."""
+def format_plan(
+    made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path], said: str = ""
+) -> list[str]:
+    """The plan on one screen; said: flags that the next command needs again."""
     from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
 
     if not made.manoeuvres and not made.impossible:
@@ -311,7 +320,7 @@ def format_plan(made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path
         f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
         f"page         {files[-1]}",
         *(f"safety       {text}" for text in SAFETY),
-        f"afterwards   slip plan --check {files[0]} NEW.mcap",
+        f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
     ]
     return lines
 

@@ -13,8 +13,9 @@ from pipeline.models import Excitation, find_effect
 from pipeline.plan import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser
 from pipeline.plan.questions import DECIDED_T, Answerable, Question, Separation
 
-_RESERVE = 1.4
-"""Factor on the goals of a suggested drive: gains of manoeuvres do not add up exactly."""
+_RESERVES = (1.4, 2.0, 2.8, 4.0)
+"""Factors on the goals of a suggested drive: gains of manoeuvres do not add up exactly. They are raised until
+the drive is longer than the given time, in which the question stays open."""
 _MOST_TIMES = 10
 """Longest suggested drive, in multiples of the given time: beyond it, another drive is better."""
 _EVERYWHERE = Area(math.inf, math.inf)
@@ -73,7 +74,7 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
     best, longest_s = library, min(_MOST_TIMES * chooser.time_s, LONGEST_S - LEAD_S - TAIL_S)
     for advice, drive in _continue(one, chooser, order, longest_s):
         weight = np.bincount(np.array(drive, np.int64), minlength=library.size).astype(np.float64)
-        if float(one.answer(weight, _RESERVE)) >= 1.0:
+        if float(one.answer(weight, _RESERVES[0])) >= 1.0:
             seconds = math.ceil(LEAD_S + float(chooser.durations[list(drive)].sum()) + TAIL_S)
             return _because(question, advice.format(seconds=seconds), question.reached)
         best = weight if _is_better(one, weight, best) else best
@@ -97,7 +98,12 @@ def _continue(
         (_EVERYWHERE, longest_s, "give a larger --area, and --time {seconds}s"),
     ):
         alone = Chooser([one], chooser.durations, chooser.shapes, area, time_s)
-        yield advice, alone.extend(order, _RESERVE)
+        for reserve in _RESERVES:
+            drive = alone.extend(order, reserve)
+            spent = float(chooser.durations[drive].sum())
+            if time_s == chooser.time_s or spent > chooser.time_s:
+                yield advice, drive
+                break
 
 
 def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:

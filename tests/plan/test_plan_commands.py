@@ -6,6 +6,8 @@ import json
 import math
 import re
 from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -24,7 +26,11 @@ from pipeline.models import find_effect
 from pipeline.plan import (
     LEAD_S,
     RATE_HZ,
+    TAIL_S,
+    Area,
+    Chooser,
     PlanError,
+    Shape,
     choose_limits,
     is_steered,
     join,
@@ -34,7 +40,7 @@ from pipeline.plan import (
     parse_time,
     wait,
 )
-from pipeline.plan.open_questions import Impossible
+from pipeline.plan.open_questions import Impossible, explain_open
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
@@ -56,8 +62,6 @@ from pipeline.sources import Vehicle, find_preset, list_presets
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
@@ -341,6 +345,40 @@ def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reac
     tried = "none of the drives that were tried, of up to 114 s, decides it"
     assert left.because.startswith(f"{tried}; what shows it: ")
     assert re.fullmatch(r"at best t = [1-4]\.\d of 5", left.reached)
+
+
+class _Promising:
+    """A question that three manoeuvres seem to answer, and that stays open: gains do not add up exactly."""
+
+    question = SimpleNamespace(text="a or b", effects=("a", "b"))
+
+    def answer(self, weight: np.ndarray[Any, Any], reserve: float = 1.0) -> np.ndarray[Any, Any]:
+        return np.minimum(0.5 * np.asarray(weight).sum(axis=-1) / reserve, 1.0)
+
+
+def test_more_time_is_advised_only_where_it_is_more_than_was_given() -> None:
+    still = Shape(np.zeros((1, 2), dtype=np.complex128), np.zeros(1))
+    chooser = Chooser([_Promising()], np.ones(1), [still], Area(20.0, 10.0), 4.0)  # type: ignore[list-item]
+    left = explain_open(Impossible("a or b", ("a", "b"), ""), chooser, [0, 0, 0])
+    (seconds,) = re.findall(r"^give --time (\d+)s$", left.because)
+    assert float(seconds) > LEAD_S + 4.0 + TAIL_S
+
+
+def test_the_next_command_names_the_results_that_the_plan_is_from(plan: Plan) -> None:
+    files = [Path("my plan/plan.toml"), *map(Path, ("plan.csv", "plan.mcap", "plan.html"))]
+    said = format_plan(plan, None, files, " --results season")[-1]
+    assert said == "afterwards   slip plan --check 'my plan/plan.toml' NEW.mcap --results season"
+
+
+def test_a_plan_of_another_vehicle_than_the_log_is_of_is_said_so(
+    plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_plan(replace(plan, runs=("season/husky",)), tmp_path / "plan")
+    log = str(Path(__file__).parents[2] / "data_samples" / "warthog_ice.mcap")
+    with pytest.raises(SystemExit) as ended:
+        main(["plan", "--check", str(tmp_path / "plan"), log, "--results", str(tmp_path / "results")])
+    assert ended.value.code == FAILED
+    assert "the plan is for husky_a200, and the log is of warthog" in capsys.readouterr().err
 
 
 def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:

@@ -13,6 +13,8 @@ import pytest
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
+from pipeline.cli import main
+from pipeline.cli.conventions import FAILED
 from pipeline.estimation import Named, RunDiagnosis, Value, load_recording
 from pipeline.estimation.ambiguity import Undecided
 from pipeline.estimation.search import Unobservable
@@ -222,3 +224,13 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
     assert "the plan is for warthog" in _run(
         "plan", "--check", folder, after, "--results", tmp_path / "results", code=1
     )
+
+
+def test_an_effect_that_there_is_not_is_refused_before_anything_is_worked_out(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        main(["plan", "--vehicle", "husky_a200", "--for", "foo", "--folder", str(tmp_path / "plan")])
+    assert ended.value.code == FAILED
+    assert "choosing manoeuvres" not in (said := capsys.readouterr().err)
+    assert "no effect is called 'foo'" in said
