@@ -230,6 +230,7 @@ def _draw_cells(
     height, x_domain, y_domain = fit_equal_aspect(extent[0], extent[1], width=_SIDE)
     known = rows[column].drop_nulls()
     top = float(known.quantile(CAP_QUANTILE, "linear") or 0.0) or 1.0
+    top = math.ceil(top) if column in {"passes", "runs"} else float(f"{top:.3g}")
     in_unit = f" [{unit}]" if unit else ""
     name = f"cells_{number}"
     drawn = rows.with_columns(pl.col(column).clip(upper_bound=top).alias(f"{column}_shown"))
@@ -269,7 +270,7 @@ def _draw_cells(
         .properties(width=_SIDE, height=height)
     )
     middle = float(known.median() or 0.0)  # type: ignore[arg-type]
-    note = f"{about[:1].upper()}{about[1:]}; colours end at {top:.3g}{f' {unit}' if unit else ''}."
+    note = f"{about[:1].upper()}{about[1:]}; colours end at {top:,g}{f' {unit}' if unit else ''}."
     summary = f"{title} in {known.len()} cells: median {middle:.3g}{f' {unit}' if unit else ''}."
     return Drawing(chart, {f"{name}_{column}": drawn}, note, summary)
 
@@ -291,7 +292,8 @@ def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[P
         )
         name = f"passes_{number}"
         base = Chart.of_rows(name)
-        across = make_axis("passes", "number of the pass over a place", tickCount=6)
+        scale = {"domainMin": 1, "nice": False, "zero": False}
+        across = make_axis("passes", "number of the pass over a place", scale=scale, tickMinStep=1)
         bars = (
             base.mark("rule", color=theme.QUIET, strokeWidth=2)
             .encode(x=across, y="low:Q", y2="high:Q")
@@ -299,7 +301,7 @@ def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[P
         )
         dots = base.mark("point", size=60, filled=True, color=theme.SLIP, opacity=1).encode(
             x=across,
-            y=make_axis("ratio", "slip over that of the first pass", scale={"zero": False}),
+            y=make_axis("ratio", "slip over that of the first pass", scale={"type": "log"}, tickCount=5),
             tooltip=[
                 encode_column("ratio:Q", title="slip over the first pass", format=".2f"),
                 encode_column("crossings:Q", title="crossings", format=".0f"),
@@ -317,6 +319,10 @@ def draw_passes(passes: pl.DataFrame, effects: tuple[PassEffect, ...]) -> list[P
             )
         )
     return pictures
+
+
+_UNDETERMINED = 10.0
+"""Change per pass above which the end of an interval says nothing: slip grows elevenfold."""
 
 
 def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
@@ -345,6 +351,8 @@ def _tabulate_effects(effects: tuple[PassEffect, ...]) -> Table:
 
 
 def _format_ends(low: float, high: float) -> str:
+    if high > _UNDETERMINED:
+        return "undetermined"
     return f"{_format_change(low)} to {_format_change(high)}"
 
 
@@ -355,10 +363,7 @@ def _format_change(share: float) -> str:
 
 # Datasets side by side as budgets by cause, and what they differ by.
 
-_COLOURS = (
-    theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK,
-    theme.MEASURED,
-)  # fmt: skip
+_COLOURS = (theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK)
 _LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 _OTHERS = "other effects"
 
@@ -432,7 +437,10 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     )
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
     sentence = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
-    note = "Cut by shares of the mean square. What makes held-out slip larger stands left of zero."
+    note = (
+        "The rms slip of a dataset, divided in the proportion of the shares of its mean square. A cause left "
+        "of zero makes the slip that the model leaves on data not fitted larger."
+    )
     return Picture(
         "causes",
         "Rms slip of each dataset by cause",

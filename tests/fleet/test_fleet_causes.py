@@ -14,6 +14,8 @@ from comparison_store import Run, write_run
 from pipeline.cli import main
 from pipeline.fleet.causes import compare_causes
 from pipeline.fleet.pairs import BLOCKS, RUNS
+from pipeline.report import theme
+from pipeline.report.fleet_pages import _COLOURS, _LEFT, _format_ends
 from pipeline.store import Store
 
 ASPHALT = {"effective_track": 0.8, "turn_lag": 0.3, "disturbance": 0.1, "localization_noise": 0.05}
@@ -188,3 +190,15 @@ def test_results_without_budgets_are_refused_in_one_line(
     assert "no run has a budget of its slip" in told.err
     assert told.err.count("\n") == 1
     assert not (store.root / "causes.html").exists()
+
+
+def test_no_two_causes_of_the_figure_look_alike() -> None:
+    colours = [*_COLOURS, theme.INK, *_LEFT.values()]
+    shades = [np.array([int(one[i : i + 2], 16) for i in (1, 3, 5)]) for one in colours]
+    apart = [np.abs(a - b).max() for i, a in enumerate(shades) for b in shades[:i]]
+    assert min(apart) > 30
+
+
+def test_an_interval_that_says_nothing_is_not_written_out() -> None:
+    assert _format_ends(-0.29, 1.02) == "\u221229\u202f% to 102\u202f%"
+    assert _format_ends(-0.9999, 1883.35) == "undetermined"

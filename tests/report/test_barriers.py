@@ -13,7 +13,7 @@ from chrome import LAPTOP, PHONE
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.report import CATALOGUE, render_catalogue, theme, write_page
+from pipeline.report import CATALOGUE, read_own, render_catalogue, theme, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 
@@ -83,3 +83,14 @@ def test_no_page_has_a_serious_barrier(
         chrome.picture(pictures / f"barriers_{name}_{width}.png", whole=True)
         assert find_barriers(chrome) == [], json.dumps([name, width])
         assert chrome.errors == []
+
+
+def test_a_long_name_in_a_heading_does_not_widen_a_page(chrome: Chrome, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    style, name = read_own("report/page.css"), "warthog_wheels_gravel_2024_8_6_11h37s32" * 2
+    head = f'<meta name="viewport" content="width=device-width"><style>{style}</style>'
+    page.write_text(f"{head}<main><h2>run logs/{name}</h2><h3>{name}</h3></main>", "utf-8")
+    chrome.size(PHONE, 600)
+    chrome.open(page.as_uri())
+    chrome.wait("document.querySelector('h3') !== null")
+    assert int(str(chrome.run("document.documentElement.scrollWidth"))) <= PHONE
