@@ -41,6 +41,7 @@ _UNPRINTABLE = re.compile(
 _FIELD = re.compile(r"(?:^|(?<=  ))\S")
 _NARROWEST = 40
 _DEEPEST = 38
+_HANG = 10  # of a row whose second field is far to the right, as wide as the labels of a summary
 
 # Commands and paths, which users copy from the screen, are not folded.
 _COPIED = ("next ", "play ", "page ", "report ")
@@ -88,7 +89,7 @@ def fold_line(line: str, width: int) -> list[str]:
         cut = line.find(" ", width)
         if cut < 0:
             return [line]
-    rest = line[cut:].strip()
+    rest, hang = line[cut:].strip(), hang or (_HANG if later else 0)
     return [line[:cut].rstrip(), *fold_line(" " * hang + rest, width)] if rest else [line[:cut].rstrip()]
 
 

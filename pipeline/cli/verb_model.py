@@ -48,7 +48,7 @@ class On:
     on: Annotated[list[str], Parameter(help="logs, or runs of the results folder", consume_multiple=True)]
     input: Annotated[
         Literal["command", "measured"] | None,
-        Parameter(help="input of the model (default: as last time, else measured wheels if there)"),
+        Parameter(help="input of the model (default: the command if effects need it, else as last time)"),
     ] = None
     vehicle_of: Annotated[
         Literal["model", "run"] | None,

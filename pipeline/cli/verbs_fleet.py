@@ -26,6 +26,7 @@ from pipeline.cli.conventions import (
     print_json,
     print_lines,
     print_result,
+    show_progress,
     summarize_error,
     use_key,
 )
@@ -323,7 +324,7 @@ def predict(
         input: input of the model.
         file: model file to write.
         json: print one JSON object.
-        quiet: print nothing.
+        quiet: print no progress and no summary.
     """
     from pipeline.job import prediction as predictions  # noqa: PLC0415 - heavy
     from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
@@ -331,8 +332,11 @@ def predict(
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(results)
-    forecast = forecast_deployment(store, vehicle, terrain, input)
-    prediction = predictions.predict_deployment(store, forecast)
+    with show_progress(f"{vehicle} on {terrain}", quiet=quiet or json) as progress:
+        progress("fitting its runs jointly")
+        forecast = forecast_deployment(store, vehicle, terrain, input)
+        progress("driving their commands with drawn parameters")
+        prediction = predictions.predict_deployment(store, forecast)
     if file is not None:
         write_model(predictions.make_model_file(prediction), file)
     summary = predictions.summarize_prediction(prediction)

@@ -229,9 +229,8 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
 def _find_open(fit: LevelFit) -> str | None:
     """Why terrain and run cannot be separated, and which runs would separate them; None if they can."""
     if len(fit.groups) == 1:
-        return (
-            f"all runs are on {next(iter(fit.groups))}: runs on another terrain separate vehicle and terrain"
-        )
+        terrain = next(iter(fit.groups))
+        return f"only runs on {terrain} determine it: runs on another terrain separate vehicle and terrain"
     if not fit.freedom:
         return "no terrain has two runs: a second run on one of them separates terrain and run"
     if fit.p_groups >= SURE and fit.spread_group > fit.scatter:

@@ -335,9 +335,10 @@ def find_run(text: str, store: Store) -> Manifest:
         return fitting[0]
     names = ", ".join(manifest.run for manifest in (fitting or manifests))
     what = f"several runs are called {text!r}" if fitting else f"there is no run {text!r}"
-    known = [name for manifest in manifests for name in (manifest.run, manifest.run.rsplit("/", 1)[-1])]
+    known = [manifest.run if "/" in text else manifest.run.rsplit("/", 1)[-1] for manifest in manifests]
     near = "" if fitting else guess_names(text, dict.fromkeys(known))
-    raise JobError("no_such_run", what, where=str(store.root), hint=f"{near}Say which of: {names}.")
+    hint = f"Say which of: {names}." if fitting else f"{near}There are: {names}."
+    raise JobError("no_such_run", what, where=str(store.root), hint=hint)
 
 
 def find_log(text: str, out: Path) -> Path:

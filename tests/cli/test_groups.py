@@ -163,10 +163,11 @@ def test_the_folded_line_is_not_shown_where_everything_is() -> None:
 @pytest.mark.parametrize(
     ("words", "near"),
     [
-        (("diagnose", "husky_tlie"), "Did you mean husky_tile"),
+        (("diagnose", "husky_tlie"), "Did you mean husky_tile? There are: field/husky_tile."),
+        (("diagnose", "field/husky_tlie"), "Did you mean field/husky_tile? There are: field/husky_tile."),
         (("model", "export", "robot.toml", "--to", "ros_control"), "Did you mean ros2_control"),
     ],
-    ids=["run", "export"],
+    ids=["run", "run in its folder", "export"],
 )
 def test_a_name_that_is_nearly_one_that_is_known_is_guessed(
     words: tuple[str, ...], near: str, tmp_path: Path

@@ -115,7 +115,8 @@ def test_one_terrain_leaves_it_open_and_says_what_would_tell() -> None:
     number = fit_one(draw({"ice": 0.7}))
     assert number.level is None
     assert number.name == "wheel_radius or longitudinal_slip"
-    assert number.because == "all runs are on ice: runs on another terrain separate vehicle and terrain"
+    expected = "only runs on ice determine it: runs on another terrain separate vehicle and terrain"
+    assert number.because == expected
 
 
 def test_a_damaged_run_is_told_apart_and_leaves_the_others_as_they_are() -> None:
