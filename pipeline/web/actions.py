@@ -346,13 +346,15 @@ class Editor:
         made = find_effect(effect)() if isinstance(effect, str) else effect
         return self.add_effects([made], f"+ {made.id}", anyway=anyway)
 
-    def add_effects(self, effects: Sequence[Effect], said: str, *, anyway: bool) -> Session:
-        """Add several effects to the model at once, and fit the whole model.
+    def add_effects(
+        self, effects: Sequence[Effect], said: str, *, anyway: bool, begin: Model | None = None
+    ) -> Session:
+        """Add several effects to the model, or to it with other values, at once, and fit the whole model.
 
         Raises:
             WorkbenchError: ``no_help``, an effect is refused and ``anyway`` is false.
         """
-        model, step = self.model, self.session.step
+        model, step = begin or self.model, self.session.step
         for made in effects:
             model = model + made
         changed = self.fit_anew(model, [*step.order, *(made.id for made in effects)], said)

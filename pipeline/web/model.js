@@ -71,7 +71,7 @@ const buildSlider = (pane, effect, parameter) => {
     pane.resting = { effect: effect.id, parameter: name, value: Number(input.value) };
     pane.rest = setTimeout(() => pane.settle().then(() => pane.redraw()), REST_MS);
   });
-  const span = low === null ? "" : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
+  const span = low === null ? (parameter.undetermined ? "undetermined" : "") : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
   return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
     h("div", { class: "named-value" }, h("span", { title: label }, parameter.about), shown),
     input,

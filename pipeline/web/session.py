@@ -228,7 +228,7 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
         "without_m": step.without.get(name),
         "refused": step.refused.get(name),
         "parameters": [
-            _show_parameter(file, effect, parameter)
+            _show_parameter(file, effect, parameter, fitted=not step.by_hand and name not in step.off)
             for parameter in effect.parameters
             if math.isfinite(effect.values[parameter.name])
         ],
@@ -255,7 +255,9 @@ def summarize_effect(effect: Effect | type[Effect]) -> str:
     return title.split(": ", 1)[-1].rstrip(".")
 
 
-def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> dict[str, object]:
+def _show_parameter(
+    file: ModelFile, effect: Effect, parameter: Parameter, *, fitted: bool
+) -> dict[str, object]:
     value = effect.values[parameter.name]
     low, high = find_range(parameter, value)
     interval = file.intervals.get(f"{effect.id}.{parameter.name}")
@@ -271,6 +273,7 @@ def _show_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> di
         "step": (high - low) / _STEPS,
         "at_bound": value != parameter.neutral and stands_at_bound(value, parameter.bounds),
         "locked": parameter.name in effect.fixed,
+        "undetermined": fitted and interval is None and parameter.name not in effect.fixed,
     }
 
 

@@ -324,7 +324,11 @@ class Sessions:
                 where=ask.run,
                 hint="Look for other effects." if is_diagnosed else "Diagnose it first.",
             )
-        return editor.add_effects(missing, f"+ all {len(missing)} that were found", anyway=True)
+        # The joint fit begins with the values of the diagnosis, whatever was fitted or set before.
+        own = editor.model
+        known = [one for one in _list_named(diagnosis) if one.id in own and not own.effect(one.id).fixed]
+        said = f"+ all {len(missing)} that were found"
+        return editor.add_effects(missing, said, anyway=True, begin=own.swap(*known))
 
     def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:
         text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
@@ -406,5 +410,10 @@ def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:
 
 def _list_missing(diagnosis: Mapping[str, object] | None, session: Session) -> list[Effect]:
     """Effects of a run's diagnosis that the session's model lacks."""
+    return [one for one in _list_named(diagnosis) if one.id not in session.step.order]
+
+
+def _list_named(diagnosis: Mapping[str, object] | None) -> list[Effect]:
+    """Effects of a run's diagnosis, with their values."""
     named = None if diagnosis is None else read_model_text(diagnosis)
-    return [] if named is None else [one for one in named.model if one.id not in session.step.order]
+    return [] if named is None else list(named.model)

@@ -19,6 +19,7 @@ from pipeline.report.motion_view import read_model_text
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.web import Ask, Limits, ServerFolders
+from pipeline.web.actions import Editor
 from pipeline.web.jobs import Jobs
 from pipeline.web.workbench import Sessions
 
@@ -26,6 +27,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from workbench_server import Workbench
+
+    from pipeline.models.model import Model
+    from pipeline.web.session import Session
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = sorted((ROOT / "data_samples").glob("[!m]*.mcap"))
@@ -89,6 +93,35 @@ def test_nothing_else_is_tried_before_what_the_diagnosis_named_is_in(diagnosed: 
         assert tried["trial"] is None
         asked = sessions.answer(Ask(run="field/late", slot="b", action="try", anyway=True))
         assert asked["trial"] is not None
+
+
+def test_all_of_the_diagnosis_is_its_model_whatever_was_done_before(
+    diagnosed: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run, slot = "field/late", "b"
+    manifest = Store(diagnosed).manifest(run)
+    assert manifest is not None
+    file = read_model_text(json.loads(manifest.path("diagnosis.json").read_text()))
+    assert file is not None
+    wanted = {effect.id: dict(effect.values) for effect in file.model}
+    begun: list[Model] = []
+    fit = Editor.fit_anew
+
+    def watch(editor: Editor, model: Model, *words: object, **more: object) -> Session:
+        begun.append(model)
+        return fit(editor, model, *words, **more)  # type: ignore[arg-type]
+
+    for sessions in open_sessions(diagnosed):
+        sessions.answer(Ask(run=run, slot=slot, action="add", effect="effective_track"))
+        by_hand = Ask(run=run, slot=slot, action="set", effect="effective_track", parameter="k", value=1.0)
+        sessions.answer(by_hand)
+        monkeypatch.setattr(Editor, "fit_anew", watch)
+        answer = cast("dict[str, Any]", sessions.answer(Ask(run=run, slot=slot, action="add_named")))
+        cards = answer["session"]["effects"] if "session" in answer else answer["effects"]
+        found = {card["id"]: {one["name"]: one["value"] for one in card["parameters"]} for card in cards}
+        assert found == wanted
+        assert {effect.id: dict(effect.values) for effect in begun[0]} == wanted
+        assert not any(one["undetermined"] for card in cards for one in card["parameters"])
 
 
 @pytest.mark.long
