@@ -41,8 +41,8 @@ _RESOLVED = 0.02
 _REPEATED = 0.18
 # For differences: number of lags after which noise is uncorrelated, and the threshold for structure.
 _FORGOTTEN = 3
-_GROWN = 0.6
-"""Share of the last square by which structure must have grown to be distinguished from noise."""
+_GROWN = 0.3
+"""Share of the last square beyond what noise in the first ones lets expect, from which on it is structure."""
 _FEWEST_LASTING = 600
 """Minimum number of windows for estimating structure."""
 
@@ -215,11 +215,11 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
         measured, squares = ~measured, np.full(squares.size, _LEAST)
     design, squares = design[measured], squares[measured]
     parts = solve_nonnegative(design, squares)
-    grown = float((design[:, known:] @ parts[known:])[-1])
+    noise = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
+    grown = float(squares[-1] - design[-1, :known] @ noise)
     if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
         # Differences grow a little with the time between them by chance: that is not structure.
-        parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
-        parts[known:] = 0.0
+        parts[:known], parts[known:] = noise, 0.0
     # Noise within two standard errors of the first square cannot be told from none.
     least = 2.0 * math.sqrt(2.0 * _PAIRS_EACH / max(windows, 1)) * float(squares[0])
     parts[1] += max(least - float(design[0, :known] @ parts[:known]), 0.0)
@@ -263,6 +263,10 @@ _QUIET_SHARE = 0.7
 """Share of window pairs, those with the smallest changes, from which noise is measured."""
 _FEWEST = 20
 """Minimum number of windows for a mean square."""
+_STRATA = 5
+"""Classes of pairs by yaw rate. With 3 or 10, the floors of 35 drawn logs are as near to the true ones."""
+_STRATUM = 100
+"""Minimum number of pairs per class by yaw rate."""
 # Number of classes of pairs, by how much the regression explains of them.
 _CLASSES = 12
 _FEWEST_IN_CLASS = 30
@@ -348,43 +352,60 @@ def _measure_repeats(
     Returns:
         The value of all pairs, and the share of it for pairs with little effect of changes, shape (2, 3).
     """
-    differences, features, moving, standing, lively = [], [], [], [], []
+    differences, features, turning, moving, standing, lively = [], [], [], [], [], []
     for comparison, (history, recorded) in zip(comparisons, described, strict=True):
         first, second = pair_windows(comparison.windows.times, gap_s, _LATEST_S if gap_s > 0.0 else NEAR_S)
         residual, live = comparison.find_residuals((), Timing()), find_live(history)
         differences.append(residual[second] - residual[first])
         features.append(recorded[second] - recorded[first])
+        turning.append(np.abs(history[:, 0, 1])[np.array((first, second))].max(axis=0))
         lively.append(live)
         moving.append(live[first] & live[second])
         standing.append(~live[first] & ~live[second])
-    rest, change = np.concatenate(differences), np.concatenate(features)
+    rest, change, turns = map(np.concatenate, (differences, features, turning))
     moves, stands = np.concatenate(moving), np.concatenate(standing)
     if moves.sum() < _FEWEST:
         return np.full((2, 3), np.nan)
-    square, alike = _take_away_changes(rest[moves], change[moves])
+    square, alike = _take_away_changes(rest[moves], change[moves], turns[moves])
     still = 0.5 * np.mean(rest[stands] ** 2, axis=0) if stands.sum() >= _FEWEST else square
     share = float(np.concatenate(lively).mean())
     return np.array((share * square + (1.0 - share) * still, alike))
 
 
-def _take_away_changes(rest: Floats, change: Floats) -> Floats:
-    """Half the mean square of differences (n, 3) less their regression on changes (n, p); see `_average`."""
+def _take_away_changes(rest: Floats, change: Floats, turning: Floats) -> Floats:
+    """Half the mean square of differences (n, 3) less their regression on changes (n, p); see `_average`.
+
+    Pairs are compared within classes of their yaw rate (n,): noise may grow with it, and calm pairs are
+    mostly straight.
+    """
     scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
     size = np.abs(scaled).max(axis=1)
-    quiet = np.argsort(size, kind="stable")[: max(int(_QUIET_SHARE * size.size), min(size.size, 5 * _FEWEST))]
+    strata = np.array_split(np.argsort(turning, kind="stable"), min(_STRATA, max(size.size // _STRATUM, 1)))
+    chosen = [
+        rows[np.argsort(size[rows], kind="stable")[: max(int(_QUIET_SHARE * rows.size), 5 * _FEWEST)]]
+        for rows in strata
+    ]
+    quiet, ends = np.concatenate(chosen), np.cumsum([rows.size for rows in chosen])[:-1]
     rest, scaled, count = rest[quiet], scaled[quiet], quiet.size
     normal = scaled.T @ scaled / count
     ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
     inverse = np.linalg.inv(normal + ridge * np.eye(normal.shape[0]))
     weights, residual = np.zeros((normal.shape[0], 3)), rest
     for _ in range(_ROUNDS):
-        weights = weights + inverse @ (scaled.T @ _hold(residual) / count - ridge * weights)
+        held = np.concatenate([_hold(part) for part in np.split(residual, ends)])
+        weights = weights + inverse @ (scaled.T @ held / count - ridge * weights)
         residual = rest - scaled @ weights
     leverage = np.einsum("ij,jk,ik->i", scaled, inverse, scaled) * _PAIRS_EACH / count
     free = 1.0 - np.minimum(leverage, _MOST_FREEDOM)
     owed = np.abs(scaled) @ np.abs(weights)
-    squares = 0.5 * _hold(residual) ** 2
-    return np.array([_average(*one, free) for one in zip(squares.T, owed.T, strict=True)]).T
+    total, alike = np.zeros(3), np.zeros(3)
+    parts = zip(*(np.split(values, ends) for values in (residual, owed, free)), strict=True)
+    for part, mine, freedom in parts:
+        squares = 0.5 * _hold(part) ** 2
+        each = np.array([_average(*one, freedom) for one in zip(squares.T, mine.T, strict=True)])
+        total += each[:, 0] * part.shape[0] / count
+        alike += each.prod(axis=1) * part.shape[0] / count
+    return np.array((total, alike / np.maximum(total, _LEAST)))
 
 
 def _average(squares: Floats, owed: Floats, free: Floats) -> tuple[float, float]:

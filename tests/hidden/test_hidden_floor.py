@@ -11,7 +11,7 @@ from draw import draw_riddle, write_riddle
 from truth import build_true
 
 from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
-from pipeline.estimation.floor import split_differences
+from pipeline.estimation.floor import _take_away_changes, split_differences
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -59,6 +59,16 @@ def test_noise_below_what_can_be_resolved_is_not_reported_as_zero() -> None:
         assert noise >= (2.0 - 1e-9) * standard_error
         assert parts.lasting.sum() > 10.0 * noise
     assert noise < 0.03 * squares[0]
+
+
+def test_noise_that_grows_with_turning_counts_as_often_as_the_vehicle_turns() -> None:
+    """As that of a localization by a laser: most driving is calm and straight, most error arises in turns."""
+    draw = np.random.default_rng(3)
+    turning = np.where(np.arange(4000) % 5 == 0, draw.uniform(0.5, 1.0, 4000), 0.01 * draw.random(4000))
+    change = draw.normal(size=(4000, 4)) * (0.1 + turning)[:, None]
+    noise = draw.normal(size=(4000, 3)) * (0.01 + 0.1 * turning)[:, None]
+    square, _ = _take_away_changes(0.3 * change[:, :3] + noise, change, turning)
+    assert square == pytest.approx(0.5 * np.mean(noise**2, axis=0), rel=0.2)
 
 
 def test_gaps_without_pairs_of_windows_do_not_lower_the_noise() -> None:
