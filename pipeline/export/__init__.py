@@ -258,21 +258,28 @@ class Facts:
         return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
 
     def measure(self, name: str) -> Amount:
-        """Return a vehicle dimension by its field name; NaN and unknown if it is not given."""
+        """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
         value = getattr(self.vehicle, name)
-        return Amount(math.nan if value is None else value, (f"vehicle {self.vehicle.id}: {name}",))
+        sources = () if name in self.vehicle.stand_ins else (f"vehicle {self.vehicle.id}: {name}",)
+        return Amount(math.nan if value is None else value, sources)
 
     def find_radius(self) -> Amount:
         """Effective wheel radius [m]."""
-        return combine(operator.mul, self.measure("wheel_radius_m"), self.take(Quantity.RADIUS))
+        return self._scale("wheel_radius_m", Quantity.RADIUS)
 
     def find_track(self) -> Amount:
         """Effective track width [m]."""
-        return combine(operator.mul, self.measure("track_width_m"), self.take(Quantity.TRACK))
+        return self._scale("track_width_m", Quantity.TRACK)
 
     def find_wheelbase(self) -> Amount:
         """Effective wheelbase [m]."""
-        return combine(operator.mul, self.measure("wheelbase_m"), self.take(Quantity.WHEELBASE))
+        return self._scale("wheelbase_m", Quantity.WHEELBASE)
+
+    def _scale(self, name: str, factor: Quantity) -> Amount:
+        """Dimension times its factor; unknown for a stand-in, whose value cancels out in limits."""
+        dimension = self.measure(name)
+        scaled = combine(operator.mul, dimension, self.take(factor))
+        return scaled if dimension.sources else Amount(scaled.value)
 
     def find_largest_steering(self) -> Amount:
         """Steering angle at the largest command [rad]."""
@@ -407,6 +414,7 @@ def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sh
         f"{facts.vehicle.name}: {target.about}.",
         f"Names: {target.source}.",
         facts.format_fit(),
+        facts.vehicle.format_unknown(),
     ]
     return facts, Sheet([line for line in head if line])
 

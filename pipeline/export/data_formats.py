@@ -50,11 +50,17 @@ def write_json_object(file: ModelFile, current: Current) -> str:
         if isinstance(effect, ResidualTerm):
             item["learned"] = learned_as_table(effect)
         effects.append(item)
+    stand_ins = pick(vehicle, *vehicle.stand_ins)
+    warnings = [*file.warnings, *filter(None, [vehicle.format_unknown()])]
     content = {
-        "vehicle": pick(vehicle, "id", "kind", *_GEOMETRY),
+        "vehicle": {
+            **pick(vehicle, "id", "kind", *_GEOMETRY),
+            **dict.fromkeys(stand_ins),
+            **({"stand_ins": stand_ins} if stand_ins else {}),
+        },
         "effects": effects,
         "fit": _plain(file.fit),
-        **({"warnings": list(file.warnings)} if file.warnings else {}),
+        **({"warnings": warnings} if warnings else {}),
     }
     return json.dumps(content, indent=1, allow_nan=False) + "\n"
 
@@ -124,6 +130,8 @@ def _write_head(model: Model) -> str:
         if Quantity.COMMAND_DELAY in parameter.quantities and not is_own(type(effect))
     )
     state = [name for effect in model for name in effect.python_state]
+    unknown = vehicle.format_unknown()
+    text = text.replace("{unknown}", f"# {unknown}\n" if unknown else "")
     for key, number in (
         ("radius", vehicle.wheel_radius_m),
         ("track", vehicle.kinematics.turning_width_m(vehicle)),

@@ -21,6 +21,8 @@ from pipeline.export.twin_body import (
 )
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
+from pipeline.run import MotionError
+from pipeline.sources.configuration import GIVE_GEOMETRY
 
 STEP_S = 0.002
 """Time step of MuJoCo [s]: with 5 ms, wheels with so little creep leave the ground after a hard step."""
@@ -56,7 +58,20 @@ def write_mjcf(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
     """
-    return write_world(build_twin_body(file.model, find_driven_speed(file)), list_head(file, MJCF))
+    return write_world(build_twin(file), list_head(file, MJCF))
+
+
+def build_twin(file: ModelFile) -> TwinBody:
+    """Build the body of a model file's vehicle, whose geometry must be its own.
+
+    Raises:
+        MotionError: ``wrong_vehicle``; ``no_geometry``.
+    """
+    vehicle = file.model.vehicle
+    if vehicle.stand_ins:
+        what = f"a twin needs {' and '.join(vehicle.stand_ins)}, which are not known"
+        raise MotionError("no_geometry", what, where=vehicle.id, hint=GIVE_GEOMETRY)
+    return build_twin_body(file.model, find_driven_speed(file))
 
 
 def find_driven_speed(file: ModelFile) -> float:

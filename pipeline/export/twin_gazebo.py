@@ -10,8 +10,8 @@ from xml.etree import ElementTree as ET
 import msgspec
 
 from pipeline.export import Current, Facts, Sheet, Target, list_comments, make_plain, start_sheet
-from pipeline.export.twin_body import GRIP, TwinBody, TwinWheel, build_twin_body, weigh_chassis, weigh_wheel
-from pipeline.export.twin_files import find_driven_speed, format_numbers, list_head, list_notes, write_comment
+from pipeline.export.twin_body import GRIP, TwinBody, TwinWheel, weigh_chassis, weigh_wheel
+from pipeline.export.twin_files import build_twin, format_numbers, list_head, list_notes, write_comment
 from pipeline.models import Model
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
@@ -119,7 +119,7 @@ def write_sdf(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
     """
-    body = build_twin_body(file.model, find_driven_speed(file))
+    body = build_twin(file)
     root = ET.Element("sdf", {"version": "1.9"})
     outside = [
         *body.controller,

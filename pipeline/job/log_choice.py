@@ -57,7 +57,7 @@ from pipeline.sources import (
     resolve_vehicle,
 )
 from pipeline.sources.candidates import LOCALIZED
-from pipeline.sources.configuration import BODY_STAND_IN
+from pipeline.sources.configuration import StandIn
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
@@ -137,8 +137,7 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
 
 
 UNKNOWN_VEHICLE = "unknown"
-_STAND_IN_RADIUS_M = 0.1
-_STAND_IN_TRACK_M = 0.5
+_STAND_INS: Mapping[StandIn, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
 
 
@@ -428,6 +427,7 @@ def _fit_vehicle(
     """
     sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
     drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    values: dict[str, float] = {}
     # Body motion does not depend on the wheels.
     drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
     if not drives or data is None:
@@ -436,8 +436,7 @@ def _fit_vehicle(
         # The arrangement of the rollers is unknown: only body motion can be evaluated.
         vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
     if drive is None:
-        values: dict[str, float] = {"wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": _STAND_IN_TRACK_M}
-        name = BODY_STAND_IN
+        name = "fitted_body"
         text = (
             "no vehicle is given and none is needed: the drive is commanded and measured as body motion, "
             "whose slip does not depend on wheel radius and track width"
@@ -461,10 +460,12 @@ def _fit_vehicle(
         if recorded_values:
             text += f"; {' and '.join(recorded_values)} as recorded"
     given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
-    known = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None, **values}
+    assumed: Mapping[StandIn, float] = _STAND_INS if drive is None else {}
     if vehicle.kind == "ackermann":
-        known = {**known, "wheel_radius_m": _STAND_IN_RADIUS_M, "track_width_m": None}
-    vehicle = msgspec.structs.replace(vehicle, **{**known, **given})
+        assumed = {"wheel_radius_m": _STAND_INS["wheel_radius_m"]}
+    bare = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None}
+    stand_ins = [key for key in assumed if key not in given]
+    vehicle = msgspec.structs.replace(vehicle, **{**bare, **values, **assumed, **given}, stand_ins=stand_ins)
     findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings, extracted=None)
 

@@ -133,7 +133,12 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
         known = msgspec.structs.asdict(preset)
         return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
     lines += [f"name = {format_value(vehicle.name)}", f"kind = {format_value(vehicle.kind)}"]
-    return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
+    lines += [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
+    if vehicle.stand_ins:
+        names = ", ".join(map(format_value, vehicle.stand_ins))
+        lines.append("# Not known: their values only convert body motion into wheel speeds and back.")
+        lines.append(f"stand_ins = [{names}]")
+    return lines
 
 
 def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> str:

@@ -28,7 +28,7 @@ from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run import MotionError
 from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
-from pipeline.sources.configuration import VehicleSection
+from pipeline.sources.configuration import StandIn, VehicleSection
 
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""
@@ -39,6 +39,12 @@ _CODE = re.compile(r"effects\s*=.*\.py[\"']")
 _ID = re.compile(r"[^\W\d][\w-]{0,63}")
 
 Table = dict[str, object]
+
+
+class _VehicleTable(VehicleSection, frozen=True, kw_only=True):
+    """``[vehicle]`` of a model file, which also says what is not known of the vehicle."""
+
+    stand_ins: list[StandIn] | None = None
 
 
 @dataclass(frozen=True)
@@ -306,7 +312,7 @@ class _Reader:
         if not isinstance(table, dict):
             hint = 'Write [vehicle] and preset = "husky_a200", or kind and geometry.'
             raise self._error("the model says no vehicle", hint, None, "vehicle", code="vehicle_unknown")
-        fields = VehicleSection.__struct_fields__
+        fields = _VehicleTable.__struct_fields__
         for key in table:
             if key not in fields:
                 hint = _ABOVE if key in _SECTIONS else f"Known are: {', '.join(fields)}."
@@ -314,7 +320,7 @@ class _Reader:
                 raise self._error(what, hint, ("vehicle", 0), key, code="unknown_key")
         try:
             require_finite({"vehicle": table})
-            section = msgspec.convert(table, VehicleSection)
+            section = msgspec.convert(table, _VehicleTable)
             return resolve_vehicle(section, recorded=None, where=str(self.path))
         except (msgspec.ValidationError, TomlError) as error:
             key = error.key.rpartition(".")[2] if isinstance(error, TomlError) else ""

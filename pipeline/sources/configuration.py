@@ -40,6 +40,9 @@ Clock = Literal["header", "log", "publish"]
 Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"]
 
 
+StandIn = Literal["wheel_radius_m", "track_width_m"]
+
+
 class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[vehicle]``: a preset, explicit values, or both (the values have priority).
 
@@ -260,6 +263,8 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
             commands distinguish the two.
         controller: the vendor's.
         units: units of the platform's topics, by name.
+        stand_ins: names of dimensions that are not known. Their values only convert body motion into wheel
+            speeds and back, and are none of the vehicle's.
     """
 
     id: str
@@ -282,20 +287,22 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     sideways_preset: str = ""
     controller: VendorController = VendorController()
     units: dict[str, OwnUnit] = {}
+    stand_ins: list[StandIn] = []
 
     @property
     def kinematics(self) -> Kinematics:
         """Kinematics of its kind."""
         return find_kinematics(self.kind)
 
-    @property
-    def is_stand_in(self) -> bool:
-        """Whether only body motion was commanded and measured: the geometry is then none of a vehicle."""
-        return self.id == BODY_STAND_IN
+    def format_unknown(self) -> str:
+        """Line on the dimensions that are not known, and how to give them; empty if all are known."""
+        return f"Not known: {' and '.join(self.stand_ins)}. {GIVE_GEOMETRY}" if self.stand_ins else ""
 
 
-BODY_STAND_IN: Final = "fitted_body"
-"""Id of a vehicle of which nothing is known but its body motion."""
+GIVE_GEOMETRY: Final = (
+    "Analyze the log with --vehicle, with --wheel-radius and --track-width, or with [vehicle] in run.toml; "
+    "apply its diagnosis to a new model."
+)
 
 
 @functools.cache

@@ -164,6 +164,8 @@ def test_topics_and_vehicle_of_a_platform_are_chosen_without_configuration(name:
     chosen = record(name, tmp_path)
     roles = (chosen.sources.command, chosen.sources.wheels, chosen.sources.pose)
     assert (*map(str, roles), chosen.vehicle.id, chosen.vehicle_source) == EXPECTED[name]
+    is_unknown = chosen.vehicle.id == "fitted_body"
+    assert chosen.vehicle.stand_ins == (["wheel_radius_m", "track_width_m"] if is_unknown else [])
 
 
 @pytest.mark.parametrize("name", ["turtlebot4", "f1tenth"])

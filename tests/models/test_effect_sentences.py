@@ -70,7 +70,7 @@ def test_every_effect_has_a_sentence_of_its_own_that_moves_with_its_numbers(kind
 
 
 def test_no_metres_are_said_of_a_vehicle_of_which_only_the_body_motion_is_known() -> None:
-    stand_in = msgspec.structs.replace(HUSKY, id="fitted_body", name="fitted vehicle")
+    stand_in = msgspec.structs.replace(HUSKY, stand_ins=["track_width_m"])
     assert find_effect("effective_track")().change(k=1.08).describe_motion(stand_in) == (
         "Effective track 1.08 times the controller's: the robot turns at 93 % of the ideal rate"
     )

@@ -136,6 +136,18 @@ def test_a_vehicle_without_preset_keeps_its_geometry() -> None:
     assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
 
 
+def test_a_stand_in_stays_a_stand_in() -> None:
+    text = (
+        '[vehicle]\nname = "crab"\nkind = "differential"\nwheel_radius_m = 0.1\ntrack_width_m = 0.5\n'
+        'stand_ins = ["wheel_radius_m"]\n'
+    )
+    file = parse_model(text, HERE)
+    assert file.model.vehicle.stand_ins == ["wheel_radius_m"]
+    assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
+    with pytest.raises(MotionError, match="stand_ins"):
+        parse_model(text.replace('wheel_radius_m"]', 'mass_kg"]'), HERE)
+
+
 def test_formulas_are_read_and_written() -> None:
     text = HEAD + '[[effect]]\nid = "wind"\nv_y = "k * sin(yaw)"\nk = { unit = "m/s", bounds = [-1, 1] }\n'
     file = parse_model(text, HERE)

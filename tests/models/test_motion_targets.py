@@ -7,6 +7,7 @@ import math
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from exported_files import CAR, F1TENTH, FIT, HUSKY, make, make_full, predict, read, take
@@ -20,6 +21,7 @@ from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.catalogue import run_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.run import MotionError
+from pipeline.sources import Vehicle
 
 PARAMETERS = sorted(SCHEMAS)
 CASES = [
@@ -125,6 +127,38 @@ def test_what_is_not_known_is_not_written() -> None:
     unlimited = make(find_effect("body_speed_limit")(), find_effect("acceleration_limit")(limit=4.0))
     assert "vx_max" not in export_model(unlimited, "nav2")
     assert "max_velocity" not in export_model(unlimited, "nav2")
+
+
+@pytest.mark.parametrize("known", [HUSKY, F1TENTH], ids=["robot", "car"])
+@pytest.mark.parametrize("target", list_targets(), ids=lambda target: target.name)
+def test_no_export_states_a_dimension_that_is_a_stand_in(target: export.Target, known: Vehicle) -> None:
+    names = ["wheel_radius_m", *(["track_width_m"] if known is HUSKY else [])]
+    guess = msgspec.structs.replace(known, wheel_radius_m=0.123, stand_ins=names)
+    if target.name in {"mjcf", "sdf"}:
+        with pytest.raises(MotionError, match=" and ".join(names)) as error:
+            export_model(make_full(guess), target.name)
+        assert "--vehicle" in error.value.hint
+        return
+    if known is HUSKY and target.name in {"autoware", "vesc"}:
+        return
+    text = export_model(make_full(guess), target.name)
+    if target.name == "traction":
+        assert "0.123" not in text
+        return
+    assert "Not known: " + " and ".join(names) in text
+    if target.name == "json":
+        vehicle = json.loads(text)["vehicle"]
+        assert [vehicle[name] for name in names] == [None] * len(names)
+        assert vehicle["stand_ins"].keys() == set(names)
+    elif target.name != "python":
+        # Nothing else is missing: in limits of the body the stand-in cancels out.
+        usual = read(target.name, export_model(make_full(known), target.name))
+        found = read(target.name, text)
+        gone = {path.rpartition(".")[2] for path in usual.keys() - found.keys()}
+        dimensions = {"wheel_radius", "traction_wheels_radius", "wheel_separation", "RD_WHEEL_TRACK"}
+        assert gone == {path.rpartition(".")[2] for path in usual} & dimensions - (
+            set() if known is HUSKY else {"wheel_separation"}
+        )
 
 
 def test_numbers_mean_the_same_to_effects_and_targets() -> None:

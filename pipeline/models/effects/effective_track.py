@@ -72,7 +72,7 @@ class EffectiveTrack(KinematicEffect):
         names = enumerate_texts([name for name, value in others.items() if value != 1.0])
         reached = math.prod(others.values()) / k
         track = f"{k * nominal:.2f} m (nominal {nominal:.2f})"
-        if vehicle.is_stand_in:
+        if "track_width_m" in vehicle.stand_ins:
             track = f"{k:.3g} times the controller's"
         return (
             f"Effective track {track}{names and f', with {names}'}: "
