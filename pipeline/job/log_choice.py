@@ -57,7 +57,6 @@ from pipeline.sources import (
     resolve_vehicle,
 )
 from pipeline.sources.candidates import LOCALIZED
-from pipeline.sources.configuration import StandIn
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
@@ -137,7 +136,7 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
 
 
 UNKNOWN_VEHICLE = "unknown"
-_STAND_INS: Mapping[StandIn, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
+_STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
 
 
@@ -460,7 +459,7 @@ def _fit_vehicle(
         if recorded_values:
             text += f"; {' and '.join(recorded_values)} as recorded"
     given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
-    assumed: Mapping[StandIn, float] = _STAND_INS if drive is None else {}
+    assumed: Mapping[str, float] = _STAND_INS if drive is None else {}
     if vehicle.kind == "ackermann":
         assumed = {"wheel_radius_m": _STAND_INS["wheel_radius_m"]}
     bare = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None}

@@ -27,6 +27,7 @@ from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
     Samples,
+    check_echo,
     check_independence,
     estimate_delay,
     gather_samples,
@@ -106,6 +107,28 @@ def align_tables(
     Raises:
         StageError: ``no_segment``, no stretch of the poses can be differentiated.
     """
+    commands, wheels = (tables.get(name, pl.DataFrame()) for name in ("commands", "wheels"))
+    echo = check_echo(commands, wheels, vehicle, body_commanded=body_commanded)
+    used = {name: table for name, table in tables.items() if not (echo and name == "wheels")}
+    made = _align(used, wheels, vehicle, hold_s=hold_s, body_commanded=body_commanded, where=where)
+    if not echo:
+        return made
+    # The readings stay as recorded; as aligned they are unknown, so that nothing evaluates them.
+    names = [name for name in wheels.columns if name.endswith("_aligned")]
+    unknown = wheels.with_columns(pl.lit(None, pl.Float64).alias(name) for name in names)
+    return replace(made, tables={**made.tables, "wheels": unknown}, findings=(*echo, *made.findings))
+
+
+def _align(
+    tables: Mapping[str, pl.DataFrame],
+    witness: pl.DataFrame,
+    vehicle: Vehicle,
+    *,
+    hold_s: float | None,
+    body_commanded: bool,
+    where: str,
+) -> Aligned:
+    """As `align_tables`; poses that are made of the wheels ``witness`` are reported even without wheels."""
     commands = tables.get("commands", pl.DataFrame())
     wheels, findings = interpolate_readings(tables.get("wheels", pl.DataFrame()))
     hold = None
@@ -136,9 +159,7 @@ def align_tables(
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
         scale = measure_command_scale(samples, vehicle)
-        independent = check_independence(
-            samples, vehicle, [_find_period(table) for table in (wheels, tables["poses"])]
-        )
+        independent = _check_poses(samples, witness, tables["poses"], vehicle)
         findings += [*scale.findings, *independent]
         grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
     aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
@@ -187,6 +208,16 @@ class _Grid:
     steps: pl.DataFrame
     recorded: Mapping[str, float | None] = field(default_factory=dict)
     is_localization: bool = True
+
+
+def _check_poses(
+    samples: Samples, witness: pl.DataFrame, poses: pl.DataFrame, vehicle: Vehicle
+) -> list[Finding]:
+    """Report poses that are made of wheels, even of wheels that are not used."""
+    if samples.measured is None and not witness.is_empty():
+        ideal = interpolate_wheels(samples.times, witness, vehicle)
+        samples = replace(samples, measured=np.where(ideal.active[:, None], ideal.velocity, np.nan))
+    return check_independence(samples, vehicle, [_find_period(table) for table in (witness, poses)])
 
 
 def _find_period(table: pl.DataFrame) -> float:

@@ -181,6 +181,11 @@ def compute_slip(
             what = "no pose falls into the intervals in which commands are live"
             hint = "Correct [[interval]] (seconds from the run's start), or take all with --interval all."
             raise StageError("empty_interval", what, where=where, hint=hint)
+        if known:
+            hint = f"Take --input {next(iter(known))}."
+            raise StageError(
+                "no_command", "the inputs asked for have no usable values", where=where, hint=hint
+            )
         what = "no command and no measured wheel speed falls together with a pose"
         hint = "Name the command in run.toml ([command] topic = ...); `slip inspect` lists the topics."
         raise StageError("no_command", what, where=where, hint=hint)
@@ -224,7 +229,7 @@ def read_inputs(
 
 def keep_known(inputs: Mapping[str, Ideal]) -> dict[str, Ideal]:
     """The inputs that are known in some live interval."""
-    return {name: ideal for name, ideal in inputs.items() if np.isfinite(ideal.velocity[ideal.active]).any()}
+    return {n: one for n, one in inputs.items() if np.isfinite(one.velocity[one.active]).all(axis=1).any()}
 
 
 def cut_steps(

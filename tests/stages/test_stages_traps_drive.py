@@ -10,6 +10,7 @@ import pytest
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import SlipError
+from pipeline.run import read_drive
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
 from pipeline.stages.command_scale import _find_ratio
@@ -161,6 +162,22 @@ def test_trap_9_wheel_odometry_is_recognised_at_any_rate(
     pose = replace(ODOMETRY, rate_hz=rates[0])
     taken = drive(replace(LONGER, pose=pose, encoders=Encoders(rate_hz=rates[1])))
     assert "pose_from_wheels" in taken.ids()
+
+
+def test_trap_9_commands_in_place_of_encoders_are_not_evaluated_and_still_show_odometry(
+    drive: TakeThrough,
+) -> None:
+    """A controller in open loop: its odometry is its command, and poses may be made of it."""
+    echo = replace(LONGER, effects={}, program=Program("smooth"), encoders=Encoders(noise_radps=0.0))
+    taken = drive(echo)
+    assert taken.finding("wheels_from_commands").severity == "warning"
+    assert "pose_from_wheels" not in taken.ids()
+    assert set(taken.result.inputs) == {"command"}
+    assert read_drive(taken.aligned.tables["wheels"], taken.aligned.vehicle) is None
+    assert {"wheels_from_commands", "pose_from_wheels"} <= drive(replace(echo, pose=ODOMETRY)).ids()
+    assert "wheels_from_commands" not in drive(replace(echo, effects={"drive_lag": 0.02})).ids()
+    with pytest.raises(SlipError, match="--input command"):
+        drive(echo, inputs=("measured",))
 
 
 def test_trap_9_wheel_odometry_with_a_wider_track_is_still_wheel_odometry(drive: TakeThrough) -> None:
