@@ -336,8 +336,7 @@ def predict(
     if not results.is_dir():
         raise no_results(results)
     with show_progress(f"{vehicle} on {terrain}", quiet=quiet or json) as progress:
-        progress("fitting its runs jointly")
-        forecast = forecast_deployment(store, vehicle, terrain, input)
+        forecast = forecast_deployment(store, vehicle, terrain, input, notify=progress)
         progress("driving their commands with drawn parameters")
         prediction = predictions.predict_deployment(store, forecast)
     if file is not None:

@@ -7,7 +7,7 @@ a vehicle.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -58,6 +58,7 @@ def forecast_deployment(
     source: Literal["command", "measured"] = "command",
     *,
     without: Sequence[str] = (),
+    notify: Callable[[str], object] = str,
 ) -> Forecast:
     """Forecast the parameters of a vehicle on a terrain from the runs of the results.
 
@@ -73,6 +74,7 @@ def forecast_deployment(
         terrain: name of the terrain; it need not have runs.
         source: input of the model.
         without: SHA-256 of recordings to exclude, such as those to be predicted.
+        notify: called with a line of progress.
 
     Raises:
         SlipError: there is no fleet, or no run of the vehicle.
@@ -82,6 +84,7 @@ def forecast_deployment(
     runs = list(_load_runs(store, start))
     if not start.numbers or not runs:
         return start
+    notify(f"fitting {len(runs)} run{'s' * (len(runs) > 1)} jointly")
     geometry, held = runs[0][1], list_held(estimates, vehicle, source)
     problem = Problem([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]

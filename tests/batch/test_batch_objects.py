@@ -151,7 +151,7 @@ def test_results_in_a_bucket_are_those_of_a_folder(
     mirror = Mirror(out, tmp_path / "elsewhere")
     mirror.pull_index()
     ice = Partition(terrain="ice")
-    mirror.pull_tables(["slip"], filter(ice.holds, mirror.store.manifests()))
+    mirror.pull_tables(["slip"], ice.select(mirror.store.manifests()))
     assert mirror.store.query("SELECT DISTINCT run FROM slip", ice)["run"].to_list() == ["season/d"]
     assert len(list((tmp_path / "elsewhere").rglob("slip.parquet"))) == 1
     assert verify_results(mirror.store, mirror=mirror, logs=False, notify=print).is_clean
