@@ -16,10 +16,10 @@ from pipeline.estimation.folds import hold_out
 from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
-from pipeline.estimation.search import SearchResult, list_rivals, suggest_manoeuvre
+from pipeline.estimation.search import SearchResult, list_rivals
 from pipeline.estimation.selection import CandidateModel, Context, Selection
 from pipeline.models import Model, find_effect
-from pipeline.models.catalogue import find_late_effect, list_effects
+from pipeline.models.catalogue import find_late_effect, list_effects, suggest_manoeuvre
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run import MotionError, MotionRun

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -19,27 +19,14 @@ from pipeline.estimation.evidence import Noise
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import USEFUL, CandidateModel, Context, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
-from pipeline.models.effect import Effect, Excitation, Place, Search
+from pipeline.models.catalogue import suggest_manoeuvre
+from pipeline.models.effect import Effect, Place, Search
 from pipeline.models.parameter import Conditions, Quantity
 
 DETECTED = LEAST_T + 1.3
 """Size of an effect [standard errors] that is named in nine of ten logs."""
 DETECTED_SHARE = 90
 """Share of logs with an effect of that size in which it is named [percent]."""
-
-MANOEUVRES: Mapping[Excitation, str] = {
-    Excitation.DRIVING: "drive for a few minutes",
-    Excitation.TURNING: "turn both ways, on the spot and while driving",
-    Excitation.SPEED_SPREAD: "drive at several speeds, forward and backward",
-    Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
-    Excitation.CHANGES: "change speed and turning in steps, every few seconds",
-    Excitation.SLOPE: "drive on a slope in several directions (by hand: `slip plan` is for level ground)",
-    Excitation.LARGE: "ask for the largest speeds and turns",
-    Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
-    Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
-    Excitation.STEERING: "steer to both sides at several speeds",
-    Excitation.SIDEWAYS: "drive sideways both ways, at several speeds",
-}
 
 
 @dataclass(frozen=True)
@@ -140,12 +127,6 @@ def _find_detectable(usual: Effect, standard_errors: float, share: float) -> lis
     size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
     least = 0.0 if parameter.least is None else parameter.least.size
     return [Detectable(usual.id, parameter.name, parameter.unit, max(size, least))]
-
-
-def suggest_manoeuvre(*effects: Effect) -> str:
-    """Manoeuvres that excite effects."""
-    needs = dict.fromkeys(need for effect in effects for need in effect.needs)
-    return "; ".join(MANOEUVRES[need] for need in [*needs][:3])
 
 
 _MOST_EFFECTS = 8
@@ -368,6 +349,9 @@ def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) 
             continue
         for some in dict.fromkeys([tuple(cases), *((case,) for case in cases)]) if cases else ():
             simpler = selection.enter(current.state.drop([effect.id]).add(*some))
+            if simpler.numbers < current.numbers and _hides_sampling(selection, simpler, most):
+                excluded.add(effect.id)
+                return simpler
             if selection.sum_losses(simpler) < most:
                 simpler = _make_sound(selection, simpler)
             if simpler.numbers >= current.numbers or selection.sum_losses(simpler) >= most:
@@ -375,6 +359,22 @@ def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) 
             if selection.judge(simpler, current).share < 1.0:
                 return simpler
     return current
+
+
+def _hides_sampling(selection: Selection, simpler: CandidateModel, most: float) -> bool:
+    """Whether a model has less than a sum of losses beside a delay or lag that sampling alone can cause.
+
+    A limit beside a lag can follow such a delay, too, which is too small to be named.
+    """
+    for kind in selection.candidates:
+        (parameter, *others), least = kind.parameters, selection.conditions.least_delay_s
+        is_sampled = parameter.least is not None and parameter.least.sampled > 0.0 and not others
+        if not is_sampled or kind.id in simpler.ids or not least:
+            continue
+        model = selection.enter(simpler.state.add(kind().change(**{parameter.name: least})))
+        if not selection.is_sound(model) and selection.sum_losses(model) < most:
+            return True
+    return False
 
 
 # Search for missing effects on each path that the recording observes.

@@ -16,7 +16,7 @@ from pathlib import Path, PurePosixPath
 from types import ModuleType
 
 from pipeline.core import guess_names, suffix_unit
-from pipeline.models.effect import Effect, Late, Parameter, Search, find_late
+from pipeline.models.effect import Effect, Excitation, Late, Parameter, Search, find_late
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.parameter import is_of_one_run
@@ -345,3 +345,24 @@ def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
         title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
         lines.append(f"{effect.id:<24}{effect.place.name.lower():<13}{title.split(': ', 1)[-1]}")
     return lines
+
+
+MANOEUVRES: Mapping[Excitation, str] = {
+    Excitation.DRIVING: "drive for a few minutes",
+    Excitation.TURNING: "turn both ways, on the spot and while driving",
+    Excitation.SPEED_SPREAD: "drive at several speeds, forward and backward",
+    Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
+    Excitation.CHANGES: "change speed and turning in steps, every few seconds",
+    Excitation.SLOPE: "drive on a slope in several directions (by hand: `slip plan` is for level ground)",
+    Excitation.LARGE: "ask for the largest speeds and turns",
+    Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
+    Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
+    Excitation.STEERING: "steer to both sides at several speeds",
+    Excitation.SIDEWAYS: "drive sideways both ways, at several speeds",
+}
+
+
+def suggest_manoeuvre(*effects: Effect) -> str:
+    """Manoeuvres that excite effects."""
+    needs = dict.fromkeys(need for effect in effects for need in effect.needs)
+    return "; ".join(MANOEUVRES[need] for need in [*needs][:3])

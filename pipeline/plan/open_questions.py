@@ -8,8 +8,8 @@ import numpy as np
 
 from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats
-from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.models import Excitation, find_effect
+from pipeline.models.catalogue import suggest_manoeuvre
 from pipeline.plan import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser
 from pipeline.plan.questions import DECIDED_T, Answerable, Question, Separation
 

@@ -10,9 +10,8 @@ from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
 from pipeline.estimation.diagnosis_lines import format_learned_share, format_unexplained
 from pipeline.estimation.error_regions import format_remaining_error
-from pipeline.estimation.search import suggest_manoeuvre
 from pipeline.estimation.verdict import holds_formula, name_formula
-from pipeline.models.catalogue import list_effects
+from pipeline.models.catalogue import list_effects, suggest_manoeuvre
 from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.report import (
     MISSING,
