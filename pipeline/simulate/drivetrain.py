@@ -117,6 +117,7 @@ def drive_wheels(
     commands = _smooth(_stop_when_silent(commands, hold_s), vehicle, effects)
     speed, turn = _limit_body(commands, vehicle, effects)
     deadband = effects.value("deadband", "d")
+    charge = 1.0 - effects.value("gain_drift", "k") * (np.arange(cell_count) + 0.5) / cell_count
 
     def hold(values: Floats) -> Floats:
         return hold_on_grid(
@@ -135,7 +136,7 @@ def drive_wheels(
             wheel = _rest_at_reversal(wheel, effects.value("reversal_pause", "d"), step_s)
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
-        wheel = effects.value("drive_gain", "g") * wheel
+        wheel = effects.value("drive_gain", "g") * charge * wheel
         if pitch is not None:
             wheel = _load(wheel, pitch, vehicle.wheel_radius_m, effects.value("grade_load", "k"))
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)

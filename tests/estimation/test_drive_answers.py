@@ -18,7 +18,12 @@ from pipeline.simulate import VEHICLES, Disturbance, Ground, Scenario, simulate_
 if TYPE_CHECKING:
     from pathlib import Path
 
-_GAINS = {"drive_gain": {"g": 0.9}, "difference_gain": {"g": 0.49}, "side_gain": {"e": 0.06}}
+_GAINS = {
+    "drive_gain": {"g": 0.9},
+    "gain_drift": {"k": 0.2},
+    "difference_gain": {"g": 0.49},
+    "side_gain": {"e": 0.06},
+}
 _DRIVES = {
     **_GAINS,
     "body_acceleration_limit": {"limit": 1.5},

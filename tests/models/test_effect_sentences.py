@@ -27,6 +27,11 @@ MOST_IN_SENTENCE = 3
             {"k": 0.6},
             "Grade load: the wheels turn 0.1 m/s slower uphill on a slope of 10 degrees",
         ),
+        (
+            "gain_drift",
+            {"k": 0.2},
+            "Gain drift: the wheels turn 20 % less of their command at the end of the run than at its start",
+        ),
         ("slope_drift", {"k": 0.6}, "Slope drift: 0.1 m/s downhill on a slope of 10 degrees"),
         (
             "terrain_change",

@@ -65,7 +65,7 @@ def test_one_wrong_reading_is_no_speed_that_lasts() -> None:
     assert average_sustained(gap, signal).size == average_sustained(times, signal).size - 9
 
 
-@pytest.mark.parametrize("name", ["drive_gain", "difference_gain", "side_gain"])
+@pytest.mark.parametrize("name", ["drive_gain", "gain_drift", "difference_gain", "side_gain"])
 def test_gains_come_before_what_begins_at_the_measured_wheels(name: str) -> None:
     """A gain behind a ramp scaled the measured speed with which the ramp begins."""
     gain = find_effect(name)

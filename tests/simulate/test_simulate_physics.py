@@ -300,6 +300,12 @@ def test_time_drift_reaches_its_share_at_the_end() -> None:
     assert half == pytest.approx(V0 * 0.95, rel=1e-4)
 
 
+def test_the_gain_of_the_drive_fades_to_its_share_at_the_end() -> None:
+    drive = simulate_run(replace(STRAIGHT, effects={"gain_drift": 0.1, "drive_gain": 0.9})).truth.drive
+    half = np.argmin(np.abs(np.arange(drive.left.size) * drive.step_s - 15.0))
+    assert 0.165 * drive.left[half] == pytest.approx(0.9 * 0.95 * V0, rel=1e-4)
+
+
 def test_the_controller_stops_some_time_after_the_last_command() -> None:
     quiet = replace(STRAIGHT, program=Program("circle", rate_hz=1.0, lead_s=1.0, hold_s=0.25))
     drive = simulate_run(quiet).truth.drive

@@ -40,7 +40,7 @@ class DriveGain(DriveEffect):
     motion = "Drive gain: the wheels reach {percent} of the commanded speed"
     clause = "turns its wheels at {percent} of the commanded speed"
     needs = (Excitation.SPEED_SPREAD,)
-    confused_with = ("wheel_radius", "wheel_speed_limit", "wheel_servo")
+    confused_with = ("wheel_radius", "wheel_speed_limit", "wheel_servo", "gain_drift")
     python = "left, right, sideways = {g} * left, {g} * right, {g} * sideways"
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
