@@ -61,7 +61,7 @@ MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
     "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
-    "effective_wheelbase",
+    "effective_wheelbase", "gain_drift",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -248,7 +248,7 @@ def _excite(scene: Scenario, effect: str, draw: np.random.Generator) -> Scenario
         tilt = math.radians(float(draw.uniform(6.0, 11.0)))
         way = float(draw.uniform(0.0, 2.0 * math.pi))
         scene = replace(scene, ground=Ground(tilt * math.cos(way), tilt * math.sin(way)))
-    if effect in {"terrain_change", "time_drift"}:
+    if effect in {"terrain_change", "time_drift", "gain_drift"}:
         scene = replace(scene, duration_s=max(scene.duration_s, 240.0))
     return scene
 

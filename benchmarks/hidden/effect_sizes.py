@@ -74,6 +74,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "body_acceleration_limit": {"limit": speed / (2.0 * size)},
         "turn_acceleration_limit": {"limit": turn / (2.0 * size)},
         "drive_gain": {"g": 1.0 - 0.1 * size},
+        "gain_drift": {"k": 0.15 * size},
         "difference_gain": {"g": 1.0 - 0.4 * size},
         "side_gain": {"e": sign * 0.06 * size},
         "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
