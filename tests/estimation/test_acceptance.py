@@ -3,13 +3,24 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from test_diagnosis_search import _load
 
+from pipeline.core.compute import Budget
+from pipeline.estimation import Input
 from pipeline.estimation.acceptance import LEAST_T, Improvement, compare, compare_rivals
 from pipeline.estimation.evidence import ORDER, Tiles, learn_noise
+from pipeline.estimation.search import simplify
+from pipeline.estimation.selection import open_selection, prepare
 from pipeline.estimation.state import Weights
+from pipeline.models import find_effect
+from pipeline.simulate import VEHICLES, Encoders, Imu, Program, Scenario
+
+if TYPE_CHECKING:
+    from pathlib import Path
 
 COUNT = 480  # four minutes of half-second windows
 TILES = Tiles(np.arange(COUNT), np.minimum(np.arange(COUNT), ORDER), np.arange(COUNT) // 20)
@@ -106,3 +117,30 @@ def test_rivals_that_do_the_same_are_not_told_apart_and_others_are() -> None:
     assert abs(alike) < 2.0
     assert compare_rivals(noise, residual + column, residual) > 5.0
     assert compare_rivals(noise, residual, residual + column) < -5.0
+
+
+def test_a_limit_beside_a_lag_is_none_where_a_delay_that_sampling_can_cause_does_its_work(
+    tmp_path: Path,
+) -> None:
+    drive = {"drive_lag": 0.06, "transport_delay": 0.009}
+    encoders = Encoders(rate_hz=50.0, noise_radps=0.003)
+    scenario = Scenario(
+        VEHICLES["husky"],
+        effects=drive,
+        program=Program("teleop"),
+        duration_s=60.0,
+        encoders=encoders,
+        imu=Imu(),
+    )
+    run, vehicle = _load(scenario, tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, ideal = open_selection(part, begin, context.list_drivetrain(), context.conditions, Budget())
+    limits = (find_effect("torque_limit")(tau=0.05, limit=limit) for limit in (10.0, 40.0, 80.0))
+    limited = min((selection.enter(ideal.state.add(one)) for one in limits), key=selection.loss)
+    lag = selection.enter(ideal.state.add(find_effect("drive_lag")(tau=0.05)))
+    # The limit follows what the delay leaves.
+    assert selection.loss(limited) < 0.95 * selection.loss(lag)
+    excluded = set[str]()
+    assert simplify(selection, limited, excluded).ids == ("drive_lag",)
+    assert excluded == {"torque_limit"}
