@@ -367,3 +367,13 @@ def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
         float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*shifts, strict=True)
     )
     return Moves(distance, turn, distance / length if length > 0.0 else 0.0)
+
+
+def project_out(own: Floats, column: Floats) -> Floats:
+    """Component of a column, shape (k, c), orthogonal to the model's own columns, shape (k, c, p)."""
+    if not own.shape[2]:
+        return column
+    flat = own.reshape(-1, own.shape[2])
+    solution = np.linalg.lstsq(flat, column.reshape(-1), rcond=1e-8)[0]
+    residual: Floats = (column.reshape(-1) - flat @ solution).reshape(column.shape)
+    return residual

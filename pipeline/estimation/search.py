@@ -13,7 +13,15 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.core.compute import Budget
-from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, STABLE_T, find_innovations, scale_evidence
+from pipeline.estimation.acceptance import (
+    LEAST_GAIN,
+    LEAST_T,
+    STABLE_T,
+    find_innovations,
+    is_large_enough,
+    project_out,
+    scale_evidence,
+)
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Noise
 from pipeline.estimation.parts import make_weights
@@ -80,7 +88,7 @@ def find_unobservable(
         with_it = final.state.add(candidate().make_usual(selection.largest))
         shift = final.fit.residual - selection.part.find_residuals(with_it)
         column = noise.whiten(shift[rows, :, None])[:, :, 0]
-        separate = _project_out(own, column)
+        separate = project_out(own, column)
         independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
         column, separate = (scale_evidence(innovations, spread, one) for one in (column, separate))
         alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
@@ -94,16 +102,6 @@ def find_unobservable(
         )
         unobservable.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
     return unobservable, seen
-
-
-def _project_out(own: Floats, column: Floats) -> Floats:
-    """Component of a column, shape (k, c), orthogonal to the model's own columns, shape (k, c, p)."""
-    if not own.shape[2]:
-        return column
-    flat = own.reshape(-1, own.shape[2])
-    solution = np.linalg.lstsq(flat, column.reshape(-1), rcond=1e-8)[0]
-    residual: Floats = (column.reshape(-1) - flat @ solution).reshape(column.shape)
-    return residual
 
 
 def _is_spread(noise: Noise, column: Floats) -> bool:
@@ -349,30 +347,32 @@ def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) 
             continue
         for some in dict.fromkeys([tuple(cases), *((case,) for case in cases)]) if cases else ():
             simpler = selection.enter(current.state.drop([effect.id]).add(*some))
-            if simpler.numbers < current.numbers and _hides_sampling(selection, simpler, most):
-                excluded.add(effect.id)
-                return simpler
             if selection.sum_losses(simpler) < most:
                 simpler = _make_sound(selection, simpler)
-            if simpler.numbers >= current.numbers or selection.sum_losses(simpler) >= most:
+            if simpler.numbers >= current.numbers:
                 continue
+            if selection.sum_losses(simpler) >= most:
+                if not _lacks_sampling(selection, simpler, most):
+                    continue
+                excluded.add(effect.id)
+                return simpler
             if selection.judge(simpler, current).share < 1.0:
                 return simpler
     return current
 
 
-def _hides_sampling(selection: Selection, simpler: CandidateModel, most: float) -> bool:
+def _lacks_sampling(selection: Selection, simpler: CandidateModel, most: float) -> bool:
     """Whether a model has less than a sum of losses beside a delay or lag that sampling alone can cause.
 
-    A limit beside a lag can follow such a delay, too, which is too small to be named.
+    It is too small to be named; a limit beside a lag follows it, too.
     """
     for kind in selection.candidates:
         (parameter, *others), least = kind.parameters, selection.conditions.least_delay_s
-        is_sampled = parameter.least is not None and parameter.least.sampled > 0.0 and not others
-        if not is_sampled or kind.id in simpler.ids or not least:
+        if others or not (parameter.least and parameter.least.sampled and least) or kind.id in simpler.ids:
             continue
         model = selection.enter(simpler.state.add(kind().change(**{parameter.name: least})))
-        if not selection.is_sound(model) and selection.sum_losses(model) < most:
+        fitted = next(effect for effect in model.state.effects if effect.id == kind.id)
+        if not is_large_enough(fitted, selection.conditions) and selection.sum_losses(model) < most:
             return True
     return False
 
