@@ -28,8 +28,17 @@ from pipeline.plan import (
     list_manoeuvres,
     wait,
 )
-from pipeline.plan.open_questions import Impossible, explain_open, leave_open, list_reasons
-from pipeline.plan.questions import DECIDED_T, Answerable, Judge, Question, Separation
+from pipeline.plan.questions import (
+    DECIDED_T,
+    Answerable,
+    Impossible,
+    Judge,
+    Question,
+    Separation,
+    explain_open,
+    leave_open,
+    list_reasons,
+)
 from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
 _MODELS = 12

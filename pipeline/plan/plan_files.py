@@ -17,9 +17,8 @@ from pipeline.logs.writer import LogWriter
 from pipeline.models import format_value
 from pipeline.models.catalogue import find_effect
 from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_within, is_steered, join, wait
-from pipeline.plan.open_questions import Impossible
 from pipeline.plan.plan import SAFETY, ExpectedGain, Plan, since_when
-from pipeline.plan.questions import Judge, Question
+from pipeline.plan.questions import Impossible, Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal
 from pipeline.run import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs

@@ -40,7 +40,6 @@ from pipeline.plan import (
     parse_time,
     wait,
 )
-from pipeline.plan.open_questions import Impossible, explain_open
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
     LONGEST_S,
@@ -52,7 +51,7 @@ from pipeline.plan.plan_files import (
     read_promises,
     write_plan,
 )
-from pipeline.plan.questions import ask_presence
+from pipeline.plan.questions import Impossible, ask_presence, explain_open
 from pipeline.plan.rehearsal import Rehearsal, assume
 from pipeline.report.drive_pages import preview_plan
 from pipeline.run import MotionError
