@@ -41,8 +41,8 @@ _RESOLVED = 0.02
 _REPEATED = 0.18
 # For differences: number of lags after which noise is uncorrelated, and the threshold for structure.
 _FORGOTTEN = 3
-_GROWN = 0.3
-"""Share of the last square beyond what noise in the first ones lets expect, from which on it is structure."""
+_GROWN = 0.85
+"""Share of the last square by which structure must have grown to be distinguished from noise."""
 _FEWEST_LASTING = 600
 """Minimum number of windows for estimating structure."""
 
@@ -215,11 +215,11 @@ def split_differences(squares: Floats, windows: int) -> Makeup:
         measured, squares = ~measured, np.full(squares.size, _LEAST)
     design, squares = design[measured], squares[measured]
     parts = solve_nonnegative(design, squares)
-    noise = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
-    grown = float(squares[-1] - design[-1, :known] @ noise)
+    grown = float((design[:, known:] @ parts[known:])[-1])
     if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
         # Differences grow a little with the time between them by chance: that is not structure.
-        parts[:known], parts[known:] = noise, 0.0
+        parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
+        parts[known:] = 0.0
     # Noise within two standard errors of the first square cannot be told from none.
     least = 2.0 * math.sqrt(2.0 * _PAIRS_EACH / max(windows, 1)) * float(squares[0])
     parts[1] += max(least - float(design[0, :known] @ parts[:known]), 0.0)
@@ -264,7 +264,7 @@ _QUIET_SHARE = 0.7
 _FEWEST = 20
 """Minimum number of windows for a mean square."""
 _STRATA = 5
-"""Classes of pairs by yaw rate. With 3 or 10, the floors of 35 drawn logs are as near to the true ones."""
+"""Classes of pairs by yaw rate, each weighted by its part of all pairs."""
 _STRATUM = 100
 """Minimum number of pairs per class by yaw rate."""
 # Number of classes of pairs, by how much the regression explains of them.
@@ -375,17 +375,19 @@ def _measure_repeats(
 def _take_away_changes(rest: Floats, change: Floats, turning: Floats) -> Floats:
     """Half the mean square of differences (n, 3) less their regression on changes (n, p); see `_average`.
 
-    Pairs are compared within classes of their yaw rate (n,): noise may grow with it, and calm pairs are
+    Each class of yaw rates (n,) counts by its part of all pairs: noise may grow with it, and calm pairs are
     mostly straight.
     """
     scaled = change / (np.sqrt((change**2).mean(axis=0)) + 1e-9)
     size = np.abs(scaled).max(axis=1)
     strata = np.array_split(np.argsort(turning, kind="stable"), min(_STRATA, max(size.size // _STRATUM, 1)))
+    limit, least = np.quantile(size, _QUIET_SHARE), min(5 * _FEWEST, size.size) // len(strata)
     chosen = [
-        rows[np.argsort(size[rows], kind="stable")[: max(int(_QUIET_SHARE * rows.size), 5 * _FEWEST)]]
+        rows[np.argsort(size[rows], kind="stable")[: max(int((size[rows] <= limit).sum()), least)]]
         for rows in strata
     ]
     quiet, ends = np.concatenate(chosen), np.cumsum([rows.size for rows in chosen])[:-1]
+    shares = [rows.size / size.size for rows in strata]
     rest, scaled, count = rest[quiet], scaled[quiet], quiet.size
     normal = scaled.T @ scaled / count
     ridge = _RIDGE * float(np.trace(normal)) / normal.shape[0] + 1e-12
@@ -399,12 +401,12 @@ def _take_away_changes(rest: Floats, change: Floats, turning: Floats) -> Floats:
     free = 1.0 - np.minimum(leverage, _MOST_FREEDOM)
     owed = np.abs(scaled) @ np.abs(weights)
     total, alike = np.zeros(3), np.zeros(3)
-    parts = zip(*(np.split(values, ends) for values in (residual, owed, free)), strict=True)
-    for part, mine, freedom in parts:
+    parts = zip(shares, *(np.split(values, ends) for values in (residual, owed, free)), strict=True)
+    for share, part, mine, freedom in parts:
         squares = 0.5 * _hold(part) ** 2
         each = np.array([_average(*one, freedom) for one in zip(squares.T, mine.T, strict=True)])
-        total += each[:, 0] * part.shape[0] / count
-        alike += each.prod(axis=1) * part.shape[0] / count
+        total += each[:, 0] * share
+        alike += each.prod(axis=1) * share
     return np.array((total, alike / np.maximum(total, _LEAST)))
 
 

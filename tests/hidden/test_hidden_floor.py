@@ -64,9 +64,10 @@ def test_noise_below_what_can_be_resolved_is_not_reported_as_zero() -> None:
 def test_noise_that_grows_with_turning_counts_as_often_as_the_vehicle_turns() -> None:
     """As that of a localization by a laser: most driving is calm and straight, most error arises in turns."""
     draw = np.random.default_rng(3)
-    turning = np.where(np.arange(4000) % 5 == 0, draw.uniform(0.5, 1.0, 4000), 0.01 * draw.random(4000))
-    change = draw.normal(size=(4000, 4)) * (0.1 + turning)[:, None]
-    noise = draw.normal(size=(4000, 3)) * (0.01 + 0.1 * turning)[:, None]
+    turns = np.arange(4000) % 5 == 0
+    turning = np.where(turns, 0.8, 0.01) * draw.uniform(0.9, 1.1, 4000)
+    change = draw.normal(size=(4000, 4)) * np.where(turns, 0.5, 0.3)[:, None]
+    noise = draw.normal(size=(4000, 3)) * np.where(turns, 0.1, 0.01)[:, None]
     square, _ = _take_away_changes(0.3 * change[:, :3] + noise, change, turning)
     assert square == pytest.approx(0.5 * np.mean(noise**2, axis=0), rel=0.2)
 
