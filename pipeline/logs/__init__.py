@@ -47,6 +47,10 @@ _HELD_INTERVALS: Final = 3.0
 _SMALLEST_LEAD_NS: Final = 1_000_000
 """Time between stamp and recording that means nothing: recorders write down messages a millisecond apart."""
 
+_LONGEST_PATH: Final = 2.0
+"""Path between two changes of a correction [m + rad] above which the second one is a jump: AMCL corrects
+every 0.2 m or 0.2 rad, slam_toolbox every 0.5 m or 0.5 rad."""
+
 TRANSFORM_FIELDS: Final = (
     f"{_TRANSFORM}header",
     f"{_TRANSFORM}child_frame_id",
@@ -326,7 +330,7 @@ def _pose_at(link: Link, leading: Link | None, time: Ints) -> tuple[Floats, Floa
     """Positions (n, 3) and quaternions (n, 4) of a link at stamps.
 
     Between two changes of a correction, its share is that of the path of the leading link [m + rad]: so much
-    of the drift had arisen. A change of more than that path is a jump of the localization.
+    of the drift had arisen. A change of more than that path, or after a long one, is a jump.
     """
     start = link.time[0]
     at, known = (time - start) * 1e-9, (link.time - start) * 1e-9
@@ -344,6 +348,8 @@ def _pose_at(link: Link, leading: Link | None, time: Ints) -> tuple[Floats, Floa
     old, new = (link.position[rows] + rotate(link.quaternion[rows], vehicle) for rows in (before, after))
     _, turn = measure_increments(link.position[fresh], link.quaternion[fresh])
     arose = np.linalg.norm(new - old, axis=1) + np.linalg.norm(turn, axis=1) < driven
+    # What was confirmed over a longer path did not drift along it.
+    arose &= driven < _LONGEST_PATH
     rows, here = (np.searchsorted(known[fresh], times, side="right") - 1 for times in (known, at))
     arose = np.append(arose, False)
     needed = ~arose[rows]

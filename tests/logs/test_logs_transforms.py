@@ -47,7 +47,8 @@ def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(
     times = START + np.arange(200) * STEP
     slow = times[::20]
     drift, yaw = np.linspace(0.0, 2.0, slow.size), np.linspace(0.0, 0.4, slow.size)
-    moved, turned = np.cumsum(rng.normal(size=(200, 3)), axis=0), np.cumsum(rng.normal(size=200)) * 0.1
+    moved = 0.03 * np.cumsum(rng.normal(size=(200, 3)), axis=0)
+    turned = 0.01 * np.cumsum(rng.normal(size=200))
     path = tmp_path / "log.mcap"
     with LogWriter(path) as writer:
         correction = transforms("map", "odom", np.stack((drift, -drift, 0 * drift), axis=1), yaw)
@@ -83,6 +84,19 @@ def test_a_chain_is_the_product_of_its_links_at_the_child_stamps(
     assert np.allclose(np.abs((series.quaternion * turn).sum(axis=1)), 1.0, atol=1e-9)
     back = buffer.lookup_series("imu", "map", at=series.time)
     assert np.allclose(series.position + rotate(series.quaternion, back.position), 0.0, atol=1e-6)
+
+
+def test_a_correction_that_long_stood_is_a_jump_where_it_changes(tmp_path: Path) -> None:
+    """A relocalization after 18 m of driving is no drift along them."""
+    times, path = START + np.arange(200) * STEP, tmp_path / "log.mcap"
+    forward = np.outer(np.arange(200), [0.1, 0.0, 0.0])
+    moved = np.outer(np.arange(200) >= 180, [0.0, 0.3, 0.0])
+    with LogWriter(path) as writer:
+        for frames, position in ((("map", "odom"), moved), (("odom", "base_link"), forward)):
+            columns = transforms(*frames, position, np.zeros(200))
+            writer.write_columns("/tf", KIND, times, columns, header_time=times)
+    series = buffer_of(path).lookup_series("map", "base_link")
+    assert np.allclose(series.position, (forward + moved)[(series.time - START) // STEP], atol=1e-9)
 
 
 def test_a_future_dated_correction_serves_from_the_start(tmp_path: Path) -> None:
