@@ -287,7 +287,7 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
         return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
     shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
     # Below the noise floor a share is of nothing.
-    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one and one["physics"] < 1.0}
+    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one and max(one.values()) < 1.0}
     if not known:
         return ""
     explained = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]

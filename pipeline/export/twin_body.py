@@ -25,6 +25,7 @@ from pipeline.models.model import Model
 from pipeline.models.parameter import TwinRole
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
+from pipeline.sources.configuration import GIVE_GEOMETRY
 
 CREEP_S = 0.01
 """Time constant of wheels with little creep [s]: five time steps of 2 ms, where three are stable, too."""
@@ -149,8 +150,12 @@ def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
             grows with speed in the model, the latter with its square.
 
     Raises:
-        MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``.
+        MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``: dimensions are not its own.
     """
+    vehicle = model.vehicle
+    if vehicle.stand_ins:
+        what = f"a twin needs {' and '.join(vehicle.stand_ins)}, which are not known"
+        raise MotionError("no_geometry", what, where=vehicle.id, hint=GIVE_GEOMETRY)
     return _Builder(model, speed_mps).build()
 
 

@@ -21,8 +21,6 @@ from pipeline.export.twin_body import (
 )
 from pipeline.models.effect import Effect
 from pipeline.models.model_file import ModelFile
-from pipeline.run import MotionError
-from pipeline.sources.configuration import GIVE_GEOMETRY
 
 STEP_S = 0.002
 """Time step of MuJoCo [s]: with 5 ms, wheels with so little creep leave the ground after a hard step."""
@@ -67,10 +65,6 @@ def build_twin(file: ModelFile) -> TwinBody:
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``.
     """
-    vehicle = file.model.vehicle
-    if vehicle.stand_ins:
-        what = f"a twin needs {' and '.join(vehicle.stand_ins)}, which are not known"
-        raise MotionError("no_geometry", what, where=vehicle.id, hint=GIVE_GEOMETRY)
     return build_twin_body(file.model, find_driven_speed(file))
 
 

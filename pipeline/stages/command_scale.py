@@ -23,6 +23,9 @@ _FEWEST_STEPS = 6
 _SCALED = 0.18
 """Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.81
 on `husky_snow_boreal` and 0.95 to 1.04 on the other recordings."""
+_SAME = 0.05
+"""Absolute logarithm of a ratio below which it is that of two radii: on recordings with the right scale it is
+0.05 at most."""
 _FEWEST_BLOCKS = 60
 """Half seconds that tell a gain from a lag; half and double change no finding of two recordings."""
 
@@ -111,13 +114,14 @@ def _find_geometry(
     """Scales of mean and difference of the sides by a preset's geometry, if nearer to the ratio in turns."""
     forward, nearest = scales[0], None
     for other in list_presets():
-        if other.kind != vehicle.kind or not (other.wheel_radius_m and other.track_width_m):
+        is_alike = other.kind == vehicle.kind == "differential"
+        if not (is_alike and other.wheel_radius_m and other.track_width_m):
             continue
         radii = other.wheel_radius_m / (vehicle.wheel_radius_m or np.nan)
         tracks = radii * (vehicle.track_width_m or np.nan) / other.track_width_m
         is_nearer = abs(np.log(turning / tracks)) < abs(np.log(turning / scales[1]))
         # Wheels may differ less than they are asked to, not more.
-        if abs(np.log(forward / radii)) < _SCALED and np.log(turning / tracks) < _SCALED and is_nearer:
+        if abs(np.log(forward / radii)) < _SAME and np.log(turning / tracks) < _SCALED and is_nearer:
             scales, nearest = (radii, tracks), other
     return scales, nearest
 

@@ -194,8 +194,9 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
         return mean
     first, second = np.tan(angles)
     middle, half = 0.5 * (first + second), 0.5 * (first - second)
-    to_one_side = np.abs(half) < np.abs(middle)
-    bent = np.divide(half**2, middle, out=np.zeros_like(middle), where=to_one_side)
+    # Toe and offsets of sensors part wheels that hardly steer, too: no axle is longer than the wheelbase.
+    apart = np.minimum(np.abs(half), 0.5 * middle**2)
+    bent = np.divide(apart**2, middle, out=np.zeros_like(middle), where=middle != 0.0)
     between: Floats = np.arctan(middle - bent)
     return between
 

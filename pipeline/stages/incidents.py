@@ -358,7 +358,8 @@ def _find_stuck(rims: Rims) -> list[Span]:
     """Wheels that turn as usual and bring the body hardly anywhere, which a noisy pose may sway meanwhile."""
     if rims.wheels is None:
         return []
-    usual = rims.driven * np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
+    gains = np.array([measure_gain(rims, axis) for axis in (0, 1, 2)])
+    usual = _smooth(rims.times, rims.driven * gains, _SMOOTH_S)
     share, size = _find_share(usual, rims.moved), np.linalg.norm(usual, axis=1)
     turns = (rims.wheels > LIVE * rims.top) & (size > 0.5 * LIVE * rims.top)
     shows = (rims.wheels > LIVE_SHARE * rims.top) & (share < 2.0 * _SHARE_OF_GAIN)

@@ -321,13 +321,17 @@ def check_echo(
         return []
     kinematics = vehicle.kinematics
     asked, read = (
-        np.stack(roll({one.name: table[one.name].to_numpy() for one in kinematics.inputs}, vehicle), axis=-1)
+        np.nan_to_num(
+            np.stack(
+                roll({one.name: table[one.name].to_numpy() for one in kinematics.inputs}, vehicle), axis=-1
+            )
+        )
         for table, roll in (
             (commands, kinematics.asked if body_commanded else kinematics.forward),
             (wheels, kinematics.forward),
         )
     )
-    equal = _EXACTLY * np.nanmax(np.abs(asked), axis=0)
+    equal = _EXACTLY * np.abs(asked).max(axis=0)
     changed = 1 + np.flatnonzero((np.abs(np.diff(read, axis=0)) > equal).any(axis=1))
     if changed.size < _FEWEST_CHANGES:
         return []
