@@ -330,11 +330,8 @@ def predict(
     from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
-    from pipeline.store.names import no_results  # noqa: PLC0415
 
     store = Store(results)
-    if not results.is_dir():
-        raise no_results(results)
     with show_progress(f"{vehicle} on {terrain}", quiet=quiet or json) as progress:
         forecast = forecast_deployment(store, vehicle, terrain, input, notify=progress)
         progress("driving their commands with drawn parameters")

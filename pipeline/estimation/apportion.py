@@ -73,6 +73,10 @@ class Share:
     alone: float = math.nan
     last: float = math.nan
 
+    def pick(self, *others: str) -> dict[str, Json]:
+        """The share with its interval, and others of its numbers, as JSON and tables hold them."""
+        return {**pick_finite(self, "share", "low", "high", *others, digits=JSON_DIGITS)}
+
 
 @dataclass(frozen=True)
 class SlipBudget:
@@ -96,9 +100,7 @@ class SlipBudget:
 
     def to_json(self) -> dict[str, Json]:
         """The keys of `slip compare --causes` for one run, for each input and quantity."""
-        rest: dict[str, Json] = {
-            share.kind: _numbers(share) for share in self.shares if share.kind != "effect"
-        }
+        rest: dict[str, Json] = {share.kind: share.pick() for share in self.shares if share.kind != "effect"}
         return {
             "input": self.input,
             "quantity": self.quantity,
@@ -106,16 +108,12 @@ class SlipBudget:
             "unit": self.unit,
             "stretches": self.stretches,
             "shares": [
-                {"effect": share.name, **_numbers(share, "alone", "last")}
+                {"effect": share.name, **share.pick("alone", "last")}
                 for share in self.shares
                 if share.kind == "effect"
             ],
             **rest,
         }
-
-
-def _numbers(share: Share, *others: str) -> dict[str, Json]:
-    return {**pick_finite(share, "share", "low", "high", *others, digits=JSON_DIGITS)}
 
 
 def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:

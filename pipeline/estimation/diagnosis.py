@@ -453,7 +453,7 @@ def _budget_rows(item: RunDiagnosis) -> list[dict[str, Json]]:
             "name": share.name,
             "mean_square": share.share * budget.total,
             "unit": budget.unit,
-            **_numbers(share, "share", "low", "high", "alone", "last"),
+            **share.pick("alone", "last"),
             "stretches": budget.stretches,
         }
         for budget in item.budgets

@@ -351,12 +351,11 @@ def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) 
                 simpler = _make_sound(selection, simpler)
             if simpler.numbers >= current.numbers:
                 continue
-            if selection.sum_losses(simpler) >= most:
-                if not _lacks_sampling(selection, simpler, most):
-                    continue
+            if selection.sum_losses(simpler) < most:
+                if selection.judge(simpler, current).share < 1.0:
+                    return simpler
+            elif _lacks_sampling(selection, simpler, most):
                 excluded.add(effect.id)
-                return simpler
-            if selection.judge(simpler, current).share < 1.0:
                 return simpler
     return current
 

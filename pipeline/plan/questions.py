@@ -9,7 +9,7 @@ end at rest add up.
 
 import math
 from collections.abc import Container, Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
@@ -428,16 +428,13 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
         weight = np.bincount(np.array(drive, np.int64), minlength=library.size).astype(np.float64)
         if float(one.answer(weight, _RESERVES[0])) >= 1.0:
             seconds = math.ceil(LEAD_S + float(chooser.durations[list(drive)].sum()) + TAIL_S)
-            return _because(question, advice.format(seconds=seconds), question.reached)
+            return replace(question, because=advice.format(seconds=seconds))
         best = weight if _is_better(one, weight, best) else best
     if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
         seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
-        return _because(question, f"give a larger --area, and up to --time {seconds}s", question.reached)
-    return _because(question, _advise(one.question, longest_s), f"at best {_format_reached(one, best)}")
-
-
-def _because(question: Impossible, because: str, reached: str) -> Impossible:
-    return Impossible(question.question, question.effects, because, reached)
+        return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
+    at_best = f"at best {_format_reached(one, best)}"
+    return replace(question, because=_advise(one.question, longest_s), reached=at_best)
 
 
 def _continue(

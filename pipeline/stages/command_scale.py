@@ -61,11 +61,12 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     if samples.measured is None or samples.command is None:
         return unscaled
     both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
-    forward, turning = _measure_ratios(samples, both)
+    steps = _average(samples, both & samples.steady, samples.step.astype(np.int64))
+    forward, turning = _measure_ratios(samples, both, steps)
     if forward is None:
         return unscaled
     if abs(np.log(forward)) > _SCALED:
-        return _explain_scale(samples, both & samples.steady, forward, vehicle)
+        return _explain_scale(samples, steps, forward, vehicle)
     if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
         return unscaled
     used = vehicle.controller_track_multiplier
@@ -79,9 +80,9 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     return CommandScale(1.0, 1.0, multiplier, (finding,))
 
 
-def _explain_scale(samples: Samples, steady: Flags, forward: float, vehicle: Vehicle) -> CommandScale:
+def _explain_scale(samples: Samples, steps: Floats, forward: float, vehicle: Vehicle) -> CommandScale:
     """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
-    asked, got = _average(samples, steady, samples.step.astype(np.int64))[1]
+    asked, got = steps[1]
     slow = _find_slow(asked)
     turning = float(np.median(got[slow] / asked[slow])) if slow.sum() >= _FEWEST_STEPS else forward
     scales, other = (forward, forward), None
@@ -126,14 +127,11 @@ def _find_geometry(
     return scales, nearest
 
 
-def _measure_ratios(samples: Samples, both: Flags) -> tuple[float | None, float | None]:
-    """Ratio of measured to commanded speed and yaw rate; None if it cannot be determined."""
-    steady, forward, turning = both & samples.steady, None, None
-    if steady.any():
-        steps = _average(samples, steady, samples.step.astype(np.int64))
-        forward, turning = (_find_ratio(asked, got) for asked, got in steps)
-        if forward is not None and turning is not None:
-            return forward, turning
+def _measure_ratios(samples: Samples, both: Flags, steps: Floats) -> tuple[float | None, float | None]:
+    """Ratio of measured to commanded speed and yaw rate in steady steps; None if it cannot be determined."""
+    forward, turning = (_find_ratio(asked, got) for asked, got in steps)
+    if forward is not None and turning is not None:
+        return forward, turning
     if samples.body_commanded and both.any():
         blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
         along, across = (_find_gain(asked, got) for asked, got in blocks)
