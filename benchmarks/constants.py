@@ -3,8 +3,9 @@
     python benchmarks/constants.py FILE... [--names NAME ...] [--log LOG ...] [--factors 0.5 2] [--diagnosis]
 
 Each number of each file is set to its value times each factor, alone, and the logs are analyzed again in this
-process. Prints one line a number and factor: `same`, or what differs. A number that is used only while
-modules are imported, or by compiled loops, keeps its value there: it is `same` whatever it is.
+process. Prints one line a number and factor: `same`, or what differs, and last how many numbers change an
+answer. A number that is used only while modules are imported, or by compiled loops, keeps its value there: it
+is `same` whatever it is.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
+import polars as pl
 from house import list_constants, read_sources
 
 from pipeline.core import SlipError
@@ -37,7 +39,7 @@ def judge(logs: list[Path], *, diagnosis: bool) -> dict[str, float | str]:
             options = Options(out=Path(folder), report=False, diagnosis=diagnosis)
             try:
                 summary = json.loads(json.dumps(analyze_log(log, options).summary))
-            except (SlipError, ArithmeticError, LookupError, ValueError) as error:
+            except (SlipError, ArithmeticError, LookupError, ValueError, pl.exceptions.PolarsError) as error:
                 answers[f"{log.stem} fails"] = type(error).__name__
                 continue
             for finding in summary["findings"]:
@@ -91,15 +93,20 @@ def main() -> None:
     asked = parser.parse_args()
     wanted = {file.resolve().relative_to(ROOT) for file in asked.files}
     before = judge(asked.logs, diagnosis=asked.diagnosis)
+    tried, deciding = 0, 0
     for source in read_sources(ROOT):
         for constant in list_constants(source) if source.path in wanted else []:
             value = getattr(importlib.import_module(source.module), constant.name)
             if not isinstance(value, int | float) or (asked.names and constant.name not in asked.names):
                 continue
+            changes = set[str]()
             for factor in asked.factors:
                 with replace_number(source.module, constant.name, factor):
                     words = compare(before, judge(asked.logs, diagnosis=asked.diagnosis))
+                changes.add(words)
                 print(f"{source.path.stem}.{constant.name} = {value:g} x {factor:g}: {words}", flush=True)
+            tried, deciding = tried + 1, deciding + (changes != {"same"})
+    print(f"{deciding} of {tried} numbers change an answer")
 
 
 if __name__ == "__main__":

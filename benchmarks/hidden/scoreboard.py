@@ -80,7 +80,8 @@ def describe(category: str, played: Sequence[Record]) -> list[str]:
         lines.append(_rate(counted, "nothing else beside it", _has_no_other))
         lines.append(_rate(counted, "exactly right", is_exact))
         lines.append(_rate(counted, "named, or undecided with it", is_narrowed))
-        lines.append(_rate(counted, f"error within {_WORSE:g} of the true model's", is_as_good))
+        hiding = [record for record in counted if record.score.truth]
+        lines.append(_rate(hiding, f"error within {_WORSE:g} of the true model's", is_as_good))
         if category == "rigid":
             lines.append(_rate(counted, "all is named, a turn_lag being a motor's lag", is_found_in_contact))
             extras = [len(list_unphysical(record)) for record in played]

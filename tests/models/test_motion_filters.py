@@ -111,7 +111,7 @@ def test_a_rate_limit_agrees_with_stepping_through_it(
         inside = []
         for _ in range(fine):
             most = limit * STEP / fine
-            value += float(np.clip(target - value, -most, most))
+            value += max(-most, min(target - value, most))
             inside.append(value)
         expected.append(np.mean(inside))
     assert np.allclose(limited, expected, atol=limit * STEP)
@@ -143,7 +143,7 @@ def test_a_ramp_begins_with_the_command_and_not_with_the_cell(seed: int) -> None
     held = rng.uniform(-1.0, 1.0, 13)[np.searchsorted(at, (np.arange(cells * fine) + 0.5) * STEP / fine)]
     most, value, inside = limit * STEP / fine, held[0], np.empty(held.size)
     for place, target in enumerate(held.tolist()):
-        value += float(np.clip(target - value, -most, most))
+        value += max(-most, min(target - value, most))
         inside[place] = value
     means = [one.reshape(cells, fine).mean(axis=1) for one in (held, inside)]
     limited = limit_rate(means[0], limit, STEP, resets_at([0], cells, [held[0]]), np.array([held[0]]))
@@ -229,7 +229,7 @@ def test_a_lag_within_a_rate_agrees_with_stepping_through_it(
     for target in signal.tolist():
         inside = []
         for _ in range(fine):
-            moved = value + float(np.clip((target - value) * share, -most, most))
+            moved = value + max(-most, min((target - value) * share, most))
             inside.append(0.5 * (value + moved))
             value = moved
         expected.append(sum(inside) / fine)
