@@ -137,7 +137,7 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
 
 UNKNOWN_VEHICLE = "unknown"
 _STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
-_STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "hunter_msgs/")
+_STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "autoware_auto_control_msgs/", "hunter_msgs/")
 
 
 @dataclass(frozen=True)
@@ -394,6 +394,9 @@ def _compare(
         )
         findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
     sources = replace_pose(chosen.sources, ratings)
+    if sources.wheels != chosen.sources.wheels:
+        # The topic that is no pose after all measures the wheels, by fields that were not read of it.
+        data = read_topics(index, list_wanted(sources, index.types, rivals))
     # Candidates are rated without intervals, and with the wheels that were chosen by name.
     as_rated = sources.interval is None and sources.wheels == chosen.sources.wheels
     made = ratings[0].made if ratings and as_rated else None

@@ -386,3 +386,19 @@ def test_hidden_effects_are_named_by_satellites(
     assert found["effective_track"]["k"]["value"] == pytest.approx(1.5, rel=0.03)
     if "lateral_skid" in named:
         assert found["lateral_skid"]["c"]["value"] == pytest.approx(0.08, abs=0.01)
+
+
+def test_an_odometry_that_is_no_pose_after_all_measures_the_wheels(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a car that nobody names its odometry is first taken for the pose, and read as one."""
+    car = PLATFORMS["f1tenth"]
+    drive = next(one for one in car.topics if one.topic == "/drive")
+    wheels = odometry("/odom", "odometry", "odom", "base_link")
+    lidar = odometry("/pf/pose/odom", "localization", "map", "base_link")
+    log = publish(tmp_path, monkeypatch, drive, wheels, lidar, imu("/imu/data"), kind=car)
+    anonymous = rewrite(log, lambda _topic, _message: None)
+    choice = choose_for(anonymous)
+    assert (str(choice.sources.wheels), str(choice.sources.pose)) == ("/odom", "/pf/pose/odom")
+    analyzed = analyze_log(anonymous, Options(out=tmp_path / "results", report=False, through="extract"))
+    assert analyzed.manifest.read("wheels").height > 500

@@ -136,6 +136,15 @@ def test_a_vehicle_without_preset_keeps_its_geometry() -> None:
     assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
 
 
+def test_a_vehicle_that_is_named_like_a_preset_keeps_what_it_does_not_know() -> None:
+    """A car called "car" has no track width, the example that goes by this name has; so with another kind."""
+    for name, kind in (("car", "ackermann"), ("husky", "ackermann")):
+        text = f'[vehicle]\nname = "{name}"\nkind = "{kind}"\nwheel_radius_m = 0.3\nwheelbase_m = 2.7\n'
+        file = parse_model(text, HERE)
+        assert file.model.vehicle.track_width_m is None
+        assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
+
+
 def test_a_stand_in_stays_a_stand_in() -> None:
     text = (
         '[vehicle]\nname = "crab"\nkind = "differential"\nwheel_radius_m = 0.1\ntrack_width_m = 0.5\n'

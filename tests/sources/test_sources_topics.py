@@ -312,3 +312,30 @@ def test_a_choice_that_cannot_be_followed_is_one_clear_line(
     assert caught.value.code == code
     assert "\n" not in said
     assert [word for word in words if word not in said] == []
+
+
+@pytest.mark.parametrize(
+    ("control", "vehicle", "speed"),
+    [
+        ("autoware_control_msgs/msg/Control", "autoware_vehicle_msgs", "longitudinal.velocity"),
+        (
+            "autoware_auto_control_msgs/msg/AckermannControlCommand",
+            "autoware_auto_vehicle_msgs",
+            "longitudinal.speed",
+        ),
+    ],
+)
+def test_both_generations_of_autoware_are_read(control: str, vehicle: str, speed: str) -> None:
+    topics = {
+        "/control/command/control_cmd": control,
+        "/vehicle/status/velocity_status": f"{vehicle}/msg/VelocityReport",
+        "/vehicle/status/steering_status": f"{vehicle}/msg/SteeringReport",
+        "/localization/kinematic_state": ODOMETRY,
+    }
+    sources = choose(topics, "autoware")
+    assert sources.command is not None
+    assert [signal.field for signal in sources.command.signals] == [speed, "lateral.steering_tire_angle"]
+    assert names(sources)["wheels"] == (
+        "/vehicle/status/velocity_status.longitudinal_velocity, "
+        "/vehicle/status/steering_status.steering_tire_angle"
+    )
