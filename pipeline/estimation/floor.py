@@ -341,7 +341,11 @@ def _list_conditions(comparison: Comparison) -> tuple[Floats, Floats]:
     moves = np.clip(np.abs(history[:, 0]).sum(axis=1) / _MOVING_MPS, 0.0, 1.0)[:, None]
     world = moves * np.column_stack((np.sin(yaw), np.cos(yaw), np.sin(roll), np.sin(pitch)))
     curve = history[:, :, 0] * history[:, :, 1]
-    return history, np.column_stack((history.reshape(history.shape[0], -1), curve, world))
+    regressors = [history.reshape(history.shape[0], -1), curve, world]
+    if context.vehicle.kinematics.has_inputs("steering"):
+        # A car turns the less for its steering the faster it is; what that adds changes within a turn.
+        regressors.append(history[:, 0, 0] * curve[:, 0])
+    return history, np.column_stack(regressors)
 
 
 def _measure_repeats(

@@ -25,7 +25,7 @@ from pipeline.estimation.ladder import judge_model
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run import MotionError
 from pipeline.run.heading import HeadingSource
-from pipeline.simulate import Disturbance, Encoders, Imu, PoseSensor
+from pipeline.simulate import VEHICLES, Disturbance, Encoders, Imu, PoseSensor, Program
 
 HUSKY = vehicle_of("husky_a200")
 SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}
@@ -225,6 +225,19 @@ def test_the_floor_is_the_true_model_s_error_under_slow_localization_noise(sourc
     true = score(problem, problem.start_state(true_model.effects)).pooled
     x, y, _, position, _ = problem.floor.ratios(true)
     assert np.allclose((x, y, position), 1.0, atol=0.15)
+
+
+@pytest.mark.parametrize("seed", [1, 3])
+def test_understeer_in_turns_of_changing_speed_is_no_noise(seed: int) -> None:
+    """What v^2 w adds to the yaw rate changes within a turn: without it the floor was up to thrice that."""
+    car, understeer = vehicle_of("ackermann_car"), find_effect("understeer")(K=0.04)
+    run = simulate(
+        {"understeer": 0.04}, seed=seed, duration_s=150.0, vehicle=VEHICLES["car"], program=Program("smooth")
+    )
+    problem = Problem([run], car, Input.COMMAND)
+    true = score(problem, problem.start_state((understeer,))).pooled
+    _, _, turn, position, heading = problem.floor.ratios(true)
+    assert np.allclose((turn, position, heading), 1.0, atol=0.4)
 
 
 def test_the_floor_knows_of_no_model_and_no_model_lowers_it() -> None:
