@@ -112,6 +112,20 @@ def test_the_verdict_says_how_far_off_why_and_what_remains() -> None:
     )
 
 
+def test_what_is_too_small_to_be_named_is_not_unexplained() -> None:
+    small = {"id": "lateral_skid", "parameters": {"c": {"value": 0.04, "undetermined": False}}}
+    unknown = {"id": "acceleration_limit", "parameters": {"limit": {"value": 143.0, "undetermined": True}}}
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)], immaterial=[small, unknown])
+    assert check_verdict(drawn).endswith(
+        "Beside lateral skid, too small to be named, no known effect explains the rest."
+    )
+    alone = draw_diagnosis({}, [(0.4, 0.2)], immaterial=[small])
+    assert check_verdict(alone).endswith(
+        "Beside lateral skid, too small to be named, no known effect explains it."
+    )
+    assert check_verdict({**alone, "immaterial": [unknown]}).endswith("No known effect explains it.")
+
+
 def test_what_removes_less_than_a_tenth_is_counted_and_not_told() -> None:
     effects = {"drive_lag": {"tau": 0.3}, "wheel_asymmetry": {"e": 0.02}, "effective_track": {"k": 1.5}}
     drawn = draw_diagnosis(effects, [(1.0, 0.5), (0.5, 0.5), (0.45, 0.48), (0.05, 0.02)])

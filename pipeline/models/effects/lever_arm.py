@@ -34,9 +34,10 @@ class LeverArm(LinearEffect):
         """What the vehicle does, with numbers."""
         ahead, sideways = self.values["l_x"], self.values["l_y"]
         direction = "ahead of" if ahead >= 0.0 else "behind"
-        aside = f"{abs(sideways) * 100.0:.2g} cm to the {name_side(sideways)}"
+        lengths = [f"{abs(arm) * 100.0:.{2 if abs(arm) < 0.995 else 3}g} cm" for arm in (ahead, sideways)]  # noqa: PLR2004
         return (
-            f"Lever arm: the pose is measured {abs(ahead) * 100.0:.2g} cm {direction} base_link and {aside}"
+            f"Lever arm: the pose is measured {lengths[0]} {direction} base_link and {lengths[1]} to the "
+            f"{name_side(sideways)}"
         )
 
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
