@@ -61,7 +61,7 @@ MORE = (
     "steering_sensor_offset", "speed_track", "brake_lag", "reversal_pause", "side_lag", "steering_play",
     "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
-    "effective_wheelbase", "gain_drift",
+    "effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -188,9 +188,14 @@ def open_seal(text: str) -> Answer:
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in (*CAR, "steering_sensor_offset", "steering_play", "effective_wheelbase") or (
-        effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS
-    )
+    car = effect in (
+        *CAR,
+        "steering_sensor_offset",
+        "steering_sensor_play",
+        "steering_rate_limit",
+        "steering_play",
+        "effective_wheelbase",
+    ) or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS)
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
     vehicle = VEHICLES[name]
     layouts = [key for key, item in LAYOUTS.items() if item.kind == vehicle.kind]

@@ -59,6 +59,8 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "effective_wheelbase": {"k": 1.0 + sign * 0.12 * size},
         "understeer": {"K": 0.035 * size},
         "steering_play": {"g": 0.05 * size},
+        "steering_sensor_play": {"g": 0.05 * size},
+        "steering_rate_limit": {"limit": 0.35 / size},
         "reversal_pause": {"d": 0.4 * size},
         "wheel_servo": {
             "tau": 0.2 * size,

@@ -324,11 +324,20 @@ def _couple_sides(left: Floats, right: Floats, effects: Effects, step_s: float) 
 
 def _steer(asked: Floats, effects: Effects, step_s: float) -> Floats:
     angle = effects.value("steering_gain", "g") * asked
+    if effects.is_active("steering_rate_limit"):
+        angle = limit_rate(angle, per_second=effects.value("steering_rate_limit", "limit"), step_s=step_s)
     angle = lag_signal(angle, tau_s=effects.value("steering_lag", "tau"), step_s=step_s)
-    if effects.is_active("steering_play"):
-        half = effects.value("steering_play", "g")
-        angle = follow(angle, lambda now, asked: min(max(now, asked - half), asked + half))
-    return angle + effects.value("steering_offset", "o")
+    return _play(angle, effects.value("steering_play", "g")) + effects.value("steering_offset", "o")
+
+
+def steer_tyres(sensed: Floats, effects: Effects) -> Floats:
+    """Angle of the tyres [rad] for that which a sensor reads, shape (n,)."""
+    tyres = _play(sensed, effects.value("steering_sensor_play", "g"))
+    return tyres + effects.value("steering_sensor_offset", "o")
+
+
+def _play(angle: Floats, half: float) -> Floats:
+    return follow(angle, lambda now, asked: min(max(now, asked - half), asked + half)) if half else angle
 
 
 # Motors under speed controllers, one a side: proportional and integral gain, bounded force, and the ground.

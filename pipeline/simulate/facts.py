@@ -249,7 +249,12 @@ _SCALES = {"wheel_radius": 0.0, "effective_track": 0.05, "lateral_scale": 0.0, "
 def _check_value(effect: str, name: str, value: float) -> None:
     low = _LEAST.get(name, -_INF)
     waits = effect in {"deadband", "transport_delay", "reversal_pause"} and name == "d"
-    if name in _NEVER_NEGATIVE or name.startswith("tau") or effect == "steering_play" or waits:
+    if (
+        name in _NEVER_NEGATIVE
+        or name.startswith("tau")
+        or effect in {"steering_play", "steering_sensor_play"}
+        or waits
+    ):
         low = 0.0
     elif name == "k" and effect in _SCALES:
         low = _SCALES[effect]

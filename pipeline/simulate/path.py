@@ -14,7 +14,7 @@ from pipeline.core.rigid import (
     quaternions_from_yaw,
     rotate,
 )
-from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners
+from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners, steer_tyres
 from pipeline.simulate.facts import Effects, Vehicle
 from pipeline.simulate.programs import (
     filter_pole,
@@ -124,8 +124,7 @@ def _roll_wheels(drive: Drive, vehicle: Vehicle, effects: Effects) -> tuple[Floa
             vehicle.wheelbase_m * effects.value("effective_wheelbase", "k")
             + effects.value("understeer", "K") * v0**2
         )
-        tyres = drive.steering + effects.value("steering_sensor_offset", "o")
-        w0 = v0 * np.tan(tyres) / span
+        w0 = v0 * np.tan(steer_tyres(drive.steering, effects)) / span
     else:
         w0 = (right - left) / (vehicle.track_width_m * effects.value("effective_track", "k"))
     time = (np.arange(v0.size) + 0.5) * drive.step_s

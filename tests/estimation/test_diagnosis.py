@@ -119,6 +119,7 @@ _CAR = replace(
     [
         ("steering_offset", 0.01, "wheels"),
         ("steering_sensor_offset", 0.01, "measured"),
+        ("steering_sensor_play", 0.02, "measured"),
         ("yaw_drift", 0.03, "measured"),
     ],
 )

@@ -50,7 +50,7 @@ CATALOGUE_IDS = {
     *("drive_gain", "difference_gain", "side_gain", "drive_overshoot", "grade_load"),
     *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling", "contact_friction"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
-    *("effective_wheelbase", "gain_drift"),
+    *("effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play"),
 }
 
 

@@ -168,6 +168,8 @@ DELTA, SPEED = 0.6 * CAR.max_steering_rad, 0.6 * CAR.max_speed_mps
         ({"understeer": 0.03}, SPEED * math.tan(DELTA) / (2.6 + 0.03 * SPEED**2)),
         ({"effective_wheelbase": 1.2}, SPEED * math.tan(DELTA) / (1.2 * 2.6)),
         ({"steering_lag": 0.4}, SPEED * math.tan(DELTA) / 2.6),
+        ({"steering_rate_limit": 0.3}, SPEED * math.tan(DELTA) / 2.6),
+        ({"steering_sensor_play": 0.05}, SPEED * math.tan(DELTA - 0.05) / 2.6),
         ({"body_turn_limit": 0.5}, 0.5),
     ],
     ids=str,
@@ -255,15 +257,39 @@ def test_a_wheel_rests_before_it_reverses() -> None:
     np.testing.assert_allclose(drive.right[~rests] * 0.165, np.where(time[~rests] < 4.0, V0, -V0))
 
 
-def test_tyres_stay_within_the_play_of_their_steering() -> None:
-    asked = 0.3 * np.sin(np.arange(80) * 0.2)
-    car = Scenario(
-        vehicle=VEHICLES["car"],
-        duration_s=8.0,
-        played=Commands(np.arange(0.0, 8.0, 0.1), np.ones(80), asked),
+_WEAVING = Scenario(
+    vehicle=VEHICLES["car"],
+    duration_s=8.0,
+    played=Commands(np.arange(0.0, 8.0, 0.1), np.ones(80), 0.3 * np.sin(np.arange(80) * 0.2)),
+)
+
+
+def test_a_steering_that_is_slow_turns_at_its_limit_until_it_has_caught_up() -> None:
+    plain, slow = (
+        simulate_run(replace(_WEAVING, effects=given)).truth.drive
+        for given in ({}, {"steering_rate_limit": 0.25})
     )
+    rates = np.diff(slow.steering) / slow.step_s
+    assert np.abs(rates).max() == pytest.approx(0.25)
+    late = plain.steering[1:] != slow.steering[1:]
+    np.testing.assert_allclose(np.abs(rates[late]), 0.25)
+    assert late.any()
+
+
+def test_play_behind_the_sensor_is_seen_by_the_tyres_alone() -> None:
+    before, behind = (
+        simulate_run(replace(_WEAVING, effects={name: 0.04})).truth
+        for name in ("steering_play", "steering_sensor_play")
+    )
+    np.testing.assert_array_equal(
+        behind.drive.steering, simulate_run(replace(_WEAVING, effects={})).truth.drive.steering
+    )
+    np.testing.assert_allclose(behind.path.position, before.path.position)
+
+
+def test_tyres_stay_within_the_play_of_their_steering() -> None:
     plain, loose = (
-        simulate_run(replace(car, effects=given)).truth.drive.steering
+        simulate_run(replace(_WEAVING, effects=given)).truth.drive.steering
         for given in ({}, {"steering_play": 0.04})
     )
     moves = np.diff(loose) != 0.0
