@@ -154,14 +154,14 @@ def add(  # noqa: D417 - the shared options document themselves
 ) -> int:
     """Add effects to a model, fit it, and show what they bring.
 
-    An effect is refused that does not help on held-out data: physics excludes the sign, an error over 2 s
-    rises or none falls, the gain is within the noise, or an interval includes the value that changes nothing.
-    The file then stays as it was.
+    An effect is refused, and the file stays as it was, if the data do not support it: its sign is impossible,
+    an error over 2 s rises or none falls, the reduction is not significant, or an interval includes the
+    neutral value.
 
     Args:
         model: the model file.
         effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
-        anyway: add the effects even if they do not help.
+        anyway: add the effects even if the data do not support them.
     """
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
 

@@ -170,7 +170,7 @@ class Improvement:
 
 
 NEARLY = 0.5
-"""Share of the required evidence and gain below which an effect is neither told nor a condition on others."""
+"""Share of the significance threshold below which an effect is neither told nor a condition on others."""
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ class NotSignificant:
     Attributes:
         effect: with its values when added to the final model of the search.
         gain: share of the loss that it removes.
-        evidence: share of the required evidence and gain, see `Improvement.reached`.
+        evidence: share of the significance threshold, see `Improvement.reached`.
     """
 
     effect: Effect

@@ -200,12 +200,12 @@ def explain_errors(
     if rises := format_rises(before, after, CHANCE):
         return rises
     if not list_rises(after, before, CHANCE):
-        return f"no error over 2 s falls by more than chance ({format_share(CHANCE)})"
+        return f"no error over 2 s falls by more than {format_share(CHANCE)}"
     if gain.is_significant:
         return None
     if gain.gain < LEAST_GAIN:
         return f"the held-out error falls by less than {format_share(LEAST_GAIN)}"
-    return f"its gain is within the noise (t = {gain.share * LEAST_T:.1f}; {LEAST_T:g} is needed)"
+    return f"the reduction is not significant (t = {gain.share * LEAST_T:.1f}, required {LEAST_T:g})"
 
 
 def explain_refusal(
@@ -223,7 +223,7 @@ def explain_refusal(
         if parameter.one_sign and value <= parameter.neutral:
             return (
                 f"{parameter.name} = {_format_value(value, parameter, digits=2)} is not possible: "
-                f"only values above {_format_value(parameter.neutral, parameter)} are"
+                f"it must be above {_format_value(parameter.neutral, parameter)}"
             )
     if conditions is not None and effect.is_degenerate(conditions):
         simpler = effect.collapse()
@@ -253,20 +253,20 @@ def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -
     at = _format_value(parameter.neutral, parameter) if math.isfinite(parameter.neutral) else "no limit"
     return (
         f"the 95 % interval of {parameter.name}, {low:.3g} to {_format_value(high, parameter)}, "
-        f"includes {at}: no effect"
+        f"includes {at} (no effect)"
     )
 
 
 def format_refusals(refusals: Mapping[str, str]) -> str:
-    """Refusals in one clause: `slope_drift does not help on held-out data (its gain is within the noise)`.
+    """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
 
     Args:
         refusals: reasons by id, at least one.
     """
     reasons = list(dict.fromkeys(refusals.values()))
     said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
-    verb = "does" if len(refusals) == 1 else "do"
-    return f"{', '.join(refusals)} {verb} not help on held-out data ({said})"
+    verb = "is" if len(refusals) == 1 else "are"
+    return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
 
 
 def measure_gain(problem: Problem, before: HeldOut, after: HeldOut, numbers: int = 1) -> Improvement:

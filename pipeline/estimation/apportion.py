@@ -317,8 +317,8 @@ class Moments:
     def sentence(self) -> str:
         """Sentence: the share of the time, and the spans with the largest shares."""
         return (
-            f"half of the {self.quantity} error that is left over {HORIZON_S:g} s arises in "
-            f"{format_share(self.time_share, 0)} of the time; its largest parts: "
+            f"half of the remaining squared {self.quantity} error over {HORIZON_S:g} s arises in "
+            f"{format_share(self.time_share, 0)} of the time; largest parts: "
             f"{enumerate_texts([_name_span(*span) for span in self.spans[:_SPANS]])}"
         )
 

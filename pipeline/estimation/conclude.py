@@ -199,8 +199,8 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     if nearest is None or not room > ABOVE_FLOOR or nearest.gain < _LEAST_LEAD:
         return ""
     return (
-        f"the remaining error is {room:.1f} times the noise floor; {nearest.effect.id} would take "
-        f"{format_share(nearest.gain)} of the held-out loss away, but is not significant"
+        f"the remaining error is {room:.1f} times the noise floor; {nearest.effect.id} would remove "
+        f"{format_share(nearest.gain)} of the held-out loss, but is not significant"
     )
 
 

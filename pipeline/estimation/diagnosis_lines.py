@@ -13,12 +13,21 @@ from pipeline.core import INPUT_WORDS, format_share, mark_finding
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.diagnosis import Diagnosis, Json, Named, RunDiagnosis, Value, format_numbers
+from pipeline.estimation.diagnosis import (
+    CAUSE,
+    Diagnosis,
+    Json,
+    Named,
+    RunDiagnosis,
+    Value,
+    format_numbers,
+)
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
     BREVITY,
     format_angle,
     format_enough,
+    format_errors,
     format_length,
     format_remaining_error,
 )
@@ -60,7 +69,7 @@ _UNOBSERVABLE_SHOWN = 8
 """Unobservable effects that are listed: more would fill a screen."""
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
-_CHANNELS = {"x": "forward motion", "y": "sideways motion", "w": "yaw rate"}
+_CHANNELS = {"x": "forward motion", "y": "lateral motion", "w": "yaw rate"}
 _VALUE = re.compile(r'^(\w+) = \{value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
 _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
 """Inputs of formulas in words."""
@@ -156,8 +165,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
     lines += _label("clocks", [_format_encoders(run)])
     lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
-    numbers = (f"{_number(run.ladder[0], key)} {unit}" for key, (_, unit) in ERRORS_OVER_2S.items())
-    lines += _label("error", [f"of the ideal model over {HORIZON_S:g} s     {'   '.join(numbers)}"])
+    lines += _label("error", [f"{format_errors(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"])
     lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
     lines += _label("when", [one.sentence for one in run.when])
     lines += _label("budget", [_format_budget(run)])
@@ -260,7 +268,7 @@ def format_unexplained(rest: Mapping[str, object], ladder: Sequence[Mapping[str,
     share = number_in(rest, "share")
     if holds_formula(ladder):
         part = "part" if share is None else format_share(share)
-        return f"a formula explains {part} of what the effects leave: {rest.get('where', '')}"
+        return f"a formula explains {part} of the residual beyond the effects: {rest.get('where', '')}"
     channel = "" if rest.get("formula") else f" {_CHANNELS.get(str(rest.get('channel')), 'motion')}"
     what = f"{'part' if share is None else format_share(share)} of the residual{channel}"
     return f"{what} has a structure that the model does not explain: {rest.get('where', '')}"
@@ -290,16 +298,18 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
     known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one and max(one.values()) < 1.0}
     if not known:
         return ""
-    explained = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
+    removed = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
     with_learned = " and ".join(format_share(one["with_learned"]) for one in known.values())
-    beyond = f"with a function learned from the data, which gives no cause, {with_learned}"
-    return f"the effects explain {' and '.join(explained)}; {beyond}"
+    beyond = f"with a function learned from the data, which names no cause, {with_learned}"
+    return f"above the noise floor the effects remove {' and '.join(removed)}; {beyond}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:
     """Possible causes of an effect, and effects that would change its values."""
     if effect.sentence != effect.motion:
-        yield effect.sentence
+        # The motion stands above, under `effects`.
+        cause = effect.sentence.removeprefix(effect.motion).removeprefix(CAUSE).removeprefix("; ")
+        yield f"{effect.id}: {cause}"
     for one in effect.unless:
         yield one.sentence
 
@@ -319,8 +329,8 @@ def _format_encoders(run: RunDiagnosis) -> str:
     """How late the encoders are in the fit, beyond what was corrected against the gyro before."""
     late = number_in(run.timing, "wheel_delay_s")
     corrected = any(one.get("id") == "wheels_delay" for one in run.findings)
-    beyond = ", beyond the delay that was corrected before" if corrected else ""
-    return f"the model takes the encoders as {late * 1e3:.0f} ms late{beyond}" if late else ""
+    beyond = " beyond the delay corrected before the fit" if corrected else ""
+    return f"estimated encoder delay {late * 1e3:.0f} ms{beyond}" if late else ""
 
 
 def _format_budget(run: RunDiagnosis) -> str:
@@ -330,7 +340,7 @@ def _format_budget(run: RunDiagnosis) -> str:
             parts = [
                 f"{CAUSE_NAMES.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.shares
             ]
-            signs = "; below zero: it makes slip larger" if any("-" in part for part in parts) else ""
+            signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
             return f"error budget by cause ({total}): {', '.join(parts)}{signs}"
     return ""
@@ -402,9 +412,9 @@ def _format_detectable(run: RunDiagnosis) -> str:
     usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
     sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
     shown = [
-        f"{one.id.replace('_', ' ')} {format_share(one.size)}"
+        f"{name_effect(one.id)} {format_share(one.size)}"
         if one.unit == "1"
-        else f"{one.id.replace('_', ' ')} {one.size:.2g} {one.unit}"
+        else f"{name_effect(one.id)} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
     return f"detection limits ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
@@ -425,8 +435,3 @@ def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> li
     folded = [f"   {len(further)} more{_FOLDED}"] if further else []
     parts = zip(FINDING_LABELS, ([*shown, *folded], further, notes), strict=True)
     return [row for label, part in parts for row in _label(label, part)]
-
-
-def _number(content: Mapping[str, Json], key: str) -> str:
-    value = number_in(content, key)
-    return "-" if value is None else f"{value:.3g}"

@@ -229,7 +229,7 @@ def _cut_commands(speed: Floats, turn: Floats) -> list[tuple[str, str, Flags]]:
         curve = (np.abs(turn) > share * max(sharp, _STANDING)) & (
             np.abs(speed) > share * max(fast, _STANDING)
         )
-        text = f"ideal yaw rate above {share * sharp:.2g} rad/s at more than {share * fast:.2g} m/s"
+        text = f"ideal yaw rate above {share * sharp:.2g} rad/s and ideal speed above {share * fast:.2g} m/s"
         regions.append(("command", text, curve))
     slow = (np.abs(speed) < 0.15 * max(fast, _STANDING)) & (np.abs(turn) > 0.25 * max(sharp, _STANDING))
     regions.append(("command", "turning on the spot", slow))
@@ -346,7 +346,7 @@ def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, obje
         seconds = extrapolate(curve, goal)
         minutes = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
         advice = f"{minutes} more minute{'s' * (minutes > 1)} of such driving for {_GOAL}"
-        advice = advice if minutes else "more of such driving does not narrow the interval"
+        advice = advice if minutes else "more such driving does not narrow the interval"
         sentences.append(text if is_brief else f"{text}; {advice}")
     if open_ones:
         sentences.append(f"{open_ones} parameter{'s' * (open_ones > 1)} undetermined")

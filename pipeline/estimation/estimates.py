@@ -135,7 +135,7 @@ class Unless:
     def doubt(self) -> str:
         """Why it is not reported itself."""
         evidence = math.floor(100.0 * self.evidence)
-        return f"{self.id} is not significant: it reaches {evidence} % of the required evidence and gain"
+        return f"{self.id} is not significant: it reaches {evidence} % of the significance threshold"
 
     @property
     def note(self) -> Mapping[str, Json]:
@@ -253,7 +253,7 @@ def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Jso
     empty = [explain_values(effect.id, values) for values in effect.tellings]
     if not all(empty):
         return None
-    return _note_insignificant(effect.id, f"{effect.id} is not named: {empty[0]}")
+    return _note_insignificant(effect.id, f"{effect.id} is not significant: {empty[0]}")
 
 
 def _note_insignificant(name: str, text: str) -> Mapping[str, Json]:

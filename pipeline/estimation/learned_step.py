@@ -235,7 +235,7 @@ def explain_no_help(before: HeldOut, after: HeldOut, stretches: Ints) -> str:
         )
         if compare_errors(one, other, stretches).high < 0.0:
             return ""
-    return "its gain is within chance"
+    return "the reduction is not significant"
 
 
 def _measure_horizon_errors(held_out: HeldOut) -> dict[str, object]:

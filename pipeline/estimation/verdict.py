@@ -160,7 +160,7 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     ]
     if open_groups:
         return [*sentences, f"The cause is {open_groups[0]}, which this log does not separate"]
-    return [*sentences, f"{_tell_small(diagnosis)}no known effect explains it"]
+    return [*sentences, f"{_tell_small(diagnosis)}no known effect explains the error"]
 
 
 def _tell_small(diagnosis: Content) -> str:

@@ -253,7 +253,7 @@ def inspect_log(path: Path, options: Options) -> Inspection:
     )
     choice, problem = _choose(index, configuration, options)
     notes = data.notes + tuple(
-        f"{count} messages of {topic} are byte-for-byte copies of others: each counts once"
+        f"{count} messages of {topic} are byte-for-byte copies of others: duplicates are ignored"
         for topic, count in data.repeated.items()
     )
     return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)
@@ -322,8 +322,8 @@ def find_run(text: str, store: Store) -> Manifest:
     manifests = survey.manifests
     if not manifests:
         unread = f"; {len(survey.errors)} cannot be read" if survey.errors else ""
-        gone = "" if store.root.exists() else ": there is no such folder"
-        what = f"there is no run {text!r}: no run has been analyzed yet{gone}{unread}"
+        gone = "" if store.root.exists() else " (the folder of results does not exist)"
+        what = f"{text!r} is neither a log nor a run: no run has been analyzed yet{gone}{unread}"
         raise JobError("no_such_run", what, where=str(store.root), hint=ANALYZE_FIRST)
     path = spell_location(Path(text).resolve())
     fitting = [
@@ -367,7 +367,7 @@ def find_recorded_log(manifest: Manifest, *, hint: str) -> Path:
     """
     log = locate_recorded(recorded_path(manifest))
     if not log.exists():
-        raise JobError("log_gone", "the log of this run is not there any more", where=str(log), hint=hint)
+        raise JobError("log_gone", "the log of this run no longer exists", where=str(log), hint=hint)
     return log
 
 
@@ -408,7 +408,7 @@ def agree_on_vehicle(model: Vehicle | None, runs: Mapping[str, Vehicle], owner: 
             )
             raise JobError("vehicle_contradiction", what, where=name, hint=hint)
     if differing := _list_differences(chosen, own):
-        what = f"the run is of a {_format(own, differing)}, the model of a {_format(chosen, differing)}"
+        what = f"the run is of a {_format(own, differing)}, the model is for a {_format(chosen, differing)}"
         hint = "Choose the geometry: --vehicle-of model, or --vehicle-of run."
         raise JobError("vehicle_contradiction", what, where=first, hint=hint)
     return chosen

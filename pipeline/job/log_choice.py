@@ -237,7 +237,7 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     witnesses = [*filter(None, [recognized]), *([Recognized(recorded, "metadata")] if recorded else [])]
     findings += list(islice(_list_contradictions(witnesses, vehicle, source), 1))
     if sources.command is None and sources.wheels is not None and sources.pose is not None:
-        text = "the log holds no command: it is analyzed from wheel encoders"
+        text = "the log contains no commands: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
@@ -328,7 +328,7 @@ def _leave_out_silent(
         if sources.command is None or not _is_silent(index, sources.command):
             return channels, sources, findings
         topic = sources.command.signals[0].topic
-        text = f"no text of {topic} is a command that can be read: the topic was left out"
+        text = f"no message of {topic} is a readable command: the topic was left out"
         findings.append(Finding("no_readable_text", "warning", text, where=topic))
         channels = [channel for channel in channels if channel.topic != topic]
 
@@ -367,14 +367,14 @@ def _list_contradictions(
     named = f"{vehicle.name} was given: check --vehicle"
     if source != "flag":
         where = "run.toml or the log's metadata"
-        named = f"{where} says {vehicle.name}, which is used: check [vehicle], or --vehicle"
+        named = f"{where} states {vehicle.name}, which is used: check [vehicle] or --vehicle"
     for one in witnesses:
         differing = list_contradictions(one.vehicle, vehicle)
         is_given = source in {"flag", "configuration", "metadata"} and source != one.source
         if is_given and differing and one.vehicle.sideways_preset != vehicle.id:
             text = (
-                f"the log looks like a {one.vehicle.name} (by its {one.source.replace('_', ' ')}: "
-                f"{', '.join(differing)}), but {named}"
+                f"the {one.source.replace('_', ' ')} of the log indicates a {one.vehicle.name} "
+                f"({', '.join(differing)}), but {named}"
             )
             yield Finding("vehicle_contradiction", "warning", text, where="vehicle")
 
@@ -440,11 +440,11 @@ def _fit_vehicle(
     if drive is None:
         name = "fitted_body"
         text = (
-            "no vehicle is given and none is needed: the drive is commanded and measured as body motion, "
+            "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
             "whose slip does not depend on wheel radius and track width"
         )
         if vehicle.kind == "omni":
-            text += " (it is asked to move sideways: as mecanum wheels their joints are read with --vehicle)"
+            text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
     else:
         asked = sources.command if drive is not sources.command else None
         measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
@@ -476,7 +476,7 @@ def _format_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[st
     """A name that depends only on the geometry, and the text of the finding."""
     if "wheelbase_m" in fitted:
         return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
-            "the log does not say which vehicle it is of: a wheelbase of "
+            "the log does not identify the vehicle: a wheelbase of "
             f"{fitted['wheelbase_m']:.3g} m was fitted; vehicle.wheelbase_m in run.toml gives the true one"
         )
     radius, track = fitted["wheel_radius_m"], fitted["track_width_m"]
@@ -489,10 +489,10 @@ def _format_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[st
     name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
     if by_controller:
         return f"fitted_{name}", (
-            "the log does not say which vehicle it is of: its controller turns commands into wheel speeds by "
-            f"a wheel radius of {radius:.3g} m and a track of {track:.3g} m, which were taken ({guess})"
+            "the log does not identify the vehicle: its controller turns commands into wheel speeds by "
+            f"a wheel radius of {radius:.3g} m and a track of {track:.3g} m, which are used ({guess})"
         )
     return f"fitted_{name}", (
-        f"the log does not say which vehicle it is of: a wheel radius of {radius:.3g} m and an effective "
-        f"track of {track:.3g} m were fitted, so that neither can be missing from the model ({guess})"
+        f"the log does not identify the vehicle: a wheel radius of {radius:.3g} m and an effective "
+        f"track of {track:.3g} m were fitted, so neither is reported as an effect ({guess})"
     )

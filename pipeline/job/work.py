@@ -262,7 +262,7 @@ class Work:
             Finding(
                 "repeated_messages",
                 "warning",
-                f"{count} messages of {topic} are byte-for-byte copies of others: each was counted once",
+                f"{count} messages of {topic} are byte-for-byte copies of others: duplicates were removed",
                 where=topic,
                 count=count,
             )

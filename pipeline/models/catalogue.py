@@ -301,7 +301,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
         if not is_of_one_run(effect.parameters):
             spread, unit = parameter.spread, suffix_unit(parameter.unit)
             texts.append(
-                f"standard deviation between runs on one ground {spread.size:.2g}{unit}: {spread.source}"
+                f"standard deviation between runs on one terrain {spread.size:.2g}{unit}: {spread.source}"
             )
         lines += [f"{'':<14}{text}" for text in texts]
     lines.append(f"observed by   {', '.join(need.value for need in effect.needs)}")
@@ -354,8 +354,8 @@ MANOEUVRES: Mapping[Excitation, str] = {
     Excitation.BOTH_SIGNS: "drive forward and backward, straight and in curves of both signs",
     Excitation.CHANGES: "change speed and turning in steps, every few seconds",
     Excitation.SLOPE: "drive on a slope in several directions (by hand: `slip plan` is for level ground)",
-    Excitation.LARGE: "ask for the largest speeds and turns",
-    Excitation.SMALL: "ask for very small speeds, and for very small turns while driving",
+    Excitation.LARGE: "command the largest speeds and yaw rates",
+    Excitation.SMALL: "command very small speeds, and very small yaw rates while driving",
     Excitation.LONG: "drive for ten minutes, the same manoeuvres at the start and at the end",
     Excitation.STEERING: "steer to both sides at several speeds",
     Excitation.SIDEWAYS: "drive sideways both ways, at several speeds",

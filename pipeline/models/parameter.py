@@ -55,7 +55,7 @@ class Quantity(enum.Enum):
     """
 
     RADIUS = ("effective over nominal wheel radius", "1", math.prod)
-    RADIUS_DIFFERENCE = ("right radius less left radius over their mean", "1", math.fsum)
+    RADIUS_DIFFERENCE = ("right minus left radius over their mean", "1", math.fsum)
     TRACK = ("effective over nominal track", "1", math.prod)
     WHEELBASE = ("effective over nominal wheelbase", "1", math.prod)
     COMMAND_DELAY = ("dead time of a command", "s", math.fsum)
@@ -63,14 +63,14 @@ class Quantity(enum.Enum):
     TURN_LAG = ("time constant of turning by the difference of wheel speeds", "s", math.fsum)
     STEERING_LAG = ("time constant of the steering angle", "s", math.fsum)
     STEERING_GAIN = ("steering angle over its command", "1", math.prod)
-    STEERING_OFFSET = ("steering angle, left positive, at which straight ahead is asked", "rad", math.fsum)
+    STEERING_OFFSET = ("steering angle at zero command, left positive", "rad", math.fsum)
     SPEED_LIMIT = ("largest commanded speed", "m/s", min)
     TURN_LIMIT = ("largest commanded yaw rate", "rad/s", min)
     WHEEL_SPEED_LIMIT = ("largest wheel speed", "rad/s", min)
     WHEEL_ACCELERATION_LIMIT = ("largest wheel acceleration", "rad/s^2", min)
-    ACCELERATION_LIMIT = ("largest change of the commanded speed", "m/s^2", min)
-    TURN_ACCELERATION_LIMIT = ("largest change of the yaw rate asked of the wheels", "rad/s^2", min)
-    DEADBAND = ("largest nominal speed at the rim for which a wheel stands still", "m/s", max)
+    ACCELERATION_LIMIT = ("largest rate of change of the commanded speed", "m/s^2", min)
+    TURN_ACCELERATION_LIMIT = ("largest rate of change of the commanded yaw rate", "rad/s^2", min)
+    DEADBAND = ("largest commanded rim speed at which a wheel stands still", "m/s", max)
 
     def __init__(self, about: str, unit: str, join: Joined) -> None:
         self.about = about
@@ -89,13 +89,13 @@ class TwinRole(enum.Enum):
     SPEED_LAG = "time constant of all driven wheels"
     SIDE_LAGS = "time constants of the left and of the right wheels"
     SPEED_GAIN = "wheel speed over its command"
-    SIDE_GAIN = "gain of the right wheels less that of the left ones"
+    SIDE_GAIN = "gain of the right wheels minus that of the left wheels"
     STEERING_LAG = "time constant of the steering"
     STEERING_GAIN = "steering angle over its command"
-    STEERING_OFFSET = "steering angle at which straight ahead is asked"
-    STEERING_MOUNT = "steering angle at which straight ahead is measured"
+    STEERING_OFFSET = "steering angle at zero command"
+    STEERING_MOUNT = "steering angle where the sensor reads zero"
     RADIUS = "effective over nominal wheel radius"
-    RADIUS_DIFFERENCE = "right radius less left radius over their mean"
+    RADIUS_DIFFERENCE = "right minus left radius over their mean"
     TRACK = "effective over nominal track"
     WHEELBASE = "effective over nominal wheelbase"
     CREEP = "time constant by which the body follows its wheels"
@@ -264,10 +264,10 @@ class Least:
         sampled: multiple of the delay caused by sampling the wheels that must be reached, too.
     """
 
-    STAMPS: ClassVar[str] = "stamps are off by as much"
-    MOUNTING: ClassVar[str] = "sensors are mounted no better"
-    DATA_SHEET: ClassVar[str] = "a data sheet allows as much"
-    GROUND: ClassVar[str] = "one ground varies by as much within a run"
+    STAMPS: ClassVar[str] = "stamps have errors of this size"
+    MOUNTING: ClassVar[str] = "mounting errors of sensors have this size"
+    DATA_SHEET: ClassVar[str] = "tolerance of data sheets"
+    GROUND: ClassVar[str] = "terrain varies by this much within a run"
 
     size: float
     reason: str

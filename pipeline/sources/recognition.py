@@ -285,7 +285,7 @@ def _compare(preset: Vehicle, source: VehicleSource, description: Description | 
         if known and said and abs(said / known - 1.0) > _DIFFERS:
             notes.append(
                 f"the robot description says {name} = {said:.4g}, the preset {preset.id} {known:g}: the "
-                f"preset counts; vehicle.{name} = {said:.4g} takes the other"
+                f"preset is used; vehicle.{name} = {said:.4g} uses the other"
             )
     return Recognized(preset, "robot_description", tuple(notes))
 
@@ -425,7 +425,7 @@ def apply_parameters(recognized: Recognized, controller: Controller) -> Recogniz
     notes = [
         f"the parameters of {controller.name} say {key} = {value:.4g}, "
         f"the {recognized.source.replace('_', ' ')} "
-        f"{getattr(recognized.vehicle, key):.4g}: the parameters count"
+        f"{getattr(recognized.vehicle, key):.4g}: the parameters are used"
         for key, value in geometry.items()
         if getattr(recognized.vehicle, key)
         and abs(value / getattr(recognized.vehicle, key) - 1.0) > _PARAMETER_DIFFERS

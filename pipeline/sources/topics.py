@@ -184,7 +184,7 @@ def choose_sources(
     held = [channel for channel in channels if channel.message_count != 0]
     chooser = _Chooser([channel for channel in held if channel.topic not in misnamed], vehicle, where)
     chooser.notes += [
-        f"{channel.topic} is left out: it holds {misnamed[channel.topic]}"
+        f"{channel.topic} is left out: it contains {misnamed[channel.topic]}"
         for channel in held
         if channel.topic in misnamed
     ]

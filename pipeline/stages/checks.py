@@ -82,7 +82,7 @@ def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
         moves = float(np.mean(np.abs(reference) > _LIVE))
         if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
             text = (
-                f"the {side} wheels' encoder says zero throughout while the {other} wheels turn and the "
+                f"the {side} wheels' encoder reads zero throughout while the {other} wheels turn and the "
                 f"{side} side moves: its encoder is dead (take --input command, or correct [wheels] {side})"
             )
             return [Finding("wheel_dead", "error", text, where=f"wheels {side}", value=moves)]
@@ -100,7 +100,7 @@ def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
         if related[wrong] < -_RELATED < _RELATED < related[1 - wrong] and related[wrong] < crossed[wrong]:
             text = (
                 f"the {side} wheels' encoder counts backward (correlation {related[wrong]:.2f} with that "
-                f"side, {related[1 - wrong]:.2f} on the other): turn its sign in the recorder or the robot "
+                f"side, {related[1 - wrong]:.2f} on the other): invert its sign in the recorder or the robot "
                 "description, or take --input command"
             )
             return [Finding("wheel_sign", "error", text, where=f"wheels {side}", value=related[wrong])]
@@ -168,7 +168,7 @@ def _report_sign(name: str, axes: list[str], value: float, *, body: bool) -> Fin
     also = " and left and right are exchanged" if axes == ["ahead"] else ""
     mend = mend.format("linear.x") if mend else f"sign = -1 under [{name}] in run.toml"
     text = (
-        f"{they} run backward where the vehicle drives ahead ({turned}): their sign is wrong{also} ({mend})"
+        f"{they} run backward while the vehicle drives forward ({turned}): their sign is wrong{also} ({mend})"
     )
     return Finding("wheel_sign", "error", text, where=name, value=value)
 
@@ -194,7 +194,7 @@ def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
     low = "left" if scale < 0.0 else "right"
     text = (
         f"the {low} wheels' encoder reads {format_share(1.0 - np.exp(-abs(scale)))} low against the other "
-        "side: the command asks for more there and the vehicle does not turn for it (another gear or "
+        "side: more is commanded there, and the vehicle does not turn accordingly (another gear or "
         "resolution?)"
     )
     return [Finding("wheel_scale", "warning", text, where=f"wheels {low}", value=float(np.exp(-abs(scale))))]
@@ -357,11 +357,11 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     # Sideways motion counts only without a forward command.
     covered = gains[0] or gains[1]
-    source = "the wheels turned" if ideal is samples.measured else "was commanded"
+    source = "turned by the wheels" if ideal is samples.measured else "commanded"
     driven = f"{path:.0f}" if path >= 10.0 else f"{path:.2g}"  # noqa: PLR2004 - two digits
     text = (
-        f"the vehicle does not move: of {driven} m that {source} it covered "
-        f"{format_share(covered, 0)}, within {net:.2g} m (wheels in the air, blocked, or stopped)"
+        f"the vehicle does not move: it covered {format_share(covered, 0)} of the {driven} m {source} and "
+        f"stayed within {net:.2g} m (wheels in the air, blocked, or stopped)"
     )
     return [Finding("not_moving", "error", text, value=covered)]
 
@@ -389,13 +389,13 @@ def check_limits(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         if share > 0.01:  # noqa: PLR2004 - a hundredth of the samples is no accident
             name, reached = "speed" if axis == 0 else "yaw rate", float(np.median(moved[beyond]))
             text = (
-                f"for {format_share(share)} of the time the command asks for more than the vehicle's largest "
-                f"{name} ({limit:g} {unit}): "
+                f"the commanded {name} exceeds the vehicle's limit ({limit:g} {unit}) for "
+                f"{format_share(share)} of the time: "
             )
             text += (
-                f"it then reaches {reached:.2g} {unit} in the median, so that this limit does not act"
+                f"the vehicle then reaches {reached:.2g} {unit} (median), so this limit does not act"
                 if reached > limit * 1.02
-                else "its controller may clip it"
+                else "the controller may clip it"
             )
             findings.append(
                 Finding("command_beyond_limit", "info", text, where=f"command {name}", value=share)

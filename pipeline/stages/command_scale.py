@@ -73,7 +73,7 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     multiplier = turning / forward * used
     track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
     text = (
-        f"in turns the wheels differ {turning / forward:.2f} times as much as the command asks "
+        f"in turns the difference of the wheels is {turning / forward:.2f} times the one commanded "
         f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
     )
     finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
@@ -88,11 +88,11 @@ def _explain_scale(samples: Samples, steps: Floats, forward: float, vehicle: Veh
     scales, other = (forward, forward), None
     text = f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded"
     if turning <= 0.0 or abs(np.log(turning / forward)) >= _SCALED:
-        text += f" and differ {turning:.2f} times as much in the median turn"
+        text += f", and in turns their difference is {turning:.2f} times the commanded one (median)"
         if not samples.body_commanded and turning > 0.0:
             scales, other = _find_geometry(scales, turning, vehicle)
         if other is None:
-            text += ", so that no single scale holds and slip from commands in turns depends on it"
+            text += ": no single scale fits, and slip from commands in turns depends on the scale"
     if other is None:
         text += (
             ": the recorded command is in another scale (another vehicle's wheel radius, a unit, or a gain "
@@ -100,11 +100,11 @@ def _explain_scale(samples: Samples, steps: Floats, forward: float, vehicle: Veh
         )
     else:
         text += (
-            f": the recorded command was made for wheels of {other.wheel_radius_m:g} m radius on a track of "
-            f"{other.track_width_m:g} m, as those of {other.name}; the mean of the sides is multiplied by "
+            f": the recorded command was made for a wheel radius of {other.wheel_radius_m:g} m and a track "
+            f"of {other.track_width_m:g} m, as of {other.name}; the mean of the sides is multiplied by "
             f"{scales[0]:.2f} and their difference by {scales[1]:.2f}"
         )
-    text += " before everything else, also for models and exports"
+    text += " before all other steps, also for models and exports"
     finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
     return CommandScale(*scales, vehicle.controller_track_multiplier, (finding,))
 

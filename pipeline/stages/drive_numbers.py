@@ -115,9 +115,9 @@ def _measure_speed(times: Floats, poses: pl.DataFrame) -> Floats:
 def _describe(source: PowerSource, current: Floats, per_metre: Floats) -> Finding:
     driven = per_metre[np.isfinite(per_metre)]
     median = float(np.median(driven)) if driven.size else None
-    text = f"the drive draws {np.nanmean(current):.1f} A in the mean"
+    text = f"the drive draws {np.nanmean(current):.1f} A on average"
     if median is not None:
-        text += f" and {median:.0f} J a metre in the median"
+        text += f" and {median:.0f} J/m (median)"
     elif not source.voltages:
         text += "; no voltage is recorded, so that its power is not known"
     return Finding("power_drawn", "info", f"{text} ({source.reason})", where=str(source), value=median)
@@ -236,10 +236,10 @@ def measure_timeout(times: Floats, speed: Floats, stamps: Floats, asked: Floats)
 def report_timeout(timeout: CommandTimeout, hold_s: float) -> Finding:
     """Report the timeout and how long commands are held."""
     said = f"{timeout.seconds:.2f} s ({timeout.low:.2f} to {timeout.high:.2f} s)"
-    held = "commands are held as long"
+    held = "commands are held for this time"
     if not timeout.low <= hold_s <= timeout.high and hold_s != timeout.seconds:
         held = f"command.hold_s = {hold_s:g} holds them {'longer' if hold_s > timeout.seconds else 'shorter'}"
-    text = f"the base begins to stop {said} after the last command, in {timeout.silences} silences: {held}"
+    text = f"the base begins to stop {said} after the last command (from {timeout.silences} pauses): {held}"
     return Finding(
         "command_timeout", "info", text, where="command", value=timeout.seconds, count=timeout.silences
     )
@@ -371,9 +371,8 @@ def mark_late_starts(
         return marked, []
     longest = float(steps.late[at].max())
     text = (
-        f"the drive followed the first command after a stop or gap late in {at.size} of "
-        f"{np.count_nonzero(steps.is_first)} starts that could be judged, by up to {longest:.2f} s: models "
-        "apply these commands from then on"
+        f"in {at.size} of {np.count_nonzero(steps.is_first)} starts after a stop or gap the drive followed "
+        f"its first command late, by up to {longest:.2f} s: models apply these commands with this delay"
     )
     return marked, [Finding("late_start", "warning", text, where="command", value=longest, count=at.size)]
 

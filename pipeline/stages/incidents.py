@@ -33,11 +33,11 @@ Kind = Literal[
 ]
 
 _MEANS: Mapping[Kind, str] = {
-    "emergency_stop": "the vehicle stood under live commands: an emergency stop, or a drive that was off",
-    "manual_driving": "the vehicle drove without a command: by joystick, or another controller",
-    "pushed": "the body moved while its wheels stood: it was pushed, carried or slid",
-    "commands_silent": "commands ceased to arrive and the vehicle stopped: a watchdog, or a lost connection",
-    "stuck": "the wheels turned and the body did not move: it was stuck, dug itself in, or was lifted",
+    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off",
+    "manual_driving": "the vehicle drove without a command: by joystick or another controller",
+    "pushed": "the body moved while its wheels stood still: it was pushed or carried, or slid",
+    "commands_silent": "commands stopped arriving and the vehicle stopped: a watchdog, or a lost connection",
+    "stuck": "the wheels turned and the body did not move: it was stuck, dug in, or was lifted",
     "localization_frozen": "the localization repeated one pose while the wheels turned: it was lost",
 }
 
@@ -182,9 +182,9 @@ def _report_expired(rims: Rims) -> tuple[Finding, ...]:
     stretches = _list_spans(rims.times, follows, 0.0)
     longest = max(float(rims.times[last] - rims.times[first]) for first, last in stretches)
     text = (
-        f"in {sum(lasting)} of {len(spans)} pauses the vehicle goes on as the last command asked, until the "
-        f"next one comes, for up to {longest:.1f} s after that is too old to count: the base keeps its last "
-        "command; set command.hold_s to the longest pause, and these stretches are compared, too"
+        f"in {sum(lasting)} of {len(spans)} pauses the vehicle continues its last command until the next, "
+        f"for up to {longest:.1f} s beyond command.hold_s: the base holds its last command; set "
+        "command.hold_s to the longest pause to include these stretches"
     )
     return (Finding("kept_command", "warning", text, where="command", value=longest, count=sum(lasting)),)
 

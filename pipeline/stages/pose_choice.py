@@ -85,7 +85,7 @@ class PoseRating:
         if self.refusal:
             return f"{self.source}: refused, {self.refusal}"
         frames = f"{self.parent or '?'} -> {self.child or '?'}"
-        share = f"{self.rate_hz:.3g} Hz new, {format_share(self.coverage)} of the time"
+        share = f"new poses at {self.rate_hz:.3g} Hz, {format_share(self.coverage)} of the time"
         return f"{self.source}: {frames}, {share}; {self.reason}"
 
 
@@ -155,7 +155,7 @@ def _rate(
         score, reasons = _score_satellites(pose, time, position, made.findings)
     if from_wheels:
         score -= 10.0
-        reasons = ["it is computed from the wheels"]
+        reasons = ["computed from the wheels"]
     elif share is not None:
         reasons.append(f"{format_share(share)} of its path differs from the wheels'")
     astray = _compare_with_gyro(time, yaw, made.tables["imu"])
@@ -306,7 +306,7 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
     notes = [note for note in sources.notes if not note.startswith("pose:")]
     notes += [
         f"pose: {best.format_line()}",
-        *(f"pose, not taken: {other.format_line()}" for other in ratings[1:]),
+        *(f"pose, not chosen: {other.format_line()}" for other in ratings[1:]),
     ]
     others = {
         **sources.others,

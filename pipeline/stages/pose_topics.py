@@ -242,7 +242,7 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
     period = float(np.median(np.diff(t[fresh]))) if fresh.size > 1 else 0.0
     if period * SLOW_HZ > 1.0:
         text = (
-            f"{topic} gives a new pose every {period:.2g} s: too slow for velocities, and much driving "
+            f"{topic} gives a new pose every {period:.2g} s: too slow for velocities, so that much driving "
             "cannot be compared; record a faster localization, or the transforms (/tf): the odometry in them "
             "fills the time between its poses"
         )

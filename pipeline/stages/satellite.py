@@ -185,8 +185,8 @@ def find_heading(
         course = replace(course, velocity=middle)
     yaw = _put_on_course(times, turned, course)
     text = (
-        f"the heading of {topic} is that of {turning.name}, put on the course over a minute: sideways motion "
-        "that lasts longer cannot be seen"
+        f"the heading of {topic} is that of {turning.name}, aligned with the course over a minute: lateral "
+        "motion that lasts longer is not observable"
     )
     silent = np.abs(turning.times[arrays.nearest_indices(times, turning.times)] - times) > arrays.SILENT_S
     yaw[silent] = np.nan
@@ -274,7 +274,7 @@ def _take_course(times: Floats, course: Course, topic: str) -> Heading:
     share = float(np.mean(~np.isfinite(yaw)))
     text = (
         f"the heading of {topic} is its course over ground, since nothing that turns with the vehicle was "
-        "recorded or agrees: sideways slip cannot be seen and reads zero"
+        "recorded or agrees: lateral slip is not observable and reads zero"
     )
     if share:
         text += (
@@ -405,7 +405,7 @@ def locate_vehicle(
             text = f"{beside.columns.topic} does not say how {topic} moves over ground: it was not used"
             findings.append(Finding("velocity_disagrees", "warning", text, where=beside.columns.topic))
     if ahead is None:
-        text = f"neither wheels nor a command say when the vehicle of {topic} drove backwards: it never did"
+        text = f"neither wheels nor commands show when the vehicle of {topic} reversed: forward is assumed"
         findings.append(Finding("direction_assumed", "warning", text, where=topic))
     heading = find_heading(times, course, [] if imu is None else list_turnings(imu), lever[:2], topic)
     headed = np.isfinite(heading.yaw)

@@ -367,7 +367,7 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
     if not lapsed.any():
         return []
     count = int(lapsed.sum())
-    text = f"in {count} time steps the last command is too old (command.hold_s holds it longer): left out"
+    text = f"in {count} time steps the last command is older than command.hold_s: left out"
     first = float(times[np.flatnonzero(lapsed)[0]])
     return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
 

@@ -376,8 +376,8 @@ def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
         return []
     begin = float(samples.times[np.flatnonzero(past)[0]])
     text = (
-        f"in {count} time steps the command says zero while the vehicle drives: the topic is stale, "
-        "or someone drives past it (restrict the run with [[interval]], or take the measured wheels)"
+        f"in {count} time steps the command is zero while the vehicle drives: the topic is stale, or the "
+        "vehicle is driven by other means (restrict the run with [[interval]], or use --input measured)"
     )
     return [Finding("stale_command", "warning", text, where="command", t_start=begin, count=count)]
 
@@ -438,8 +438,8 @@ def check_map_shape(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     text = (
         f"by the wheels, distances in the map are {format_share(stretched, 2)} ({low} to {high}) longer "
         f"along its heading of {angle:.0f} degrees than across: it is sheared or its axes have unequal "
-        "scales, or there is a slope that the poses do not show (a scale of the whole map is not told from "
-        "the wheels' radius)"
+        "scales, or there is a slope that the poses do not show (a scale of the whole map cannot be "
+        "separated from the wheel radius)"
     )
     return [Finding("map_uneven", "warning", text, where="pose", value=stretched, count=int(first.size))]
 

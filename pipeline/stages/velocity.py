@@ -89,8 +89,8 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     findings = []
     if fit.signed_scale < 0.0:
         text = (
-            "the gyro's yaw rate has the wrong sign: it was inverted, "
-            f"and then differs from that of the poses by {format_share(fit.residual)}"
+            "the gyro's yaw rate has the wrong sign and was inverted: it then differs from the yaw rate of "
+            f"the poses by {format_share(fit.residual)}"
         )
         findings.append(Finding("imu_sign", "warning", text, where="imu", value=fit.signed_scale))
     scale = abs(fit.signed_scale)
@@ -238,7 +238,7 @@ _JOINED_S = 1.0
 """Largest gap [s] between events of one kind that are merged."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
 _MEANS = {
-    "digging_in": "the vehicle moved less and less per turn of its wheels: it dug itself in",
+    "digging_in": "the vehicle moved less and less per turn of its wheels: it dug in",
     "spinning": "the wheels turned and the vehicle hardly moved: the wheels spun",
     "sliding": "the vehicle moved faster than its wheels turned: it slid",
 }

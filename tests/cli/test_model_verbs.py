@@ -116,7 +116,7 @@ def test_an_effect_that_is_no_help_is_refused_with_the_reason_and_taken_only_whe
         main(asked)
     (said,) = capsys.readouterr().err.splitlines()
     assert ended.value.code == 1
-    assert "slope_drift does not help on held-out data (" in said
+    assert "slope_drift is not supported by the data (" in said
     assert said.endswith("Choose another effect, or give --anyway.")
     assert model.read_bytes() == kept
     with pytest.raises(SystemExit) as ended:
@@ -135,7 +135,7 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
         main(["model", "add", str(model), *useless, "--on", RUN, "--out", str(results), "--quiet"])
     assert ended.value.code == 1
     said = capsys.readouterr().err
-    assert "do not help on held-out data (" in said
+    assert "are not supported by the data (" in said
     assert "--anyway" in said
     assert model.read_bytes() == kept
 

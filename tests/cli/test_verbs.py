@@ -226,10 +226,10 @@ def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> No
         (("compare", "folder"), "folder: this is not a results folder. Give the folder"),
         (
             ("diagnose", "no/such"),
-            "results: there is no run 'no/such': no run has been analyzed yet: there is no",
+            "results: 'no/such' is neither a log nor a run: no run has been analyzed yet (the folder",
         ),
         (("diagnose", "no/such", "--results", "empty"), "no run has been analyzed yet. Analyze logs first"),
-        (("export", "run", "--to", "csv"), "no run has been analyzed yet: there is no such folder. Analyze"),
+        (("export", "run", "--to", "csv"), "(the folder of results does not exist). Analyze"),
         *(
             ((*verb, "--results", "nowhere"), "nowhere: there are no results: there is no such folder. Give")
             for verb in (

@@ -196,7 +196,7 @@ def test_a_share_has_a_sign_with_a_reason_or_none(skidding: Diagnosis, share: fl
     )
     text = describe(Diagnosis((replace(run, budgets=budgets),)), everything=True)
     assert f"m/s): {budgets[0].shares[0].name} {shown}, " in text
-    assert ("below zero: it makes slip larger" in text) is (share == -0.1)
+    assert ("negative: the effect increases slip" in text) is (share == -0.1)
 
 
 def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:

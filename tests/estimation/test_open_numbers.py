@@ -38,7 +38,7 @@ def test_numbers_that_no_driving_determined_are_not_told() -> None:
     """The gentle run on grass said `limit 5 rad/s^2`, the value that the search starts from."""
     numbers = {"friction": 0.41, "creep": 0.2, "k": 1.69, "gyration": 1.0}
     motion, clause = put_in_words("contact_friction", numbers, ("k",))
-    assert motion == "Contact friction: track 1.69 times as wide"
+    assert motion == "Contact friction: effective track 1.69 times nominal"
     assert clause == "shows signs of contact friction"
     assert "0.41" in put_in_words("contact_friction", numbers, ("friction",))[1]
 

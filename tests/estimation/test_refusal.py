@@ -26,7 +26,7 @@ def test_what_is_clear_is_not_refused() -> None:
     [
         (Improvement(t=12.0, t_stable=9.0, gain=0.004), "less than 1 %"),
         (Improvement(t=3.0, t_stable=2.6, gain=0.05), "t = 3.0; 5 is needed"),
-        (Improvement(t=9.0, t_stable=0.5, gain=0.05), "within the noise"),
+        (Improvement(t=9.0, t_stable=0.5, gain=0.05), "not significant"),
     ],
     ids=["small", "uncertain", "of_one_event"],
 )
@@ -37,7 +37,7 @@ def test_a_gain_within_the_noise_is_refused(gain: Improvement, word: str) -> Non
 def test_an_interval_that_includes_doing_nothing_is_refused() -> None:
     track = find_effect("effective_track")(k=1.01)
     why = explain_refusal(track, {"effective_track.k": (0.98, 1.04)})
-    assert why == "the 95 % interval of k, 0.98 to 1.04, includes 1: no effect"
+    assert why == "the 95 % interval of k, 0.98 to 1.04, includes 1 (no effect)"
     # One number that is certain is enough.
     two = find_effect("side_lag")(tau_left=0.3, tau_right=0.01)
     certain = {"side_lag.tau_left": (0.25, 0.35), "side_lag.tau_right": (-0.01, 0.03)}
@@ -61,7 +61,7 @@ def test_a_degenerate_form_is_called_by_what_it_is() -> None:
     [
         ({"t_mrmse_m": 0.102, "r_mrmse_rad": 0.04}, "position error rises by 2 %"),
         (WORSE, "position error rises by 10 %, heading error by 20 %"),
-        ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than chance (1 %)"),
+        ({"t_mrmse_m": 0.0995, "r_mrmse_rad": 0.0499}, "no error over 2 s falls by more than 1 %"),
         (BETTER, None),
     ],
 )  # fmt: skip
@@ -73,6 +73,6 @@ def test_errors_that_rise_or_do_not_fall_speak_against_an_addition(
 
 def test_refusals_are_said_in_one_clause() -> None:
     one = "with these values it acts as drive_lag"
-    assert format_refusals({"side_lag": one}) == f"side_lag does not help on held-out data ({one})"
+    assert format_refusals({"side_lag": one}) == f"side_lag is not supported by the data ({one})"
     assert format_refusals({"side_lag": one, "turn_lag": one}).startswith("side_lag, turn_lag do not help")
     assert format_refusals({"side_lag": one, "turn_lag": "no"}).endswith(f"(side_lag: {one}; turn_lag: no)")

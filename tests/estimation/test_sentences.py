@@ -73,7 +73,7 @@ def test_causes_that_hold_alternatives_are_joined_by_commas() -> None:
         "yaw_misalignment", {"psi": Value(-0.03, -0.04, -0.02, "rad")}, 1.0, (), (), corrected=False,
         path="command", selected=1.0, motion="Yaw misalignment",
     )  # fmt: skip
-    assert "Cause: a misaligned sensor or a bent axle, or crabbing on this ground; a run" in named.sentence
+    assert "Cause: a misaligned sensor or a bent axle, or crabbing on this terrain; a run" in named.sentence
 
 
 @pytest.mark.parametrize(
@@ -220,7 +220,7 @@ def test_a_late_encoder_and_the_formula_of_the_model_are_said() -> None:
         run = RunDiagnosis("run", "command", ladder=ladder, unexplained=rest, timing=timing)
         texts = [text for _, text in list_lines(run)]
         assert f"{words}: v_y = a * v0, v0 the ideal forward speed" in texts
-        assert "the model takes the encoders as 334 ms late" in texts
+        assert "estimated encoder delay 334 ms" in texts
 
 
 def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_unexplained() -> None:
@@ -235,7 +235,7 @@ def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_
     run = RunDiagnosis("run", "measured", ladder=ladder, unexplained=rest, noise_floor=floor)
     texts = [text for _, text in list_lines(run)]
     assert "The lateral error depends on forward speed; with one effect and a fitted formula" in texts[0]
-    assert f"a formula explains 66 % of what the effects leave: {where}" in texts
+    assert f"a formula explains 66 % of the residual beyond the effects: {where}" in texts
     shown = "formula in the model: v_y = k_1 * v0 * v0, k_1 = 0.0819 s/m, v0 the ideal forward speed"
     assert shown in texts
     assert not any("does not explain" in text for text in texts)
@@ -243,7 +243,7 @@ def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_
     assert report.structure == {"formula": where, "unexplained": None}
     assert (
         "formula",
-        f"a formula explains 66 % of what the effects leave: {where}; formula in the model",
+        f"a formula explains 66 % of the residual beyond the effects: {where}; formula in the model",
     ) in [(label, text) for label, text, _ in _list_open(report)]
 
 
@@ -251,7 +251,7 @@ def test_a_formula_that_the_model_holds_is_said_with_its_numbers_and_not_called_
     ("position", "heading", "said"),
     [
         ((0.9, 0.95), (0.8, 0.82), "90 % of the position error and 80 % of the heading error"),
-        ((1.84, 1.85), (0.82, 0.84), "the effects explain 82 % of the heading error; "),
+        ((1.84, 1.85), (0.82, 0.84), "above the noise floor the effects remove 82 % of the heading error; "),
         ((1.2, 1.3), (1.1, 1.1), ""),
     ],
 )

@@ -100,6 +100,6 @@ def test_an_interval_that_includes_no_effect_in_every_run_is_reason_not_to_name_
     doubt = find_doubt(skew(unsure, unsure), {})
     assert doubt is not None
     assert doubt["id"] == "insignificant_effect"
-    assert "includes 0 s: no effect" in str(doubt["text"])
+    assert "includes 0 s (no effect)" in str(doubt["text"])
     assert find_doubt(skew(unsure, sure), {}) is None
     assert find_doubt(skew(Value(0.02, math.nan, math.nan, "s")), {}) is None

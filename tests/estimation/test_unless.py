@@ -104,7 +104,7 @@ def test_what_changes_no_other_number_is_a_finding(
     assert unless.note["id"] == "insignificant_effect"
     assert unless.note["where"] == "body_inertia"
     assert str(unless.note["text"]).startswith(
-        "body_inertia is not significant: it reaches 90 % of the required evidence and gain (tau = 0.0"
+        "body_inertia is not significant: it reaches 90 % of the significance threshold (tau = 0.0"
     )
     assert list(find_unless(judgement, (), nearly, ("body_inertia",))) == []
 

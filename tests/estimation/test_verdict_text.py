@@ -181,7 +181,8 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     nothing = check_verdict(draw_diagnosis({}, close))
     assert nothing.endswith(f"6 cm and 1.1 degrees off, at the noise floor. {NOTHING_MISSING}.")
     assert check_verdict(draw_diagnosis({}, far)).endswith(
-        "off, 10 times the noise floor in heading and 8 times in position. No known effect explains it."
+        "off, 10 times the noise floor in heading and 8 times in position. "
+        "No known effect explains the error."
     )
     half_known = draw_diagnosis({}, far, noise_floor={"t_mrmse_m": 0.05, "r_mrmse_rad": 0.0})
     assert "off, 8 times the noise floor in position. No known" in check_verdict(half_known)
@@ -219,7 +220,7 @@ def test_a_fitted_formula_is_part_of_the_model_and_no_effect() -> None:
 
 @pytest.mark.parametrize("name", ["not_moving", "pose_from_wheels", *FAULTS])
 def test_a_refusal_is_the_whole_verdict(name: str) -> None:
-    text = "the vehicle does not move: of 90 m that the wheels turned it covered 0.5 %"
+    text = "the vehicle does not move: it covered 0.5 % of the 90 m turned by the wheels"
     finding = {"id": name, "text": text, "severity": "error"}
     drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.5, 0.2)], findings=[finding])
     verdict = format_verdict(drawn)

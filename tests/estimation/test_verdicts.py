@@ -67,6 +67,6 @@ def test_an_effect_that_is_not_significant_is_told_where_the_error_is_far_above_
         whole=SimpleNamespace(errors=SimpleNamespace(t_mrmse_m=error)), floor=SimpleNamespace(t_mrmse_m=0.1)
     )
     lead = _find_lead(ways, judgement)  # type: ignore[arg-type]
-    assert ("lateral_skid would take 12 %" in lead) == is_told
+    assert ("lateral_skid would remove 12 %" in lead) == is_told
     assert bool(lead) == is_told
     assert _find_lead(ways, None) == ""  # type: ignore[arg-type]

@@ -314,4 +314,4 @@ def test_an_effect_whose_interval_includes_no_effect_is_a_finding_and_no_name(tm
     (run,) = diagnose_runs([recording], vehicle).runs
     assert {effect.id for effect in run.effects} == {"deadband", "effective_track", "icr_offset"}
     (said,) = [one["text"] for one in run.findings if one["id"] == "insignificant_effect"]
-    assert str(said).startswith("heading_skew is not named: the 95 % interval of d, ")
+    assert str(said).startswith("heading_skew is not significant: the 95 % interval of d, ")

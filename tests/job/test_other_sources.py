@@ -367,7 +367,7 @@ def test_a_receivers_velocity_is_no_command_and_a_fix_is_below_a_localization(tm
         ((ground_velocity("/gps/vel"), imu("/imu")), {"drive_lag", "effective_track", "lateral_skid"}),
         ((fix("/gps/fix"), ground_velocity("/gps/vel")), {"drive_lag", "effective_track"}),
     ],
-    ids=["fixes and a gyro", "velocities and a gyro", "no gyro: sideways slip cannot be seen"],
+    ids=["fixes and a gyro", "velocities and a gyro", "no gyro: lateral slip is not observable"],
 )
 def test_hidden_effects_are_named_by_satellites(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, topics: tuple[Published, ...], named: set[str]

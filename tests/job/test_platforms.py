@@ -235,7 +235,7 @@ def test_an_odometry_of_the_wheels_is_never_preferred_and_says_what_it_is(tmp_pa
     assert verdicts["/odom"].from_wheels
     assert not verdicts["/tf"].from_wheels
     assert "too slow" in verdicts["/amcl_pose"].reason
-    assert [note for note in chosen.sources.notes if note.startswith("pose, not taken: /odom")]
+    assert [note for note in chosen.sources.notes if note.startswith("pose, not chosen: /odom")]
 
 
 def test_a_field_of_one_of_several_structures_can_be_a_side(tmp_path: Path) -> None:

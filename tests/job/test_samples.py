@@ -93,7 +93,7 @@ def test_a_vehicle_that_the_metadata_of_the_log_contradict_is_warned_about(
         findings = analyze_log(samples / "husky_tile.mcap", options).summary["findings"]
         texts = [str(one["text"]) for one in findings if one["id"] == "vehicle_contradiction"]
         assert [text.partition(" (")[0] for text in texts] == (
-            [] if name == "husky_a200" else ["the log looks like a Clearpath Husky A200"]
+            [] if name == "husky_a200" else ["the metadata of the log indicates a Clearpath Husky A200"]
         )
 
 

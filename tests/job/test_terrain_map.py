@@ -109,10 +109,10 @@ def test_a_run_whose_log_has_gone_or_changed_is_not_placed_by_it(earth: Path, tm
     log.write_bytes((earth / "a.mcap").read_bytes())
     assert "another one" in read_beside(manifest).reason
     log.unlink()
-    assert "not there any more" in read_beside(manifest).reason
+    assert "no longer exists" in read_beside(manifest).reason
     drawn = draw_up_terrain(Store(tmp_path / "results"))
     (note,) = drawn.notes
-    assert note.startswith("not placed with other runs, the log of this run is not there any more")
+    assert note.startswith("not placed with other runs, the log of this run no longer exists")
     assert list(drawn.frames) == [f"run {manifest.run}"]
     assert drawn.cell_table["latitude"].null_count() == drawn.cell_table.height
 

@@ -142,4 +142,4 @@ def test_a_clause_of_two_numbers_is_none_with_one_of_them(name: str, values: dic
 
 def test_contact_without_a_bound_tells_no_coefficient() -> None:
     contact = find_effect("contact_friction")(k=1.75)
-    assert contact.describe_motion(HUSKY) == "Contact friction: track 1.75 times as wide"
+    assert contact.describe_motion(HUSKY) == "Contact friction: effective track 1.75 times nominal"

@@ -121,7 +121,7 @@ def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(
     whole = float(np.sum(size**2))
     assert share == pytest.approx(float(np.sum(size[(middle >= 20.0) & (middle < 24.0)] ** 2)) / whole)
     assert heading.time_share < 0.1
-    assert heading.sentence.endswith(f"its largest parts: 20 to 24 s ({100.0 * share:.0f} %)")
+    assert heading.sentence.endswith(f"largest parts: 20 to 24 s ({100.0 * share:.0f} %)")
 
 
 def test_intervals_of_a_ratio_hold_it_as_often_as_they_say() -> None:

@@ -146,7 +146,7 @@ def test_words_say_since_when_how_narrow_and_what_was_idle() -> None:
     assert "effective_track.k known to 5 % after 20 s of 100 s" in idle
     assert "last 80 % of the drive narrowed no interval by more than a tenth" in idle
     vague = format_enough([_name([0.9, 0.6, 0.3])])
-    assert "known to 0.3; more of such driving does not narrow the interval" in vague
+    assert "known to 0.3; more such driving does not narrow the interval" in vague
     # The least known is told; others may be known better, but not well.
     vaguer = format_enough([_name([0.9, 0.6, 0.3]), _name([0.9, 0.6, 0.5])])
     assert "known to 0.5 (1 more not known to 5 %)" in vaguer

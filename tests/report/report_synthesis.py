@@ -88,8 +88,8 @@ def make_diagnosis(names: dict[str, str]) -> dict[str, object]:
                 "quantity": "heading",
                 "time_share": 0.05,
                 "spans": [{"t_start": 12.0, "t_end": 16.0, "share": 0.3, "text": "12 to 16 s (30 %)"}],
-                "text": "half of the heading error that is left over 2 s arises in 5 % of the time; "
-                "its largest parts: 12 to 16 s (30 %)",
+                "text": "half of the remaining squared heading error over 2 s arises in 5 % of the time; "
+                "largest parts: 12 to 16 s (30 %)",
             }
         ],
         "unexplained": None,

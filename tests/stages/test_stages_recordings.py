@@ -129,7 +129,7 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(results: Path) -> None:
     # Made with the Warthog's wheels, the stored command is too small: the wheels turn faster than it says.
     assert found["value"] == pytest.approx(0.30 / 0.165, rel=1e-6)
     # In turns the wheels differ by half of what it says: its track, too, is the Warthog's.
-    assert "differ 0.53 times as much" in found["text"]
+    assert "their difference is 0.53 times the commanded one" in found["text"]
     assert "wheels of 0.3 m radius on a track of 1.08 m, as those of Clearpath Warthog" in found["text"]
 
 

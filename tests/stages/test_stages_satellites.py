@@ -90,7 +90,7 @@ def test_without_an_imu_the_course_is_the_heading_and_that_is_said(drive: TakeTh
     taken = drive(publishing(SKIDDING, fix("/gps/fix"), ground_velocity("/gps/vel")))
     said = taken.finding("heading_from_course")
     assert said.severity == "warning"
-    assert "sideways slip cannot be seen" in said.text
+    assert "lateral slip is not observable" in said.text
     # Two seconds at either end and some of the steps stand, and a standing vehicle has no course.
     assert said.value is not None
     assert 0.04 < said.value < 0.4

@@ -271,7 +271,7 @@ def test_trap_14_standing_under_live_commands_is_both(drive: TakeThrough) -> Non
     taken = drive(stopped)
     assert {"wheels_dead", "not_moving"} <= taken.warned()
     # Wheels that say zero have turned nothing.
-    assert " m that was commanded it covered 0 %, " in taken.finding("not_moving").text
+    assert "it covered 0 % of the " in taken.finding("not_moving").text
 
 
 @pytest.mark.parametrize(
@@ -301,7 +301,7 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
     assert speed.text.endswith("so that this limit does not act")
     clipped = drive(replace(FIELD, vehicle=eager, effects={"body_speed_limit": 1.0}))
     texts = {one.where: one.text for one in clipped.findings if one.id == "command_beyond_limit"}
-    assert texts["command speed"].endswith("its controller may clip it")
+    assert texts["command speed"].endswith("the controller may clip it")
     assert "command_beyond_limit" not in drive(FIELD).ids()
 
 

@@ -300,7 +300,7 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
         "(() => { document.querySelector('select.catalogue').value = 'wheel_radius';"
         " document.querySelector('.add-chosen').click(); })()"
     )
-    chrome.wait("document.getElementById('toast').textContent.includes('does not help on held-out data')")
+    chrome.wait("document.getElementById('toast').textContent.includes('is not supported by the data')")
     assert chrome.run("document.querySelectorAll('.card').length") == 0
     chrome.click("#toast .anyway")
     chrome.wait("document.querySelectorAll('.card').length === 1")

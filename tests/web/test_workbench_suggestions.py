@@ -160,7 +160,7 @@ def test_verb_page_and_json_give_one_reason_against_an_effect(
     said = workbench.refuse("/api/session", run=RUN, action="add", effect=effect)
     asked = run_verb(*add)
     assert (said["code"], asked.returncode) == ("no_help", 1)
-    clause = f"{effect} does not help on held-out data ("
+    clause = f"{effect} is not supported by the data ("
     assert asked.stderr.count(clause) == str(said["message"]).count(clause) == 1
     reason = str(said["message"]).partition(clause)[2].partition("): the model is unchanged")[0]
     assert f"{clause}{reason}): the model is unchanged" in asked.stderr

@@ -1,8 +1,8 @@
-"""Acceleration limit: wheels change their speed no faster than the drive can.
+"""Acceleration limit: the drive limits the acceleration of every wheel.
 
     abs(dOmega/dt) <= limit, each wheel
 
-limit [rad/s^2]. Ask for large steps of speed: small ones are reached at once and do not show it.
+limit [rad/s^2]. Command large steps of speed: small ones are reached at once and do not show it.
 
 Source: acceleration limits of a ros2_control diff_drive_controller; torque limit of the motor.
 """
@@ -17,7 +17,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class AccelerationLimit(DriveEffect):
-    """Acceleration limit: wheels change their speed no faster than the drive can."""
+    """Acceleration limit: the drive limits the acceleration of every wheel."""
 
     id = "acceleration_limit"
     rank = 10
@@ -36,7 +36,7 @@ class AccelerationLimit(DriveEffect):
         ),
     )
     motion = "Acceleration limit: {limit:.3g} rad/s^2 at every wheel"
-    clause = "changes the speed of its wheels by at most {rim:.2g} m/s^2"
+    clause = "accelerates its wheels by at most {rim:.2g} m/s^2 at the rim"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("drive_lag", "body_inertia")
     same_in_one_motion = ("body_acceleration_limit", "turn_acceleration_limit")

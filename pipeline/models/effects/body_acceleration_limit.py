@@ -1,8 +1,8 @@
-"""Body acceleration limit: a smoother ramps the speed that is asked of the vehicle, whatever its wheels do.
+"""Body acceleration limit: a velocity smoother limits the rate of change of the commanded speed.
 
     abs(dM/dt) <= limit,  M = r (Omega_r + Omega_l) / 2
 
-limit [m/s^2], 0.5 to 2.5 of the usual smoothers. Ask for large steps of speed while turning: straight ahead
+limit [m/s^2], 0.5 to 2.5 of the usual smoothers. Command large steps of speed while turning: straight ahead
 it is an acceleration limit of the wheels.
 
 Source: velocity smoothers of Nav2 and limits of a ros2_control diff_drive_controller, linear.x.
@@ -20,7 +20,7 @@ LEAST_RAMP_S = 0.08
 
 
 class BodyAccelerationLimit(DriveEffect):
-    """Body acceleration limit: a smoother ramps the speed that is asked of the vehicle."""
+    """Body acceleration limit: a velocity smoother limits the rate of change of the commanded speed."""
 
     id = "body_acceleration_limit"
     rank = 2
@@ -31,7 +31,7 @@ class BodyAccelerationLimit(DriveEffect):
             "m/s^2",
             (0.02, 50.0),
             INF,
-            "largest acceleration ahead",
+            "largest forward acceleration",
             1.0,
             starts=(0.4, 1.0, 2.5),
             step=1e-2,
@@ -40,7 +40,7 @@ class BodyAccelerationLimit(DriveEffect):
         ),
     )
     motion = "Body acceleration limit: {limit:.3g} m/s^2"
-    clause = "changes its speed by at most {limit:.2g} m/s^2"
+    clause = "accelerates by at most {limit:.2g} m/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE)
     confused_with = ("acceleration_limit", "wheel_servo", "drive_lag")
     same_in_one_motion = ("acceleration_limit",)

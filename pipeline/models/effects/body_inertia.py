@@ -1,4 +1,4 @@
-"""Body inertia: with little grip the body follows its wheels late and slides on in turns.
+"""Body inertia: with little grip the body follows its wheels with a lag and slides on in turns.
 
     dv_x/dt = (v0 - v_x)/tau + v_y*w,  dv_y/dt = -v_y/tau - v_x*w,  dw/dt = (w0 - w)/tau
 
@@ -21,11 +21,11 @@ from pipeline.models.parameter import Conditions, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 LEAST_LAG_S = 0.02
-"""Smallest lag of the body to report [s]: stamps are off by as much."""
+"""Smallest lag of the body to report [s]: stamps have errors of this size."""
 
 
 class BodyInertia(BodyEffect):
-    """Body inertia: with little grip the body follows its wheels late and slides on in turns."""
+    """Body inertia: with little grip the body follows its wheels with a lag and slides on in turns."""
 
     id = "body_inertia"
     twin = TwinRole.CREEP
@@ -41,11 +41,11 @@ class BodyInertia(BodyEffect):
         ),
     )
     motion = "Body inertia: time constant {tau:.2f} s from wheel speed to body speed"
-    clause = "follows its wheels with a time constant of {tau:.2g} s"
+    clause = "follows its wheel speeds with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)
-    equivalent_when = "never turning, or only turning on the spot"
+    equivalent_when = "if the run never turns, or only turns on the spot"
     late = Late.BODY
     python_state = ("slide_x", "slide_y", "slide_w")
     python = """

@@ -3,7 +3,7 @@
     tau * dOmega/dt = u - Omega, each wheel:  tau = tau_brake where Omega is slowed down, else tau_drive
 
 tau_drive, tau_brake [s]. A motor against a load speeds up slowly and is braked by it; one that coasts slows
-down slowly. What turns over is braked until it stands. Ask for steps up and down, of several heights.
+down slowly. What turns over is braked until it stands. Command steps up and down, of several heights.
 
 Source: hybrid speed response of a motor with a one-quadrant drive; Isermann, Mechatronic Systems, chapter 6.
 """
@@ -22,8 +22,8 @@ class BrakeLag(TwoLags):
     kinds = WHEELED
     apart, least_apart_s = 0.2, 0.04
     parameters = (
-        time_constant("tau_drive", "time constant of speeding up", 0.6, (0.5,)),
-        time_constant("tau_brake", "time constant of slowing down", 0.2, (0.2,)),
+        time_constant("tau_drive", "time constant while speeding up", 0.6, (0.5,)),
+        time_constant("tau_brake", "time constant while slowing down", 0.2, (0.2,)),
     )
     motion = "Brake lag: time constant {tau_drive:.2f} s speeding up, {tau_brake:.2f} s slowing down"
     clause = "speeds up and slows down with time constants of {tau_drive:.2g} s and {tau_brake:.2g} s"

@@ -1,4 +1,4 @@
-"""Clock offset: reported poses are stamped late, or early.
+"""Clock offset: reported poses are stamped too late or too early.
 
     reported pose(t) = pose(t - d)
 
@@ -16,7 +16,7 @@ from pipeline.run.signals import RunContext, Velocity
 
 
 class ClockOffset(ReportEffect):
-    """Clock offset: reported poses are stamped late, or early."""
+    """Clock offset: reported poses are stamped too late or too early."""
 
     id = "clock_offset"
     rank = 40
@@ -26,7 +26,7 @@ class ClockOffset(ReportEffect):
             "s",
             (-1.0, 1.0),
             0.0,
-            "how late poses are stamped",
+            "delay of the stamps of poses",
             -0.15,
             starts=(-0.3, -0.1, 0.1, 0.3),
             step=5e-3,
@@ -42,11 +42,11 @@ class ClockOffset(ReportEffect):
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "body_inertia")
     equivalent_to = ("transport_delay",)
-    equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+    equivalent_when = "if the input is the command and there are no encoders, no gyro and no other clock"
     late = Late.POSES
     readings = (
         Reading(Level.VEHICLE, "clock_offset", "a constant latency of the localization"),
-        Reading(Level.TERRAIN, "body_inertia", "inertia of the body on this ground"),
+        Reading(Level.TERRAIN, "body_inertia", "inertia of the body on this terrain"),
         Reading(Level.RUN, "clock_offset", "a clock that was reset"),
     )
 

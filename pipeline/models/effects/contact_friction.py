@@ -102,7 +102,7 @@ class ContactFriction(BodyEffect):
         {"friction": 0.11, "creep": 0.3, "k": 1.65, "gyration": 0.9},
         {"friction": 0.3, "creep": 0.5, "k": 2.5, "gyration": 1.8},
     )
-    motion = "Contact friction: coefficient {friction:.2g}, track {k:.3g} times as wide"
+    motion = "Contact friction: coefficient {friction:.2g}, effective track {k:.3g} times nominal"
     clause = "skids with a friction coefficient of {friction:.2g}"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")

@@ -1,4 +1,4 @@
-"""Difference gain: the wheels reach the same share of every commanded difference.
+"""Difference gain: the difference of the wheel speeds is a constant share of its command.
 
     D = Omega_r - Omega_l:  D = g * D
 
@@ -20,12 +20,12 @@ from pipeline.sources import Vehicle
 
 
 class DifferenceGain(DriveEffect):
-    """Difference gain: the wheels reach the same share of every commanded difference."""
+    """Difference gain: the difference of the wheel speeds is a constant share of its command."""
 
     id = "difference_gain"
     rank = 1
     kinds = SIDES
-    parameters = (replace(SHARE, about="reached over asked difference of the wheels", typical=0.7),)
+    parameters = (replace(SHARE, about="actual over commanded difference of the wheel speeds", typical=0.7),)
     motion = "Difference gain: the robot reaches {percent} of the commanded speed difference of its sides"
     needs = (Excitation.TURNING,)
     confused_with = ("effective_track", "turn_droop", "wheel_servo", "body_turn_limit")

@@ -1,4 +1,4 @@
-"""Drive gain: all wheels reach the same share of their commanded speed.
+"""Drive gain: all wheels reach a constant share of their commanded speed.
 
     Omega = g * u, each wheel
 
@@ -20,7 +20,7 @@ SHARE = Parameter(
     "1",
     (0.05, 3.0),
     1.0,
-    "reached over asked speed",
+    "actual over commanded wheel speed",
     0.9,
     least=Least(0.01, Least.DATA_SHEET),
     plausible=Plausible(
@@ -30,7 +30,7 @@ SHARE = Parameter(
 
 
 class DriveGain(DriveEffect):
-    """Drive gain: all wheels reach the same share of their commanded speed."""
+    """Drive gain: all wheels reach a constant share of their commanded speed."""
 
     id = "drive_gain"
     twin = TwinRole.SPEED_GAIN

@@ -1,4 +1,4 @@
-"""Drive lag: wheels approach the commanded speed like a first-order system.
+"""Drive lag: wheels follow the commanded speed like a first-order system.
 
     tau * dOmega/dt = u - Omega, each wheel
 
@@ -30,7 +30,7 @@ TIME_CONSTANT = Parameter(
 
 
 class DriveLag(DriveEffect):
-    """Drive lag: wheels approach the commanded speed like a first-order system."""
+    """Drive lag: wheels follow the commanded speed like a first-order system."""
 
     id = "drive_lag"
     twin = TwinRole.SPEED_LAG
@@ -49,7 +49,7 @@ class DriveLag(DriveEffect):
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
     equivalent_to = ("body_inertia",)
-    equivalent_when = "never turning, or only turning on the spot"
+    equivalent_when = "if the run never turns, or only turns on the spot"
     same_in_one_motion = ("turn_lag",)
     python_state = ("lag_left", "lag_right", "lag_sideways")
     python = """

@@ -1,4 +1,4 @@
-"""Effective wheelbase: a car turns for its steering as if its axles were further apart, or closer.
+"""Effective wheelbase: a car turns less, or more, than its wheelbase and steering angle predict.
 
     w0 = w0 / k    (l_eff = k l)
 
@@ -26,7 +26,7 @@ from pipeline.sources import Vehicle
 
 
 class EffectiveWheelbase(KinematicEffect):
-    """Effective wheelbase: a car turns for its steering as if its axles were further apart, or closer."""
+    """Effective wheelbase: a car turns less, or more, than its wheelbase and steering angle predict."""
 
     id = "effective_wheelbase"
     twin = TwinRole.WHEELBASE
@@ -50,7 +50,7 @@ class EffectiveWheelbase(KinematicEffect):
     python = "w0 = w0 / {k}"
     readings = (
         Reading(Level.VEHICLE, "geometry", "a wrong wheelbase"),
-        Reading(Level.TERRAIN, "effective_wheelbase", "tyres that give way"),
+        Reading(Level.TERRAIN, "effective_wheelbase", "deforming tyres"),
         Reading(Level.RUN, "effective_wheelbase", "a change of tyre pressure or load"),
     )
 

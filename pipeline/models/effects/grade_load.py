@@ -1,6 +1,6 @@
-"""Grade load: on a slope the wheels turn slower than asked uphill and faster downhill.
+"""Grade load: on a slope the wheels turn slower than commanded uphill and faster downhill.
 
-    Omega = u + k/r * sin(pitch), each wheel that is asked to turn
+    Omega = u + k/r * sin(pitch), each wheel that is commanded to turn
 
 pitch > 0 is nose down. k [m/s]: 0.6 takes 0.1 m/s of any speed on a slope of 10 degrees. It is the load
 torque over the gain of the speed controller, so that a controller with an integral part shows it for moments
@@ -23,7 +23,7 @@ _LEAST_SLOPE_RAD = math.radians(1.5)
 
 
 class GradeLoad(DriveEffect):
-    """Grade load: on a slope the wheels turn slower than asked uphill and faster downhill."""
+    """Grade load: on a slope the wheels turn slower than commanded uphill and faster downhill."""
 
     id = "grade_load"
     rank = 15
@@ -34,7 +34,7 @@ class GradeLoad(DriveEffect):
             "m/s",
             (-5.0, 5.0),
             0.0,
-            "speed that the load of a vertical slope would take",
+            "speed lost at a slope of 90 degrees (k sin(slope))",
             0.6,
             plausible=Plausible(-0.1, 4.0, "a tenth of the largest speed lost on 10 degrees, up to 5 m/s"),
             one_sign=True,

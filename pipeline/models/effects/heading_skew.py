@@ -29,7 +29,7 @@ class HeadingSkew(ReportEffect):
             "s",
             (-0.6, 0.6),
             0.0,
-            "age of the heading against the position",
+            "delay of the heading relative to the position",
             0.1,
             step=1e-3,
             least=Least(LEAST_DELAY_S, Least.STAMPS),
@@ -45,7 +45,7 @@ class HeadingSkew(ReportEffect):
     late = Late.HEADING
     readings = (
         Reading(Level.VEHICLE, "heading_skew", "a recorder that stamps headings late"),
-        Reading(Level.TERRAIN, "lateral_skid", "lateral skid on this ground"),
+        Reading(Level.TERRAIN, "lateral_skid", "lateral skid on this terrain"),
         Reading(Level.RUN, "heading_skew", "a clock that was reset"),
     )
 

@@ -1,4 +1,4 @@
-"""Lateral ICR offset: turning drags the vehicle forward or backward, as with a load hung to one side.
+"""Lateral ICR offset: turning drags the vehicle forward or backward, as with a load on one side.
 
     v_x += y_icr * w
 
@@ -15,7 +15,7 @@ from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class IcrLateral(LinearEffect):
-    """Lateral ICR offset: turning drags the vehicle forward or backward, as with a load hung to one side."""
+    """Lateral ICR offset: turning drags the vehicle forward or backward, as with a load on one side."""
 
     id = "icr_lateral"
     twin = TwinRole.CENTRE_ASIDE
@@ -38,7 +38,7 @@ class IcrLateral(LinearEffect):
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)
     equivalent_to = ("lever_arm",)
-    equivalent_when = "always: a pose of a point l_y = -y_icr to the left moves alike"
+    equivalent_when = "always: a pose measured at l_y = -y_icr moves in the same way"
     python = "v_x = v_x + {y_icr} * v_w"
 
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:

@@ -56,7 +56,7 @@ class IcrOffset(LinearEffect):
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)
-    equivalent_when = "always: a pose of a point l_x = -x_icr ahead moves alike"
+    equivalent_when = "always: a pose measured at l_x = -x_icr moves in the same way"
     python = "v_y = v_y - {x_icr} * v_w"
 
     def is_outside(self, vehicle: Vehicle) -> bool:

@@ -1,4 +1,4 @@
-"""Lateral scale: rollers give away a share of the sideways motion, whatever its speed.
+"""Lateral scale: rollers lose a constant share of the sideways motion.
 
     s0 = k * s0
 
@@ -17,7 +17,7 @@ from pipeline.run.signals import Rolling, RunContext
 
 
 class LateralScale(KinematicEffect):
-    """Lateral scale: rollers give away a share of the sideways motion, whatever its speed."""
+    """Lateral scale: rollers lose a constant share of the sideways motion."""
 
     id = "lateral_scale"
     rank = 25

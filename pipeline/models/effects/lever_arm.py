@@ -27,7 +27,7 @@ class LeverArm(LinearEffect):
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "wheel_asymmetry")
     equivalent_to = ("icr_offset", "icr_lateral")
-    equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves alike"
+    equivalent_when = "always: a centre of rotation at (-l_x, -l_y) moves in the same way"
     parts = (Part("l_x", "icr_offset", "x_icr", -1.0), Part("l_y", "icr_lateral", "y_icr", -1.0))
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:

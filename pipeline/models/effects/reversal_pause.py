@@ -25,7 +25,7 @@ class ReversalPause(DriveEffect):
             "s",
             (0.0, 3.0),
             0.0,
-            "how long a wheel stands before it reverses",
+            "time at standstill before a wheel reverses",
             0.4,
             starts=(0.15, 0.5),
             step=1e-2,

@@ -37,7 +37,7 @@ class SideGain(DriveEffect):
             "1",
             (-0.5, 0.5),
             0.0,
-            "right gain less left gain over their mean",
+            "right minus left gain over their mean",
             0.05,
             least=Least(0.005, Least.DATA_SHEET),
             plausible=Plausible(-0.3, 0.3, "a larger difference is a fault of one motor"),

@@ -27,7 +27,7 @@ class SlopeDrift(LinearEffect):
             "m/s",
             (-3.0, 3.0),
             0.0,
-            "downhill speed on a vertical slope",
+            "downhill speed at a slope of 90 degrees (k sin(slope))",
             0.6,
             plausible=Plausible(-0.1, 2.5, "wider than the 0.4 to 0.8 m/s that were seen"),
             one_sign=True,

@@ -1,4 +1,4 @@
-"""Track at speed: a skid-steered vehicle turns more for its wheels, or less, the faster it drives.
+"""Track at speed: the effective track of a skid-steered vehicle changes with its speed.
 
     v_w += k * abs(v0) * w0
 
@@ -18,7 +18,7 @@ from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
 class SpeedTrack(LinearEffect):
-    """Track at speed: a skid-steered vehicle turns more for its wheels, or less, the faster it drives."""
+    """Track at speed: the effective track of a skid-steered vehicle changes with its speed."""
 
     id = "speed_track"
     kinds = SIDES

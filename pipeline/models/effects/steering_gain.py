@@ -1,4 +1,4 @@
-"""Steering gain: the wheels steer by a constant multiple of what is asked.
+"""Steering gain: the steering angle is a constant multiple of its command.
 
     delta = g * delta
 
@@ -15,7 +15,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringGain(DriveEffect):
-    """Steering gain: the wheels steer by a constant multiple of what is asked."""
+    """Steering gain: the steering angle is a constant multiple of its command."""
 
     id = "steering_gain"
     twin = TwinRole.STEERING_GAIN
@@ -27,7 +27,7 @@ class SteeringGain(DriveEffect):
             "1",
             (0.05, 5.0),
             1.0,
-            "steered over asked angle",
+            "actual over commanded steering angle",
             0.85,
             least=Least(0.01, Least.DATA_SHEET),
             plausible=Plausible(0.5, 1.5, "wider than the 0.85 of a worn linkage"),

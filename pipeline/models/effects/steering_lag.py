@@ -1,4 +1,4 @@
-"""Steering lag: the steering angle approaches what is asked like a first-order system.
+"""Steering lag: the steering angle follows its command like a first-order system.
 
     tau * ddelta/dt = u_delta - delta
 
@@ -17,7 +17,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringLag(DriveEffect):
-    """Steering lag: the steering angle approaches what is asked like a first-order system."""
+    """Steering lag: the steering angle follows its command like a first-order system."""
 
     id = "steering_lag"
     twin = TwinRole.STEERING_LAG

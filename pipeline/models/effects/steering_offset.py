@@ -1,4 +1,4 @@
-"""Steering offset: the wheels are off centre when straight ahead is asked.
+"""Steering offset: the steering angle is not zero at zero command.
 
     delta = delta + o
 
@@ -15,7 +15,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class SteeringOffset(DriveEffect):
-    """Steering offset: the wheels are off centre when straight ahead is asked."""
+    """Steering offset: the steering angle is not zero at zero command."""
 
     id = "steering_offset"
     twin = TwinRole.STEERING_OFFSET
@@ -27,7 +27,7 @@ class SteeringOffset(DriveEffect):
             "rad",
             (-0.5, 0.5),
             0.0,
-            "angle at which straight ahead is asked",
+            "steering angle at zero command",
             0.04,
             least=Least(0.002, Least.DATA_SHEET),
             quantities=(Quantity.STEERING_OFFSET,),
@@ -38,7 +38,7 @@ class SteeringOffset(DriveEffect):
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)
-    equivalent_when = "only the command and the body motion are used"
+    equivalent_when = "if only commands and body motion are used"
     python = "steering = steering + {o}"
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:

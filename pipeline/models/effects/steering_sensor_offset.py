@@ -1,4 +1,4 @@
-"""Steering sensor offset: the tyres are off centre when the steering sensor reads straight ahead.
+"""Steering sensor offset: the steering angle is not zero where its sensor reads zero.
 
     w0 += v0 * (tan(delta + o) - tan(delta)) / l
 
@@ -20,7 +20,7 @@ from pipeline.run.signals import Rolling, RunContext
 
 
 class SteeringSensorOffset(KinematicEffect):
-    """Steering sensor offset: the tyres are off centre when the steering sensor reads straight ahead."""
+    """Steering sensor offset: the steering angle is not zero where its sensor reads zero."""
 
     id = "steering_sensor_offset"
     twin = TwinRole.STEERING_MOUNT
@@ -28,12 +28,10 @@ class SteeringSensorOffset(KinematicEffect):
     rank = 0
     kinds = ACKERMANN
     parameters = (
-        replace(
-            SteeringOffset.parameters[0], about="steering of the tyres less that of the sensor", typical=0.02
-        ),
+        replace(SteeringOffset.parameters[0], about="true minus measured steering angle", typical=0.02),
     )
-    motion = "Steering sensor offset: the tyres stand {degrees:.2g} degrees to the {way} of its reading"
-    clause = "the tyres stand {degrees:.2g} degrees to the {way} of the steering sensor's reading"
+    motion = "Steering sensor offset: the tyres are {degrees:.2g} degrees to the {way} of its reading"
+    clause = "the tyres are {degrees:.2g} degrees to the {way} of the steering sensor's reading"
     needs, confused_with = SteeringOffset.needs, SteeringOffset.confused_with
     equivalent_to = ("steering_offset",)
     equivalent_when = SteeringOffset.equivalent_when

@@ -1,4 +1,4 @@
-"""Terrain change: after a time, or past a position, the ground takes another share of the motion.
+"""Terrain change: from a time or position on, speed and yaw rate change by constant factors.
 
     v0 = k_v * v0,  w0 = k_w * w0    where t >= at_s, or where x > at_x when at_x is given
 
@@ -33,16 +33,16 @@ _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
 
 
 class TerrainChange(KinematicEffect):
-    """Terrain change: after a time, or past a position, the ground takes another share of the motion."""
+    """Terrain change: from a time or position on, speed and yaw rate change by constant factors."""
 
     id = "terrain_change"
     rank = 60
     parameters = (
         Parameter(
-            "k_v", "1", (0.05, 3.0), 1.0, "share of speed beyond", 0.85, least=_LEAST, plausible=_PLAUSIBLE
+            "k_v", "1", (0.05, 3.0), 1.0, "speed factor after it", 0.85, least=_LEAST, plausible=_PLAUSIBLE
         ),
         Parameter(
-            "k_w", "1", (0.05, 3.0), 1.0, "share of turning beyond", 0.75, least=_LEAST, plausible=_PLAUSIBLE
+            "k_w", "1", (0.05, 3.0), 1.0, "yaw rate factor after it", 0.75, least=_LEAST, plausible=_PLAUSIBLE
         ),
         Parameter(
             "at_s",

@@ -1,10 +1,10 @@
-"""Torque limit: wheels approach the commanded speed with a lag, and no faster than their motors can.
+"""Torque limit: wheels follow the commanded speed with a lag and a limited acceleration.
 
     dOmega/dt = (u - Omega) / tau within +-limit, each wheel
 
 tau [s] and limit [rad/s^2]. After a small step the wheels follow like a drive lag; after a large one the
-motors give all they have, and the lag begins where limit tau is left. A ramp that is asked of the drive is
-another thing: there the lag follows the ramp. Ask for small and large steps of speed.
+motors give all they have, and the lag begins where limit tau is left. A ramp that is commanded to the drive is
+another thing: there the lag follows the ramp. Command small and large steps of speed.
 
 Source: saturation of a speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """
@@ -30,7 +30,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class TorqueLimit(DriveEffect):
-    """Torque limit: wheels approach the commanded speed with a lag, and no faster than their motors can."""
+    """Torque limit: wheels follow the commanded speed with a lag and a limited acceleration."""
 
     id = "torque_limit"
     rank = 22

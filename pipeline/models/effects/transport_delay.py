@@ -1,4 +1,4 @@
-"""Transport delay: the wheels do what was asked a moment ago.
+"""Transport delay: the wheels follow their command after a dead time.
 
     Omega(t) = u(t - d)
 
@@ -16,7 +16,7 @@ from pipeline.run.signals import Commands, RunContext
 
 
 class TransportDelay(CommandEffect):
-    """Transport delay: the wheels do what was asked a moment ago."""
+    """Transport delay: the wheels follow their command after a dead time."""
 
     id = "transport_delay"
     twin = TwinRole.DELAY
@@ -27,7 +27,7 @@ class TransportDelay(CommandEffect):
             "s",
             (0.0, 1.0),
             0.0,
-            "age of the command that acts",
+            "dead time from command to wheels",
             0.2,
             starts=(0.05, 0.15, 0.3, 0.5),
             step=5e-3,
@@ -38,11 +38,11 @@ class TransportDelay(CommandEffect):
         ),
     )
     motion = "Transport delay: dead time {d:.2f} s"
-    clause = "reacts {d:.2g} s after each command"
+    clause = "follows commands after a dead time of {d:.2g} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)
-    equivalent_when = "the input is the command and there are neither encoders, gyro nor another clock"
+    equivalent_when = "if the input is the command and there are no encoders, no gyro and no other clock"
 
     python = ""  # the exported function reads commands with this delay
 

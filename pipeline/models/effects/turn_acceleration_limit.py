@@ -1,9 +1,9 @@
-"""Turn acceleration limit: a smoother ramps the yaw rate that is asked of the vehicle.
+"""Turn acceleration limit: a velocity smoother limits the rate of change of the commanded yaw rate.
 
     abs(dD/dt) <= limit,  D = r (Omega_r - Omega_l) / b
 
 limit [rad/s^2], 1 to 4 of the usual smoothers, of the yaw rate that the wheels would give without skidding.
-Ask for large steps of the turn while driving: on the spot it is an acceleration limit of the wheels.
+Command large steps of the turn while driving: on the spot it is an acceleration limit of the wheels.
 
 Source: velocity smoothers of Nav2 and limits of a ros2_control diff_drive_controller, angular.z.
 """
@@ -18,7 +18,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class TurnAccelerationLimit(DriveEffect):
-    """Turn acceleration limit: a smoother ramps the yaw rate that is asked of the vehicle."""
+    """Turn acceleration limit: a velocity smoother limits the rate of change of the commanded yaw rate."""
 
     id = "turn_acceleration_limit"
     rank = 3
@@ -29,7 +29,7 @@ class TurnAccelerationLimit(DriveEffect):
             "rad/s^2",
             (0.02, 100.0),
             INF,
-            "largest acceleration of the turn",
+            "largest yaw acceleration",
             2.0,
             starts=(0.8, 2.0, 5.0),
             step=1e-2,
@@ -38,7 +38,7 @@ class TurnAccelerationLimit(DriveEffect):
         ),
     )
     motion = "Turn acceleration limit: {size:.3g} rad/s^2"
-    clause = "changes its yaw rate by at most {size:.3g} rad/s^2"
+    clause = "accelerates its yaw rate by at most {size:.3g} rad/s^2"
     needs = (Excitation.CHANGES, Excitation.LARGE, Excitation.TURNING)
     confused_with = ("acceleration_limit", "wheel_servo", "turn_lag")
     same_in_one_motion = ("acceleration_limit",)

@@ -37,7 +37,7 @@ class TurnDroop(DriveEffect):
             "rad/s",
             (0.0, 200.0),
             NAN,
-            "wheel difference from which it falls short",
+            "wheel speed difference above which it falls short",
             1.5,
             starts=(0.5, 1.5, 4.0, 10.0),
             step=1e-2,
@@ -47,14 +47,14 @@ class TurnDroop(DriveEffect):
             "1",
             (0.0, 1.5),
             1.0,
-            "share of the excess that is reached",
+            "share of the excess difference that is reached",
             0.4,
             least=Least(0.03, Least.DATA_SHEET),
             plausible=Plausible(0.0, 0.97, "with all of it reached nothing droops"),
         ),
     )
-    motion = "Turn droop: gain {gain:.2f} beyond {threshold:.2g} rad/s between the wheels"
-    clause = "turns with a gain of {gain:.2f} beyond {rim:.2g} m/s of difference between its sides"
+    motion = "Turn droop: gain {gain:.2f} beyond a wheel speed difference of {threshold:.2g} rad/s"
+    clause = "turns with a gain of {gain:.2f} beyond a difference of {rim:.2g} m/s between its sides"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("effective_track", "difference_gain", "wheel_speed_limit", "body_turn_limit")
     contains = ("effective_track", "difference_gain")

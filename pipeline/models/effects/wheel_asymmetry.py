@@ -38,7 +38,7 @@ class WheelAsymmetry(KinematicEffect):
             "1",
             (-0.5, 0.5),
             0.0,
-            "right radius less left radius over their mean",
+            "right minus left radius over their mean",
             0.04,
             least=Least(0.003, Least.DATA_SHEET),
             plausible=Plausible(-0.2, 0.2, "wider than the 8 % of one soft side"),

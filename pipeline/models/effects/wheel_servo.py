@@ -1,4 +1,4 @@
-"""Wheel servo: a speed controller on each side drives its wheels against the friction of the ground.
+"""Wheel servo: the speed controller of each side works against ground friction.
 
     each side at u = r Omega [m/s], commanded u_c, e = u_c - u; the body at v and w, a = b/2
     0.7 tau du/dt = 1.7 (p - drag sign(u)) - 2 F,  p = clip(e + z, +-bound - bound u / no_load),
@@ -64,7 +64,7 @@ _NO_COMMAND = 1e-6
 
 
 class WheelServo(DriveEffect):
-    """Wheel servo: a speed controller on each side drives its wheels against the friction of the ground."""
+    """Wheel servo: the speed controller of each side works against ground friction."""
 
     id = "wheel_servo"
     rank = 31
@@ -163,8 +163,8 @@ class WheelServo(DriveEffect):
         {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "no_load": 5.0, "scrub": 0.2, "creep": 0.3},
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
-    motion = "Wheel servo: the speed controllers of the sides yield to the friction of the ground"
-    clause = "is slowed by the friction of the ground, with a time constant of {tau:.2g} s"
+    motion = "Wheel servo: ground friction slows the wheels below their commanded speed"
+    clause = "turns its wheels slower than commanded against ground friction"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
     contains = ("deadband", "drive_lag", "turn_lag")

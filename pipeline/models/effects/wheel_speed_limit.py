@@ -1,4 +1,4 @@
-"""Wheel speed limit: a wheel turns no faster than its motor can.
+"""Wheel speed limit: the speed of every wheel is limited.
 
     Omega = clip(Omega, -limit, limit), each wheel
 
@@ -16,7 +16,7 @@ from pipeline.run.signals import RunContext, Wheels
 
 
 class WheelSpeedLimit(DriveEffect):
-    """Wheel speed limit: a wheel turns no faster than its motor can."""
+    """Wheel speed limit: the speed of every wheel is limited."""
 
     id = "wheel_speed_limit"
     twin = TwinRole.WHEEL_LIMIT

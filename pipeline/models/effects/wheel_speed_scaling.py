@@ -1,9 +1,9 @@
-"""Wheel speed scaling: all wheels are slowed alike where one would turn too fast.
+"""Wheel speed scaling: all wheels are slowed by one factor where one would exceed its limit.
 
     Omega = u * min(1, limit / fastest), each wheel; fastest = max(abs(u)) of all wheels
 
 limit [rad/s], 6 on a Husky. It keeps the radius of a curve; where each wheel is clipped alone, which is a
-wheel speed limit, a fast curve becomes a wider one. Ask for curves that are too fast for the outer wheels.
+wheel speed limit, a fast curve becomes a wider one. Command curves that are too fast for the outer wheels.
 
 Source: desaturation of wheel speeds in WPILib, `DifferentialDriveKinematics`; measured on a Husky on snow.
 """
@@ -22,14 +22,14 @@ _LEAST_SPEED = 1e-9
 
 
 class WheelSpeedScaling(DriveEffect):
-    """Wheel speed scaling: all wheels are slowed alike where one would turn too fast."""
+    """Wheel speed scaling: all wheels are slowed by one factor where one would exceed its limit."""
 
     id = "wheel_speed_scaling"
     rank = 4
     kinds = ("differential", "mecanum")
     parameters = WheelSpeedLimit.parameters
-    motion = "Wheel speed scaling: all wheels are slowed alike beyond {limit:.3g} rad/s"
-    clause = "slows all its wheels alike where one would turn faster than {rim:.2g} m/s at the rim"
+    motion = "Wheel speed scaling: all wheels are slowed by one factor where one exceeds {limit:.3g} rad/s"
+    clause = "slows all wheels by one factor where one exceeds {rim:.2g} m/s at the rim"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "body_speed_limit", "body_turn_limit")
     same_in_one_motion = ("wheel_speed_limit",)

@@ -27,7 +27,7 @@ class YawMisalignment(ReportEffect):
             "rad",
             (-0.8, 0.8),
             0.0,
-            "reported less true heading",
+            "reported minus true heading",
             0.05,
             least=Least(0.003, Least.MOUNTING),
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
@@ -39,7 +39,7 @@ class YawMisalignment(ReportEffect):
     confused_with = ("lateral_drift",)
     readings = (
         Reading(Level.VEHICLE, "yaw_misalignment", "a misaligned sensor or a bent axle"),
-        Reading(Level.TERRAIN, "crabbing", "crabbing on this ground"),
+        Reading(Level.TERRAIN, "crabbing", "crabbing on this terrain"),
         Reading(Level.RUN, "yaw_misalignment", "a remounted sensor"),
     )
 
