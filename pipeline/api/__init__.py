@@ -94,7 +94,7 @@ def analyze(
         results: folder of results.
         settings: what a `run.toml` would say, for example ``{"vehicle": {"preset": "husky_a200"}}``.
         report: write `report.html`.
-        diagnosis: name what is missing from the model.
+        diagnosis: identify the effects that the model lacks.
         force: compute again what is there.
     """
     options = Options(

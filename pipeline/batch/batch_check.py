@@ -19,7 +19,7 @@ from pipeline.store.verification import DiskFiles, Examination, Problem
 
 _UNSEALED = "without the right key its integrity cannot be checked"
 _LEFT = {
-    "left_out": "look at who made it, and remove it",
+    "left_out": "find out who made it, and remove it",
     "not_sealed": _UNSEALED,
     "other_key": _UNSEALED,
     KEY_MARK: _UNSEALED,
@@ -132,7 +132,7 @@ class _Repairer:
         if codes == {"not_listed"}:
             self._target.put_on_list(f"{home}/{MANIFEST}")
             return Repair(
-                subject=subject, action="listed", what="all its files are whole; it is on the list as it is"
+                subject=subject, action="listed", what="all its files are intact; it is on the list unchanged"
             )
         remains = _explain_remains(codes)
         if remains:
@@ -177,8 +177,8 @@ def _explain_remains(codes: set[str]) -> str:
     if not codes <= {"old_generation", "not_listed", "extra_file"}:
         return ""
     if "extra_file" in codes:
-        return "all that was written is whole; remove the files that were not written with it"
-    return "the current results are whole; remove old ones with `slip batch --prune --keep 0`"
+        return "all that was written is intact; remove the files that were not written with it"
+    return "the current results are intact; remove old ones with `slip batch --prune --keep 0`"
 
 
 _NOT_FOLLOWED = "remote_not_followed"

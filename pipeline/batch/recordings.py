@@ -98,7 +98,7 @@ class Looker:
                 path, f"it does not answer within {self.patience_s:g} s: is it on a mount that is gone?"
             )
         except OSError as error:
-            self.skip(path, f"it cannot be looked at ({error.strerror or error})")
+            self.skip(path, f"it cannot be read ({error.strerror or error})")
         return None
 
     def skip(self, path: Path, reason: str) -> None:
@@ -318,7 +318,7 @@ def _find_in(target: str, looker: Looker) -> Iterator[Path]:
     elif real is not None and looker.ask(real, real.exists):
         looker.skip(real, "it is a pipe, a socket or a device, not a file")
     elif len(looker.skipped) == before:
-        hint = "Check the path; quote a glob so that the shell leaves it alone"
+        hint = "Check the path; quote a glob so that the shell does not expand it"
         raise BatchError("logs_not_found", "there is no such file or folder", where=target, hint=hint)
 
 

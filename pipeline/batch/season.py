@@ -178,7 +178,7 @@ def _make_entry(item: Item, blame: Blame, kills: int) -> Entry:
         run=item.run,
         code=blame.code,
         reason=f"{blame.reason}; {kills} times" if quarantined else blame.reason,
-        hint="It is left alone until it changes; try it again with --retry-quarantined"
+        hint="It is skipped until it changes; --retry-quarantined tries it again"
         if quarantined
         else "Run the same command again",
         kills=kills,
@@ -445,6 +445,6 @@ def _make_line_of(entry: Entry, state: str, report: Report | None = None) -> Lin
 
 def _list_remaining(result: Result) -> list[Line]:
     return [
-        Line(path=item.log.path, run=item.run, state="left", reason="not begun: see the errors of the others")
+        Line(path=item.log.path, run=item.run, state="left", reason="not started: see the other errors")
         for item in result.remaining
     ]

@@ -29,7 +29,7 @@ from pipeline.core import SlipError, keep_current_folder_out, read_version, sile
 HELP = """How far was the motion from the ideal model, and why?
 
 Reads MCAP logs of field robots, computes slip per time step, and writes tables, a summary and a report.
-A name that begins with a dash goes behind --, after all options.
+Write names that begin with a dash after --, behind all options.
 """
 _GROUPS = {
     "Analyze a run": {

@@ -135,7 +135,7 @@ def summarize_error(path: str, error: SlipError) -> dict[str, str]:
 def format_state(state: str) -> str:
     """What a log came out as, in words."""
     words = {"lossy": "with losses", "copy": "copies", "growing": "being written"}
-    return {**words, "left": "not begun", "skipped": "left out"}.get(state, state)
+    return {**words, "left": "not started", "skipped": "left out"}.get(state, state)
 
 
 def format_value(value: object) -> str:

@@ -102,7 +102,7 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
 
     text = draft_effect(file)
     if file.exists() and not force:
-        what, hint = "the file is there already", "Give --force to replace it."
+        what, hint = "the file already exists", "Give --force to replace it."
         raise MotionError("effect_exists", what, where=str(file), hint=hint)
     write_text(file, text, code="effect_unwritable")
     if not quiet:
@@ -121,7 +121,7 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
 def trust(files: list[Path], /, *, json: bool = False) -> int:
     """Trust the Python that model files name, by its content.
 
-    It is run from now on, whatever its path. Read it first: it can do whatever you can. A changed file must
+    It is run from now on, whatever its path. Read it first: it runs with all your rights. A changed file must
     be trusted anew.
 
     Args:
@@ -307,9 +307,9 @@ def forecast_runs(
     if len(terrains) > 1:
         raise MotionError(
             "several_terrains",
-            f"the runs are on {', '.join(terrains)}, and a prior applies to one ground",
+            f"the runs are on {', '.join(terrains)}, and a prior applies to one terrain",
             where=", ".join(run.name for run in runs),
-            hint="Fit the runs of each ground alone.",
+            hint="Fit the runs of each terrain separately.",
         )
     without = [run.sha256 for run in runs]
     return forecast_deployment(Store(out), vehicle.id, terrains[0], source, without=without)
@@ -372,7 +372,7 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
     `slip model new FILE --from NAME` makes a model file of it.
 
     Args:
-        name: of a model.
+        name: a model of the literature.
         json: print one JSON object.
     """
     from pipeline.models.literature import MODELS, find_model  # noqa: PLC0415 - heavy

@@ -107,7 +107,7 @@ def _print_csv(answer: pl.DataFrame) -> None:
     except pl.exceptions.PolarsError as error:
         said = str(error).splitlines()[0]
         raise SlipError(
-            "no_csv", f"the answer cannot be CSV: {said}", hint="Use --to json, or ask for plain columns"
+            "no_csv", f"the answer cannot be written as CSV: {said}", hint="Use --to json, or plain columns"
         ) from error
 
 

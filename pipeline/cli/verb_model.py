@@ -104,7 +104,7 @@ def new(
 
     if model.exists() and not force:
         raise MotionError(
-            "model_exists", "the file is there already", where=str(model), hint="Give --force to replace it."
+            "model_exists", "the file already exists", where=str(model), hint="Give --force to replace it."
         )
     chosen = resolve_vehicle(VehicleSection(preset=vehicle), recorded=None, where=str(model))
     made = find_model(template or "ideal").make(chosen)
@@ -203,10 +203,10 @@ def fit(  # noqa: D417 - the shared options document themselves
     With --predict, other runs are predicted with them.
 
     Args:
-        model: the model file, which is written over: copy it to keep it. With --prior it may be missing, or
+        model: the model file, which is overwritten: copy it to keep it. With --prior it may be missing, or
             be left out: the model then uses the fleet's prior.
         predict: logs or runs that the fit must not see, to be predicted with it.
-        afresh: discard the present values and search anew.
+        afresh: discard the present values and search from the start.
         first: fit the first seconds of driving only, for example 20s.
         prior: fleet: use the other runs of the vehicle in the results folder as a prior.
     """
@@ -228,8 +228,8 @@ def compare(  # noqa: D417 - the shared options document themselves
 ) -> int:
     """Compare two models, with their present values, on runs.
 
-    A fit of each to the runs is shown as well. With --against, models of the literature, or learned ones, and
-    those given are all fitted to the runs; their errors on data that a fit has not seen stand side by side.
+    A fit of each to the runs is shown as well. With --against, the given models
+    and models of the literature, or learned ones, are fitted to the runs, and their held-out errors compared.
 
     Args:
         model: a model file; with --against it may be left out.
@@ -257,7 +257,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     own_runs: list[str] = []
     for path, (file, runs) in zip(paths, files, strict=True):
         own = {str(row.get("run")) for row in file.list_fitted("runs")} & {run.name for run in runs}
-        seen = "the error of its values there is not held out"
+        seen = "its error there is not a held-out error"
         own_runs += [f"{path} was fitted to {name}: {seen}" for name in sorted(own)]
         held += check_bands(file.model, runs, chosen.source, file.per_run) or [{}] * len(runs)
         carried = carry_over(file.model, runs, chosen.source, fitted_on=_terrains(file), per_run=file.per_run)
@@ -292,7 +292,7 @@ def export(  # noqa: D417 - the options document themselves
     ] = None,
     on: Annotated[
         list[str] | None,
-        Parameter(help="robot_localization: logs or runs whose held-out errors count", consume_multiple=True),
+        Parameter(help="robot_localization: logs or runs for the held-out errors", consume_multiple=True),
     ] = None,
     results: Results = Path("results"),
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
@@ -300,7 +300,7 @@ def export(  # noqa: D417 - the options document themselves
 ) -> int:
     """Export a model to what people run.
 
-    Each line says which effect it came from.
+    Each line names the effect that it comes from.
 
     Args:
         model: the model file.
@@ -451,9 +451,9 @@ def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
     lines = list(format_heads("held-out error of"))
     for name, item in rows:
         lines.append(format_measured_errors(f"{item.run}: ideal", item.ideal.pooled))
-        lines.append(format_measured_errors(f"  {Path(name).name} as it is", item.carried.pooled))
+        lines.append(format_measured_errors(f"  {Path(name).name} as given", item.carried.pooled))
         lines.append(format_measured_errors("  refitted to this run", item.own.pooled))
-        lines.append(f"  error of the given model over that of its fit: {item.ratio:.2f}")
+        lines.append(f"  error as given over error refitted: {item.ratio:.2f}")
     return lines
 
 

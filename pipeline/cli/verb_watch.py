@@ -41,7 +41,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
     quiet_for: Annotated[
-        PositiveFloat, Parameter(name="--for", help="end after so many seconds without new data")
+        PositiveFloat, Parameter(name="--for", help="end after this many seconds without new data")
     ] = _QUIET_S,
     page: Annotated[
         Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
@@ -211,7 +211,7 @@ def _format_knowledge(knowledge: Content) -> list[tuple[str, str]]:
         for one in cast("Sequence[Sequence[str]]", knowledge.get("undecided") or [])
     ]
     if knowledge.get("enough"):
-        return [*rows, ("enough", "all missing effects are known to 5 %: no more driving is needed")]
+        return [*rows, ("enough", "all effects are known to 5 %: no more driving is needed")]
     if knowledge.get("data"):
         rows.append(("data", str(knowledge["data"])))
     rows += [("drive", one) for one in cast("Sequence[str]", knowledge.get("drive") or [])]

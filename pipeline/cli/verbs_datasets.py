@@ -45,11 +45,11 @@ def compare(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Compare datasets: medians, intervals, tests, effect sizes.
 
-    Tests count runs.
+    The unit of the tests is the run.
     Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
 
     Args:
-        as_published: compare window norms of the published chain in place of median moduli.
+        as_published: compare 2 s window norms, as published, in place of median slip speeds.
         causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
             causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
@@ -346,7 +346,7 @@ def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet:
     write_features(merged, path)
     runs = merged["sha256"].n_unique()
     content = {"file": str(path), "runs": runs, "rows": merged.height, "twice": twice}
-    line = f"{path}: {runs} runs, {merged.height} rows, {twice} stood twice"
+    line = f"{path}: {runs} runs, {merged.height} rows, {twice} duplicates"
     return print_result(content, lambda: [line], json=json, quiet=quiet)
 
 
@@ -364,8 +364,8 @@ def share(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Write features of every run to a file that can be shared.
 
-    It holds no data, no names of files, no places.
-    `slip fleet map merge` puts such files together, `slip fleet map --shared` draws them.
+    The file contains no raw data, no file names and no places.
+    `slip fleet map merge` merges such files, `slip fleet map --shared` draws them.
 
     Args:
         json: print one JSON object.

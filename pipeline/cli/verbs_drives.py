@@ -74,24 +74,24 @@ def plan(  # noqa: D417 - the runs document themselves
 ) -> int:
     """Plan a drive that decides the open questions of a diagnosis.
 
-    A robot can play it.
+    The plan is an MCAP file that a robot can play.
 
     Args:
-        vehicle: vehicle preset; without any log the plan looks for all of its effects.
+        vehicle: vehicle preset; without logs the plan covers all effects of that vehicle.
         terrain: terrain to drive on; the plan starts from the prediction of the runs of --known.
         known: results folder with diagnosed runs of the vehicle (default: --results).
         wanted: what to decide; by default what is undecided, and in the time left all that is open.
         time: longest duration, for example 60s or 2min.
-        area: free ground: length along the heading at the start, and width; the start is its middle.
-        max_speed: [m/s].
-        max_yaw_rate: [rad/s].
-        max_acceleration: [m/s^2].
-        topic: on which the commands will be played (default: as the run recorded them).
+        area: free area: length along the initial heading, and width; the start is in its middle.
+        max_speed: highest speed [m/s].
+        max_yaw_rate: highest yaw rate [rad/s].
+        max_acceleration: highest acceleration [m/s^2].
+        topic: topic of the commands (default: the recorded one).
         type_name: message type of that topic.
-        check: plan.toml, or the plan's folder, to compare with the log that came of it.
+        check: plan.toml, or the plan's folder, to compare with the log of the drive.
         compare: other drives whose times are shown beside the plan's, for example
             drive,human,straight_and_circle,eights.
-        seed: of the draws from the known distribution.
+        seed: seed of the random draws.
         config: configuration file of the logs.
         folder: folder of the plan, to write.
         json: print one JSON object.
@@ -300,14 +300,14 @@ def format_plan(
 
     if not made.manoeuvres and not made.impossible:
         what = "" if diagnosis is None else ": all effects are decided, and more driving narrows no interval"
-        return [f"no question is open{what}"]
+        return [f"no open question{what}"]
     lines = []
     for one in made.promises:
         how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.format_rest():
         lines.append(f"then         {rest}")
-    lines += [f"not decided  {text}" for text in made.list_impossible()]
+    lines += [f"undecided    {text}" for text in made.list_impossible()]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
     most = f"limits       {made.limits.format(steered=made.steered)}"
     if not made.manoeuvres:

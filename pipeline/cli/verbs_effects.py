@@ -63,7 +63,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Name what is missing from the model of a vehicle.
+    """Identify the physical effects that the model of a vehicle lacks.
 
     From one run, or from several of one vehicle jointly.
 
@@ -232,7 +232,7 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
         keep_diagnosis(results, manifest, {**run.to_json(), LINES: list_lines(run)})
     except OSError as error:
         if not quiet:
-            print_note(f"slip: the diagnosis is not kept: {error}")
+            print_note(f"slip: the diagnosis was not saved: {error}")
 
 
 def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
@@ -308,7 +308,7 @@ def effects(  # noqa: D417 - the arguments document themselves
 ) -> int:
     """List the physical effects, or print one's page.
 
-    The page has formula, parameters, source, what it is confused with, and what shows it.
+    The page has formula, parameters, source, similar effects, and the driving that shows it.
 
     Args:
         json: print one JSON object.
@@ -364,13 +364,13 @@ def export(  # noqa: D417 - the results folder documents itself
 ) -> int:
     """Export a run as a log, as CSV, or as layouts for viewers.
 
-    The log opens beside the original one.
+    The log can be opened together with the original one.
 
     Args:
         run: name of a run, or its log.
         to: what to write.
-        file: where; by default beside you, named after the run (a folder for csv).
-        model: a model file whose velocity and predicted path are exported too (default: what was diagnosed).
+        file: output file (csv: folder); by default in the current folder, named after the run.
+        model: a model file whose velocity and predicted path are exported too (default: the diagnosed model).
         input: input of the model (default: the command where there is one).
         frame: fixed frame of the log's poses.
         trust_code: trust the Python that the model file names, now and later.

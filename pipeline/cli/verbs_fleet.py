@@ -390,7 +390,7 @@ def trend(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"),
     *,
     by: Annotated[
-        str, Parameter(help="whose slip and health: dataset, vehicle, terrain, or several of them")
+        str, Parameter(help="groups for slip and health: dataset, vehicle, terrain, or several of them")
     ] = "dataset",
     threshold: Annotated[
         NonNegativeFloat, Parameter(help="relative change of slip that raises an alert")

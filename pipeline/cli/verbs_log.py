@@ -63,7 +63,7 @@ def analyze(  # noqa: D417 - the shared choices document themselves
     """Analyze logs: slip per time step, its causes, a summary, a report.
 
     Args:
-        diagnosis: name what is missing from the model.
+        diagnosis: identify the effects that the model lacks.
         report: write report.html.
         model: a model file to compute slip relative to as well.
         trust_code: trust the Python that the model file names, now and later.
@@ -162,7 +162,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Show topics, rates, gaps, clocks and damage of a log.
 
-    Says which topics would serve, and why; or why the log cannot be analyzed.
+    Shows which topics are used, and why; or why the log cannot be analyzed.
 
     Args:
         json: print one JSON object.
@@ -363,7 +363,7 @@ def simulate(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Write a log with known physics, or replay one through a twin.
 
-    The truth stays out of the log that is written.
+    The log does not contain the true values.
 
     Args:
         file: the log to write (run.mcap).

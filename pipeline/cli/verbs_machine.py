@@ -59,7 +59,7 @@ _EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
 
 def build_batch() -> App:
     """The command, which brings results up to date by itself, and its own commands."""
-    app = App(name="batch", help="Bring the results up to date with a season of logs.")
+    app = App(name="batch", help="Analyze the new and changed logs of a folder.")
     app.default(run)
     app.command(run)
     app.command(schedule)
@@ -90,7 +90,7 @@ def run(  # noqa: D417 - the shared choices document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Bring the results up to date with a season of logs.
+    """Analyze the new and changed logs of a folder.
 
     The same command again continues.
 
@@ -99,7 +99,7 @@ def run(  # noqa: D417 - the shared choices document themselves
         executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
         shard: i/n, the i-th of n machines that share the logs.
         reports: write report.html for every log.
-        diagnosis: name what is missing from the model for every log, which takes longer.
+        diagnosis: identify the effects that the model lacks in every log, which takes longer.
         force: compute again what is already there.
         retry_quarantined: try logs again that killed their workers.
         timeout: longest time for one log [s].
@@ -211,7 +211,7 @@ def schedule(  # noqa: D417 - arguments document themselves
 ) -> int:
     """Print units that run `slip batch` every night.
 
-    One at a time, caught up after downtime, in the journal.
+    Runs never overlap, are made up after downtime, and log to the journal.
 
     Args:
         print: for systemd (a service and its timer) or cron.
@@ -458,4 +458,4 @@ def _look_at_clock() -> Check:
         except (OSError, ValueError, LookupError):
             hint = "Set TZ to a name such as Europe/Berlin, or unset it"
             return Check("time zone", "problem", f"TZ={named} is not known, times are shown in UTC", hint)
-    return Check("time zone", "ok", f"{zone}; results hold UTC")
+    return Check("time zone", "ok", f"{zone}; results are in UTC")

@@ -69,7 +69,7 @@ def query(  # noqa: D417 - arguments document themselves
     memory: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json")] = False,
 ) -> int:
-    """Answer SQL over the tables of all runs.
+    """Query the tables of all runs with SQL.
 
     Tables are slip, windows, aggregates, datasets, ..., and `runs` with one row a run.
 
@@ -180,7 +180,7 @@ def status(  # noqa: D417 - arguments document themselves
     *,
     json: bool = False,
 ) -> int:
-    """Show what batches made of the logs, and the size of the results.
+    """Show the state of the logs of all batches, and the size of the results.
 
     Args:
         json: print one JSON object.
@@ -249,7 +249,7 @@ def verify(  # noqa: D417 - arguments document themselves
         follow_remote: also read remote logs (s3://) whose address is known from the results alone.
         sample: read only a random share of files and logs, for example 5%, and the entries of all runs.
         seed: seed of the sample (default: another one every day).
-        repair: list what can be recomputed, and have the next batch over its log recompute it.
+        repair: mark what can be recomputed, for the next batch over its log.
         json: print one JSON object.
         quiet: print nothing.
     """

@@ -284,7 +284,7 @@ def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirE
         except (FileNotFoundError, NotADirectoryError):
             return None
         except OSError as error:
-            skip(Path(folder), f"the folder cannot be looked into: {error.strerror}")
+            skip(Path(folder), f"the folder cannot be read: {error.strerror}")
             return None
         below = [entry.path for entry in entries if entry.is_dir(follow_symlinks=False)]
         files = [entry for entry in entries if not entry.is_dir(follow_symlinks=False)]

@@ -41,7 +41,7 @@ _LONGEST_STEP_S = 5.0
 
 VARIABLES: Mapping[str, tuple[str, str]] = {
     "f_x": ("ideal speed", "m/s"),
-    "f_y": ("ideal sideways speed", "m/s"),
+    "f_y": ("ideal lateral speed", "m/s"),
     "f_w": ("ideal yaw rate", "rad/s"),
     "f_x_f_w": ("ideal speed times ideal yaw rate", "m/s²"),
     "a_x": ("change of ideal speed", "m/s²"),

@@ -320,8 +320,8 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
     if len(grounds) == 1:
         return []
     text = (
-        f"these runs are on {', '.join(grounds)} and were fitted together: a difference between surfaces may "
-        "appear as a change within a run (slip compare --causes and slip fleet fit separate surfaces)"
+        f"these runs are on {', '.join(grounds)} and were fitted together: a difference between terrains may "
+        "appear as a change within a run (slip compare --causes and slip fleet fit separate terrains)"
     )
     return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
 

@@ -415,7 +415,7 @@ def leave_grounds_out(problem: Problem, model: Model, per_run: Sequence[str] = (
                 ratios += list_ratios(there, state, after)
                 if rises := format_rises(before.pooled, after.pooled, _WORSE):
                     refusals.append(f"learned without {ground}, on {run.name} {rises}")
-    bands = make_bands(ratios, f"of {len(grounds)} grounds, each left out in turn")
+    bands = make_bands(ratios, f"of {len(grounds)} terrains, each left out in turn")
     return GroundsOut(bands, "; ".join(refusals))
 
 

@@ -220,7 +220,7 @@ def format_contest(contest: Contest) -> list[str]:
             f"{position:>10.4f} {mark(rival, 't_mrmse_m')} {math.degrees(heading):>10.2f} "
             f"{mark(rival, 'r_mrmse_rad')} {rival.fit_s:>6.1f}"
         )
-    lines += ["* smallest; = larger by no more than chance (95 % interval over stretches of 10 s)"]
+    lines += ["* smallest; = not significantly larger (95 % interval over stretches of 10 s)"]
     for metric, (words, _) in ERRORS_OVER_2S.items():
         tied = contest.ties[metric]
         said = f"{best[metric].name} has the smallest error of {words}"

@@ -272,7 +272,7 @@ class Measure:
 
 
 MEASURES = {
-    "slip": Measure("median_modulus", "slip speed", "m/s", "the published idea: fast vehicles look worse"),
+    "slip": Measure("median_modulus", "slip speed", "m/s", "the published measure; fast vehicles look worse"),
     "relative": Measure(
         "relative_slip", "relative slip", "1", "slip speed over ideal speed, while the vehicle should move"
     ),
@@ -280,16 +280,19 @@ MEASURES = {
         "lost_energy",
         "lost energy",
         "1",
-        "slip path over path driven: what friction takes per metre and mass, over its coefficient times g",
+        "slip path over path driven: energy lost to friction per metre and mass, over mu g",
     ),
     "unpredictability": Measure(
         "relative_unpredictability",
         "unpredictability",
         "1",
-        "rms slip that a fitted slip model leaves on unseen data, over the rms ideal speed",
+        "held-out RMS slip of a fitted slip model over the RMS ideal speed",
     ),
     "transitory": Measure(
-        "transitory_slip", "transitory slip", "m", "slip path that a change of command adds to the steady one"
+        "transitory_slip",
+        "transitory slip",
+        "m",
+        "slip path that a change of command adds to the steady slip path",
     ),
 }
 

@@ -98,7 +98,7 @@ class Difference:
         """
         largest = max((abs(part.difference) for part in self.parts), default=0.0)
         if largest == 0.0:
-            return f"{self.b} against {self.a}: the same slip, and each cause has the same part in it"
+            return f"{self.b} and {self.a}: the same slip, and the same from each cause"
         if largest > self.total:
             # A single cause exceeds the total difference: shares would be meaningless.
             words = ", ".join(
@@ -106,16 +106,14 @@ class Difference:
                 for part in self.parts
                 if abs(part.difference) >= _LEAST_SHOWN * largest
             )
-            return (
-                f"{self.b} against {self.a}, {self.total:.2g} m/s of RMS slip more, by cause in m/s: {words}"
-            )
+            return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}; by cause in m/s: {words}"
         main_parts = [part for part in self.parts if abs(part.difference) >= _LEAST_SHOWN * self.total]
         none = [part for part in self.parts if abs(part.difference) < _NO_PART * self.total]
         words = ", ".join(
             f"{format_share(part.difference / self.total, 0)} {names[part.name]}" for part in main_parts
         )
         rest = f"; no contribution: {', '.join(names[part.name] for part in none)}" if none else ""
-        return f"{self.b} against {self.a}, {self.total:.2g} m/s of RMS slip more: {words}{rest}"
+        return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}: {words}{rest}"
 
 
 def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:

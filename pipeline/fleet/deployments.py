@@ -131,7 +131,9 @@ def rank_datasets(datasets: pl.DataFrame, column: str) -> tuple[pl.DataFrame, li
     notes = []
     unknown = placed.filter(pl.col("complexity").is_null())["dataset"].to_list()
     if unknown:
-        notes.append(f"not on the map, because the scale does not know their terrain: {', '.join(unknown)}")
+        notes.append(
+            f"not on the map, because their terrain is not on the complexity scale: {', '.join(unknown)}"
+        )
     weightless = placed.filter(pl.col("largest_kinetic_energy").is_null())["dataset"].to_list()
     if weightless:
         notes.append(f"not on the map, because the mass is not known: {', '.join(weightless)}")

@@ -338,7 +338,7 @@ def judge_pair(row: Mapping[str, object]) -> str:
 
 _WORDS = {
     DIFFERENT: ("differs significantly", "differ significantly"),
-    OF_TWO_RUNS: ("differs only as two single runs", "differ only as two single runs"),
+    OF_TWO_RUNS: ("differs, but as two single runs only", "differ, but as two single runs only"),
     ALIKE: ("shows no significant difference", "show no significant difference"),
     TOO_FEW: ("has too few runs for a test", "have too few runs for a test"),
 }

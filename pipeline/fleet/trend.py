@@ -209,7 +209,7 @@ def _follow(
         for i, shift in enumerate(search.shifts)
     )
     missing = FEWEST_FREE - search.freedom
-    need = f"{missing} more run{'s' * (missing > 1)} on ground that was driven before" if missing > 0 else ""
+    need = f"{missing} more run{'s' * (missing > 1)} on a terrain driven before" if missing > 0 else ""
     return ParameterTrend(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
         undetermined, int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, *last,
@@ -231,7 +231,7 @@ def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
     """Likely causes: those at run level, and other terrain unless two terrains show the change."""
     causes = [reading.text for reading in find_effect(effect).readings if reading.level is Level.RUN]
     if len({*before} & {*after}) < 2 or UNKNOWN in after:  # noqa: PLR2004 - the ground may have changed
-        causes.append("other ground")
+        causes.append("other terrain")
     return ", or ".join(causes)
 
 
@@ -254,9 +254,9 @@ def shorten_change(trend: ParameterTrend, change: LevelChange) -> str:
 def format_power(trend: ParameterTrend) -> str:
     """Format the smallest detectable change, or what is missing for a test."""
     if trend.need:
-        return f"not tested: a change takes {trend.need}"
+        return f"not tested: {trend.need} needed"
     if not math.isfinite(trend.least):
-        return "not tested: no ground was driven on two dates"
+        return "not tested: no terrain was driven on two dates"
     unit = suffix_unit(trend.unit)
     return f"a change by {trend.least:.2g}{unit} would be detected"
 
@@ -432,10 +432,10 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
     """Text if there is no alert: no significant change, or no test possible."""
     most = max((one.points.height for one in series), default=0)
     if most >= FEWEST_RUNS or any(not one.need for one in parameters):
-        return "nothing moved beyond the threshold"
+        return "no change exceeds the threshold"
     return (
-        f"nothing could be tested: a change of slip takes {FEWEST_RUNS} runs, the most of a group is {most}; "
-        "one of a parameter four runs on one ground"
+        f"no test is possible: a change of slip needs {FEWEST_RUNS} runs of a group (the largest has {most}), "
+        "a change of a parameter four runs on one terrain"
     )
 
 

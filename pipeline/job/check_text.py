@@ -22,6 +22,8 @@ STATUSES = ("changed", "differs", "unchanged", "unknown")
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
+_LEAST_P = 1e-4
+"""Smallest p value that is printed."""
 _ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
 
 
@@ -36,20 +38,21 @@ def format_verdict(check: Check) -> str:
         listed = enumerate_texts([_format_change(check, name) for name in named[:_MOST_NAMED]])
         others = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
         sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
-    rest = "by no effect of the model: run slip diagnose on AFTER"
+    rest = "and no effect of the model explains it: run slip diagnose on AFTER"
     sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if not changed and differs:
         listed = enumerate_texts(
             [f"{_name(check, name)} {_format_pair(check, name)}" for name in differs[:_MOST_NAMED]]
         )
         sentences.append(
-            f"No conclusion: the recordings differ in {listed}, but runs on each side may differ as much"
+            f"No conclusion: the recordings differ in {listed}, but within the spread between runs"
         )
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
-        nothing = "No conclusion: no number is known on both sides"
-        few = "" if check.is_compared else "; most numbers of the model cannot be compared"
-        sentences.append(f"No change shown in {known} number{'s' * (known != 1)}{few}" if known else nothing)
+        nothing = "No conclusion: no quantity is known on both sides"
+        few = "" if check.is_compared else "; most parameters of the model cannot be compared"
+        noun = "quantity" if known == 1 else "quantities"
+        sentences.append(f"No change shown in {known} {noun}{few}" if known else nothing)
     sentences += [*_format_limits(check), *_format_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
 
@@ -75,7 +78,7 @@ def _format_simulated(check: Check, named: Sequence[str]) -> str:
 
 
 def _format_change(check: Check, name: str) -> str:
-    return f"{_name(check, name)} {_format_pair(check, name)} (p = {check.changes[name].p:.1g})"
+    return f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(check.changes[name].p, 1)})"
 
 
 def _format_pair(check: Check, name: str) -> str:
@@ -154,11 +157,12 @@ def _format_power(check: Check) -> list[str]:
     spread = " at the default spread between runs" if default and not check.simulated else ""
     runs = "this run" if count == 1 else f"these {count} runs"
     first = f"A change of less than {text} is not detectable with {runs}{spread}"
-    missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
+    differs = check.list_status("differs")
+    missing = check.changes[(differs or asked)[0]].count_missing()
     if missing is None:
         return [first]
-    does = "decide" if check.list_status("differs") else "detect half of that"
-    return [first, f"{missing} more run{'s' * (missing != 1)} a side {does}"]
+    needed = "run per side is needed" if missing == 1 else "runs per side are needed"
+    return [first, f"{missing} more {needed} {'to decide' if differs else 'to detect half of that'}"]
 
 
 def _share(check: Check, name: str) -> float:
@@ -190,7 +194,7 @@ def list_lines(check: Check) -> list[Line]:
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
         before, after = (" and ".join(one) for one in check.sides.terrains)
-        lines.append(("grounds", f"BEFORE was driven on {before}, AFTER on {after}"))
+        lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
     return lines + [("note", note) for note in check.sides.notes]
 
 
@@ -211,10 +215,10 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         )
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
-    within = f", {change.p_within:.2g} within these recordings" if change.status == "differs" else ""
-    size = "it double" if name in ERRORS else "one of its own size"
-    few = f"; too few runs to see {size}" if check.is_unseen(name) else ""
-    return f"{text}  p = {change.p:.2g}{within}{few}"
+    within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
+    size = "a factor of two" if name in ERRORS else "a change of its own size"
+    few = f"; too few runs to detect {size}" if check.is_unseen(name) else ""
+    return f"{text}  {_format_p(change.p)}{within}{few}"
 
 
 def _format_resolution(check: Check, name: str) -> str:
@@ -222,11 +226,16 @@ def _format_resolution(check: Check, name: str) -> str:
     change = check.changes[name]
     show = _format_ratio if name in ERRORS else _format_size
     text = f"detectable change {show(change.smallest)}"
-    text += "; errors at the speed of AFTER" if name in ERRORS else ""
+    text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
     if check.simulated:
         return text
     source = "(default)" if change.is_default else "(these runs)"
     return f"{text}; spread between runs {show(change.spread)} {source}"
+
+
+def _format_p(p: float, digits: int = 2) -> str:
+    """`p = 0.012`; below 0.0001 only that, as the tails of the test are not known better."""
+    return f"p = {p:.{digits}g}" if p >= _LEAST_P else f"p < {_LEAST_P:g}"
 
 
 def _format_ratio(logarithm: float) -> str:

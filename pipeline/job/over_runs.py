@@ -383,7 +383,7 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
     short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
     notes = []
     if short:
-        notes.append(f"too few runs to find a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
+        notes.append(f"too few runs to detect a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
     needs: dict[str, list[str]] = {}
     lost: dict[tuple[str, tuple[str, ...]], list[str]] = {}
     for number in parameters:

@@ -368,11 +368,11 @@ def _note_terrain(labels: pl.DataFrame, forecast: Forecast) -> str:
     """Note on a terrain without runs of the vehicle: whether it is known, and what the forecast is from."""
     terrains = {str(name) for name in labels["terrain"]} - {UNKNOWN, forecast.terrain}
     own = labels.filter(pl.col("run").is_in(list(forecast.elsewhere)))["terrain"].unique().sort()
-    source = f"the forecast is that of another ground, from {', '.join(own)}"
+    source = f"the prediction is for another terrain, from runs on {', '.join(own)}"
     if not labels.filter(pl.col("terrain") == forecast.terrain).is_empty():
         return f"no run of {forecast.vehicle} is on {forecast.terrain}: {source}"
     known = f"{guess_names(forecast.terrain, terrains)}Known: {', '.join(sorted(terrains))}"
-    return f"{forecast.terrain} is an unknown terrain, no run is on it: {source}. {known}"
+    return f"no run is on {forecast.terrain}: {source}. {known}"
 
 
 def weigh_runs(there: Flags) -> Floats:

@@ -143,7 +143,7 @@ class _Allowance:
         self.remaining -= size
         if self.remaining < 0:
             raise _BudgetError(
-                f"it inflates to more than {self.most / 1e6:,.1f} MB, and no more is read; "
+                f"it decompresses to more than {self.most / 1e6:,.1f} MB, and no more is read; "
                 "a larger --max-inflated reads more"
             )
 
@@ -197,7 +197,7 @@ def read_bag(path: Path, container: str, numbers: AbstractSet[int], most: int) -
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001 - exceptions caused by damage have no common type
-            text = f"the {container} breaks off: what comes after {collected.count} messages cannot be read"
+            text = f"the {container} is truncated: what comes after {collected.count} messages cannot be read"
             text += f" ({_format_error(error)})"
             kind = OVER_BUDGET if isinstance(error, _BudgetError) else "damaged_record"
             collected.losses.append(Loss(kind, text, start_ns=collected.last))

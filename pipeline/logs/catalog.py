@@ -250,8 +250,8 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         (within if fits else omitted).append(span)
     catalog.spans = within
     text = (
-        f"the chunks of the file inflate to {_spell(total)}, {total / size:.0f} times its size, and no more "
-        f"than {_spell(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks were left "
+        f"the chunks of the file decompress to {_spell(total)}, {total / size:.0f} times its size, and at "
+        f"most {_spell(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks were left "
         f"out; --max-inflated {-(-total // 10**6)}MB reads them"
     )
     catalog.losses.append(
@@ -279,7 +279,7 @@ def _spell(size: int) -> str:
     return f"{size / 1e6:,.1f} MB"
 
 
-_NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be seen"
+_NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"
 
 _LISTED: Final = 12
 """Maximum number of topics listed in a message."""

@@ -190,7 +190,7 @@ class Foxglove:
             # Times, services and assets, which are not requested.
             return None
         if len(frame) < _HEAD.size:
-            raise FrameError("a message without a head")
+            raise FrameError("a message without a header")
         _, number, log_time = _HEAD.unpack_from(frame)
         channel = self._subscribed.get(number)
         # Messages of a topic that was just unadvertised may still arrive.

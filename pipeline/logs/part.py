@@ -75,11 +75,11 @@ def catalog_file(source: ByteSource, *, threads: int = 1, max_inflated: int | No
         Scanner(source, catalog).scan(start, stop)
         keep_within(catalog, source.size, max_inflated)
         examine_spans(source, catalog, threads)
-        catalog.notes.append(f"{reason}; the index was rebuilt by walking the records")
+        catalog.notes.append(f"{reason}; the index was rebuilt by reading all records")
         if isinstance(reason, _DamagedSummaryError) and all(
             each.kind != "truncated" for each in catalog.losses
         ):
-            text = f"{reason}; all records were walked in its place"
+            text = f"{reason}; all records were read instead"
             catalog.losses.append(Loss("damaged_summary", text))
     else:
         _scan_gaps(source, catalog, start, summary.start)
@@ -126,7 +126,7 @@ def _check_magic(head: bytes, source: ByteSource, catalog: Catalog) -> int:
     alike = sum(a == b for a, b in zip(head, rec.MAGIC, strict=False))
     what = hint = ""
     if head.startswith(b"\x89MCAP0\n"):
-        what = "a text-mode copy has changed the file's line ends and with them its data"
+        what = "a copy in text mode changed line ends of the file, and with them its data"
         hint = "Copy the file again in binary mode"
     elif alike < len(rec.MAGIC) - 2 and _FARM_NG in source.read_at(0, 2 * len(_FARM_NG)):
         what = "it is a recording of farm-ng's event recorder, whose messages have no definitions in the file"
@@ -144,7 +144,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     tail_size = rec.FOOTER_SIZE + len(rec.MAGIC)
     tail = source.read_at(max(0, source.size - tail_size), tail_size)
     if len(tail) < rec.FOOTER_SIZE + len(rec.MAGIC) or not tail.endswith(rec.MAGIC):
-        raise _DamagedSummaryError("the file does not end as MCAP does")
+        raise _DamagedSummaryError("the end of the file is not that of an MCAP file")
     opcode, length = rec.HEAD.unpack_from(tail, 0)
     if opcode != rec.FOOTER or length != rec.LEAST_BODY[rec.FOOTER]:
         raise _DamagedSummaryError("the footer is damaged")
@@ -182,11 +182,11 @@ def _parse_summary(body: bytes, start: int, catalog: Catalog, cover: Cover) -> _
     view = memoryview(body)
     while position < len(view):
         if position + rec.HEAD_SIZE > len(view):
-            raise rec.RecordError("a record is cut")
+            raise rec.RecordError("a record is truncated")
         opcode, length = rec.HEAD.unpack_from(view, position)
         position += rec.HEAD_SIZE
         if length > len(view) - position:
-            raise rec.RecordError("a record is cut")
+            raise rec.RecordError("a record is truncated")
         record = view[position : position + length]
         position += length
         parsed = rec.parse_record(opcode, record)

@@ -176,7 +176,7 @@ def read_topics(
         digest_read = digest.result() if digest is not None else (sha256 or "")
         fetched = index.fetched_bytes + count_fetched(sources)
     if walked:
-        notes.append(f"the message indexes of {walked} chunks are damaged; their records were walked")
+        notes.append(f"the message indexes of {walked} chunks are damaged; their records were read instead")
     counted = [(job.info, job.buffer.count) for job in jobs.values()]
     losses.update(dict.fromkeys(count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []

@@ -198,11 +198,11 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
         body_size: length of the whole body.
     """
     if len(body) < LEAST_BODY[CHUNK]:
-        raise RecordError("the head of a chunk is cut")
+        raise RecordError("the header of a chunk is truncated")
     start, end, size, crc, named = _CHUNK_HEAD.unpack_from(body)
     position = _CHUNK_HEAD.size + named
     if position + 8 > len(body):
-        raise RecordError("the head of a chunk is cut")
+        raise RecordError("the header of a chunk is truncated")
     try:
         compression = str(body[_CHUNK_HEAD.size : position], "utf-8")
     except UnicodeDecodeError:
@@ -216,7 +216,7 @@ def parse_chunk_head(body: Buffer, body_size: int) -> ChunkHead:
 def parse_message_index(body: Buffer) -> tuple[int, NDArray[np.uint64]]:
     """Channel and entries of a message index: log time [ns] and offset in the chunk, shape (n, 2)."""
     if len(body) < _INDEX_HEAD.size:
-        raise RecordError("a message index is cut")
+        raise RecordError("a message index is truncated")
     channel, size = _INDEX_HEAD.unpack_from(body)
     if size > len(body) - _INDEX_HEAD.size:
         raise RecordError("a message index says it is longer than its record")

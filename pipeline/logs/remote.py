@@ -211,7 +211,7 @@ def _fetch_matching(store: AbstractFileSystem, url: str, start: int, end: int, t
             error = broken
             continue
         return fetched
-    raise OSError(f"the connection breaks off: {' '.join(str(error).split())}")
+    raise OSError(f"the connection was interrupted: {' '.join(str(error).split())}")
 
 
 def _is_changed(error: OSError) -> bool:
@@ -441,8 +441,8 @@ class RemoteSource(AbstractContextManager["RemoteSource"]):
                 "log_not_found", "there is no such object", where=str(self._path), hint="Check bucket and key"
             ) from None
         if not info.get("size"):
-            hint = "The recorder was stopped before it wrote anything; leave it out"
-            raise LogError("log_empty", "the object holds no bytes", where=str(self._path), hint=hint)
+            hint = "The recorder was stopped before it wrote anything; omit this file"
+            raise LogError("log_empty", "the object is empty", where=str(self._path), hint=hint)
         return info
 
     def read_at(self, offset: int, length: int) -> bytes:

@@ -251,7 +251,7 @@ class Scanner:
         truncated = end == stop == self._source.size
         kind = "truncated" if truncated else "damaged_record"
         text = (
-            f"the file breaks off: its last {end - start} bytes hold no whole record"
+            f"the file is truncated: its last {end - start} bytes are no complete record"
             if truncated
             else f"bytes {start} to {end} hold no record"
         )

@@ -418,7 +418,7 @@ class _Reader:
 
     def _here(self) -> str:
         if self._position >= len(self._tokens):
-            raise SchemaError("the definition breaks off")
+            raise SchemaError("the definition is truncated")
         return self._tokens[self._position]
 
     def _next(self) -> str:

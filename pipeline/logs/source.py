@@ -73,8 +73,8 @@ class FileSource(AbstractContextManager["FileSource"]):
             raise LogError("log_unreadable", what, where=self.name, hint="Give an .mcap file")
         if self.size == 0:
             self.close()
-            hint = "The recorder was stopped before it wrote anything; leave it out"
-            raise LogError("log_empty", "the file holds no bytes", where=self.name, hint=hint)
+            hint = "The recorder was stopped before it wrote anything; omit this file"
+            raise LogError("log_empty", "the file is empty", where=self.name, hint=hint)
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""

@@ -237,7 +237,7 @@ def _load_prefix(
     try:
         chunk = chunks.inflate_prefix(stored, head.compression, head.uncompressed_size, needed)
     except chunks.InflateError as error:
-        raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
+        raise _SpanError("damaged_chunk", f"it cannot be decompressed: {error}") from None
     messages = locate_messages(chunk, [(c, e[e[:, 1] < needed]) for c, e in entries], len(stored))
     return Loaded(chunk, messages, _damage_losses(span, messages, len(chunk)), unchecked=True)
 
@@ -245,7 +245,7 @@ def _load_prefix(
 def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]]:
     """Header of a chunk; from the summary if the chunk's own header is damaged."""
     head: rec.ChunkHead | None = None
-    reason = "the head of the chunk disagrees with the summary"
+    reason = "the header of the chunk disagrees with the summary"
     try:
         opcode, size = rec.HEAD.unpack_from(blob, 0)
         head = rec.parse_chunk_head(blob[rec.HEAD_SIZE : span.length], size)
@@ -273,7 +273,7 @@ def _open_chunk(span: Span, blob: memoryview) -> tuple[rec.ChunkHead, list[Loss]
     crc = int.from_bytes(blob[crc_at : crc_at + 4], "little")
     if crc == 0 or expected.body + expected.compressed_size > len(blob):
         raise _SpanError("damaged_record", reason)
-    text = f"{reason}; its records are whole and were kept"
+    text = f"{reason}; its records are intact and were kept"
     return replace(expected, crc=crc), [_loss(span, "damaged_record", text, bytes_lost=0)]
 
 
@@ -284,7 +284,7 @@ def _inflate_checked(
     try:
         chunk = chunks.inflate(stored, head.compression, head.uncompressed_size)
     except chunks.InflateError as error:
-        raise _SpanError("damaged_chunk", f"it cannot be inflated: {error}") from None
+        raise _SpanError("damaged_chunk", f"it cannot be decompressed: {error}") from None
     computed = chunks.checksum(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
@@ -293,7 +293,7 @@ def _inflate_checked(
         reason = "the checksum of the whole file holds"
     if reason is None:
         raise _SpanError("chunk_crc", "its checksum does not match its records")
-    text = f"its checksum is wrong but its records are whole ({reason}); they were kept"
+    text = f"its checksum is wrong but its records are intact ({reason}); they were kept"
     losses.append(_loss(span, "wrong_crc", text, bytes_lost=0))
     return chunk
 
@@ -340,7 +340,7 @@ def _load_start(span: Span, head: rec.ChunkHead, stored: Buffer, reason: str) ->
         return _lost(span, "truncated", reason)
     last = int(messages.log_time.max())
     text = (
-        f"the chunk at {span.offset} is cut ({reason}): "
+        f"the chunk at byte {span.offset} is truncated ({reason}): "
         f"{messages.start.size} messages before the cut were read, unchecked"
     )
     loss = Loss("truncated", text, bytes=span.length, chunks=1, start_ns=last, end_ns=span.end_ns)

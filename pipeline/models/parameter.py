@@ -274,8 +274,8 @@ class Least:
     sampled: float = 0.0
 
 
-WARTHOG_RUNS = "nine runs of a Warthog on five grounds"
-WARTHOG_LAGS = "six runs of a Warthog on three grounds (`make run-spreads`)"
+WARTHOG_RUNS = "nine runs of a Warthog on five terrains"
+WARTHOG_LAGS = "six runs of a Warthog on three terrains (`make run-spreads`)"
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ class Plan:
         if self.promises and self.spare_s >= _LEAST_REST_S:
             gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
             sentences.append(
-                f"{self.spare_s:.0f} s more would {gain if intervals else 'decide nothing else'}"
+                f"{self.spare_s:.0f} more seconds would {gain if intervals else 'decide nothing else'}"
             )
         return "; ".join(sentences)
 

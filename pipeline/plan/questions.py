@@ -433,7 +433,7 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
     if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
         seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
         return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    at_best = f"at best {_format_reached(one, best)}"
+    at_best = f"expected {_format_reached(one, best)}"
     return replace(question, because=_advise(one.question, longest_s), reached=at_best)
 
 
@@ -466,11 +466,11 @@ def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:
 def _format_reached(one: Answerable, weight: Floats) -> str:
     measured = float(one.measure(weight))
     if isinstance(one.question, Separation):
-        enough, what = measured >= DECIDED_T, f"t = {measured:.1f} of {DECIDED_T:g}"
+        enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
     else:
         bound = float(one.bound(weight))
         enough = bound <= one.question.goal
-        what = f"+- {measured:.2g}, or up to {bound:.2g}"
+        what = f"+- {measured:.2g}, up to {bound:.2g}"
     return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
 
 
@@ -478,6 +478,6 @@ def _advise(question: Question, longest_s: float) -> str:
     """Why no drive answers a question, and what shows it."""
     effects = [find_effect(name)() for name in question.effects]
     on_slope = any(Excitation.SLOPE in effect.needs for effect in effects)
-    tried = f"none of the drives that were tried, of up to {LEAD_S + longest_s + TAIL_S:.0f} s, decides it"
+    tried = f"no drive of up to {LEAD_S + longest_s + TAIL_S:.0f} s that was tried decides it"
     why = "no drive on level ground decides it" if on_slope else tried
-    return f"{why}; what shows it: {suggest_manoeuvre(*effects)}"
+    return f"{why}; to observe it: {suggest_manoeuvre(*effects)}"

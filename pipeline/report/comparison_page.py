@@ -61,7 +61,7 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     chart = _frame(layer(whiskers, box, middle), len(labels))
     note = (
         "All windows of a dataset in one box, as published: a long run counts more than a short one, and "
-        "windows are correlated. The box says how slip is spread, not how sure its median is."
+        "windows are correlated. The box shows the spread of slip, not the uncertainty of its median."
     )
     sentence = ", ".join(
         f"{name} {median:.3g}" for name, median in boxes.select("group", "median").iter_rows()
@@ -256,7 +256,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
         ]
         for row in shown.sort("median_modulus").iter_rows(named=True)
     ]
-    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; a run counts once, whatever its length"
+    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; every run has the same weight, whatever its length"
     # Columns without any value, not computed or not in the logs, are omitted.
     columns = [
         i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)

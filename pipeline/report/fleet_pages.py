@@ -424,7 +424,7 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
                 axis={"title": None, "grid": False},
             ),
             x=encode_column(
-                "sum(slip):Q", axis={"title": "rms slip over half a second [m/s]", "format": ",~r"}
+                "sum(slip):Q", axis={"title": "RMS slip over half a second [m/s]", "format": ",~r"}
             ),
             color=encode_column(
                 "cause:N",
@@ -438,13 +438,13 @@ def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
     frame = pl.DataFrame(rows, schema=kinds, orient="row")
     sentence = "; ".join(f"{one.dataset} {format_number(math.sqrt(one.total))} m/s" for one in budgets)
     note = (
-        "The rms slip of a dataset, divided in the proportion of the shares of its mean square. A cause left "
-        "of zero makes the slip that the model leaves on data not fitted larger."
+        "The RMS slip of a dataset, divided in proportion to the shares of its mean square. A negative part "
+        "increases the held-out slip of the model."
     )
     return Picture(
         "causes",
-        "Rms slip of each dataset by cause",
-        Drawing(chart, {"causes": frame}, note, f"Rms slip: {sentence}."),
+        "RMS slip of each dataset by cause",
+        Drawing(chart, {"causes": frame}, note, f"RMS slip: {sentence}."),
     )
 
 
@@ -478,7 +478,7 @@ def _tabulate_differences(differences: Sequence[Difference], names: Mapping[str,
         for one in differences
         for part in one.parts
     ]  # fmt: skip
-    return Table("Differences of rms slip by cause; p after Holm over the causes of a pair", columns, rows)
+    return Table("Differences of RMS slip by cause; p after Holm over the causes of a pair", columns, rows)
 
 
 def _format_cause_ends(

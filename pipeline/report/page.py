@@ -164,9 +164,9 @@ def _tabulate(report: RunReport) -> Table | None:
 _QUANTITIES = (
     Cell("median slip speed", small="m/s"),
     Cell("median 2 s window norm", small="m/s"),
-    Cell("rms g", sub="x", after=", forward", small="m/s"),
-    Cell("rms g", sub="y", after=", sideways", small="m/s"),
-    Cell("rms g", sub="w", after=", yaw rate", small="rad/s"),
+    Cell("RMS g", sub="x", after=", forward", small="m/s"),
+    Cell("RMS g", sub="y", after=", lateral", small="m/s"),
+    Cell("RMS g", sub="w", after=", yaw rate", small="rad/s"),
     Cell("time steps"),
 )
 

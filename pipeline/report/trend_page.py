@@ -30,7 +30,7 @@ _FEWEST_POINTS = 3
 _LIMITS = ("limit_low", "limit_high")
 _KEY = (
     "Points: the value of each run, with its 95 % interval as a thin line. Short strokes: the value expected "
-    "on the ground of the run. Grey bars: the range in which all values of the figure lie, with a "
+    "on the terrain of the run. Grey bars: the range in which all values of the figure lie, with a "
     "probability of 95 %, if nothing else changes."
 )
 _KEY_OF_SERIES = "Points: the value of each run. Lines: the mean between two changes."

@@ -416,7 +416,8 @@ class Manifest:
             content = None
         if not isinstance(content, dict):
             hint = "Analyze the log again with --force; `slip results verify` lists what else is damaged"
-            raise StoreError("file_damaged", "the file is not what was written", where=str(path), hint=hint)
+            text = "the file has changed since it was written"
+            raise StoreError("file_damaged", text, where=str(path), hint=hint)
         return content
 
     @property

@@ -312,7 +312,7 @@ class Generation:
             if digest != sha256:
                 raise StoreError(
                     "file_damaged",
-                    "a file of the results is not what was written",
+                    "a file of the results has changed since it was written",
                     where=str(source),
                     hint="Analyze the log again with --force",
                 )

@@ -348,7 +348,7 @@ class Mirror:
                 if wanted.get(name) not in {"", hash_bytes(data)}:
                     raise StoreError(
                         "file_damaged",
-                        "an object of the results is not what was written",
+                        "an object of the results has changed since it was written",
                         where=self._address_of(name),
                         hint="Look with `slip results verify` for what else is damaged",
                     )

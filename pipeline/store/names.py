@@ -148,7 +148,7 @@ def name_clash(run: str, other: str, folder: Path) -> StoreError:
     """The error for two runs in one folder."""
     return StoreError(
         "name_clash",
-        f"the results of {run!r} and of {other!r} would share a folder",
+        f"the results of {run!r} and of {other!r} would have the same folder",
         where=str(folder),
         hint="Rename one of the logs, or give it another folder with --results",
     )
@@ -308,7 +308,7 @@ def name_damage(path: Path) -> Iterator[None]:
         raise table_damaged(getattr(error, "strerror", None) or NOT_AS_WRITTEN, path) from error
 
 
-NOT_AS_WRITTEN = "it is not what was written"
+NOT_AS_WRITTEN = "it has changed since it was written"
 
 
 def table_damaged(why: str, path: Path) -> StoreError:
@@ -401,7 +401,7 @@ def _note_refused(runs: Sequence[str], clock: str | None, named: Mapping[str, st
     dated = sum(named[run] is not None for run in runs)
     others = "; the others have no date" if dated < len(runs) else ""
     return (
-        f"the clocks of {len(runs)} runs start at the very same instant of {clock}, which names contradict: "
+        f"the clocks of {len(runs)} runs start at the same instant of {clock}, which names contradict: "
         f"the dates in the names of {dated} count{others}"
     )
 
@@ -410,7 +410,7 @@ def _note_order(runs: Sequence[str], start: int | None) -> str:
     """Note on runs of one date and start."""
     instant = datetime.fromtimestamp((start or 0) // 10**9, UTC)
     return (
-        f"{len(runs)} runs start at the very same instant, {instant:%Y-%m-%d %H:%M:%S} UTC, and are in the "
+        f"{len(runs)} runs start at the same instant, {instant:%Y-%m-%d %H:%M:%S} UTC, and are in the "
         f"order of their names: {', '.join(sorted(runs))}"
     )
 

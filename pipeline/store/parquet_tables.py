@@ -358,7 +358,7 @@ def answer_query(
             "files_not_allowed",
             f"the query names {reader[0]}, which opens files outside the results",
             where=_shorten(sql),
-            hint="Ask the tables of the results only, or give --allow-files if the query is your own",
+            hint="Query the tables of the results only, or give --allow-files if the query is your own",
         )
     names = [contract.name for contract in list_contracts()]
     known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
@@ -421,7 +421,7 @@ def _check_kind(sql: str) -> None:
             "bad_query",
             "the query cannot be answered: it does not begin with SELECT or WITH",
             where=_shorten(sql),
-            hint="Tables are asked, never changed: SELECT run, vehicle FROM runs",
+            hint="Queries read tables and never change them: SELECT run, vehicle FROM runs",
         )
 
 

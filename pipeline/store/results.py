@@ -447,7 +447,7 @@ class Store:
             return
         raise StoreError(
             "not_sealed",
-            "the results of the run are not what was sealed with the key",
+            "the results of the run have changed since they were sealed",
             where=str(home),
             hint="Look with `slip results verify`; --repair has the next batch make them again from the log",
         )

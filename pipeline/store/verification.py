@@ -139,7 +139,7 @@ def seal_entries(files: DiskFiles | Mirror, key: Key) -> Iterator[tuple[str, byt
     if seen.problems or seen.unlisted:
         first = seen.problems[0].path if seen.problems else files.locate(seen.unlisted[0])
         what = f"{len(seen.problems) + len(seen.unlisted)} of the files may not be what was written"
-        hint = "See `slip results verify`, and its --repair; only whole results are sealed"
+        hint = "See `slip results verify`, and its --repair; only intact results are sealed"
         raise StoreError("not_whole", what, where=str(first), hint=hint)
     for entry in seen.entries.values():
         yield entry_name(entry.path), replace(entry, signature="").encode(key)
@@ -313,7 +313,7 @@ class _Examiner:
             except ValueError:
                 is_right = False
             if not is_right:
-                what = "the file is not what was written"
+                what = "the file has changed since it was written"
                 yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
         elif marker is None and is_sealed:
             yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_missing", "the file is gone")
@@ -361,7 +361,7 @@ class _Examiner:
             if digest == ABSENT:
                 yield self._problem(run, path, "file_missing", "the file is gone")
             elif digest != sha256:
-                yield self._problem(run, path, "file_damaged", "the file is not what was written")
+                yield self._problem(run, path, "file_damaged", "the file has changed since it was written")
 
     def _list_inside(self, folder: str) -> Iterator[str]:
         """Names below a folder."""
@@ -396,7 +396,7 @@ class _Examiner:
         elif entry is None:
             yield self._problem("", name, "not_listed", "its entry on the list is gone")
         else:
-            yield self._problem("", name, "file_damaged", "the file is not what was written")
+            yield self._problem("", name, "file_damaged", "the file has changed since it was written")
 
     def _examine_notes(self) -> Iterator[Problem]:
         for name in sorted(name for name in self._names if name.startswith(NOTES) and name.endswith(".json")):
@@ -407,7 +407,7 @@ class _Examiner:
                 if data is not None:
                     unseal(data)
             except (ValueError, OSError) as error:
-                what = f"the note is damaged and is not used ({error}); nothing but time is lost by it"
+                what = f"the note is damaged and is not used ({error}); this costs nothing but time"
                 yield self._problem("", name, "note_damaged", what)
 
     def _problem(self, run: str, name: str, code: str, what: str) -> Problem:

@@ -366,7 +366,7 @@ class Guard:
     def _check_origin(self, scope: Scope, headers: Mapping[str, str], *, bears: bool) -> str:
         host = headers.get("host", "")
         if strip_port(host) not in self._hosts:
-            return "this server does not go by that name"
+            return "this server does not have that name"
         origin = headers.get("origin")
         if origin is not None and origin.lower() != f"http://{host.lower()}":
             return "the request comes from another origin"

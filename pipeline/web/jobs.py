@@ -152,7 +152,7 @@ def _analyze(task: Task, entry: Entry) -> Entry:
 
 WORDS = {
     "sample": "driving a simulated Husky over tile",
-    "upload": "taking the log in",
+    "upload": "receiving the log",
     **STAGE_WORDS,
     "diagnosis": "estimating effects",
     "plan": "planning the next drive",

@@ -37,11 +37,11 @@ const buildCard = (pane, effect) => {
   const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
   const [named, cause] = (effect.sentence || effect.about).split(CAUSE);
   const words = effect.formula.length ? effect.formula.join("; ") : named;
-  const [turn, told] = effect.off ? ["Switch on", "put it back into the model, with its present values"] : ["Switch off", "leave it out of the model without a new fit"];
+  const [turn, told] = effect.off ? ["Switch on", "switch it on again with its present values"] : ["Switch off", "switch it off without a new fit"];
   return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
     h("b", { class: "name" }, words), h("p", { class: "quiet id" }, effect.id),
     cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
-    effect.refused && h("p", { class: "no-help", role: "note" }, `No help here: ${effect.refused}.`),
+    effect.refused && h("p", { class: "no-help", role: "note" }, `Not supported by the data: ${effect.refused}.`),
     effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
     h("div", { class: "head" },
       carries !== null && carries > 0 && h("span", { class: "carries" }, `without it ${sayLength(effect.without_m)}`),
@@ -110,7 +110,7 @@ const buildNext = (pane) => {
   const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
-  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. To go on: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
+  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
@@ -126,7 +126,7 @@ const buildNext = (pane) => {
 
 const buildRow = (pane, row, first) => {
   const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
-  const marks = [row.named && h("i", { class: "mark" }, "found by the diagnosis, beside its other effects"),
+  const marks = [row.named && h("i", { class: "mark" }, "identified by the diagnosis, together with its other effects"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
@@ -142,15 +142,15 @@ const buildFound = (pane, unexplained, there) => {
   if (there.has(id)) return null;
   const lines = unexplained.formula.split("\n").filter((line) => /^v_[xyw] = /.test(line)).map((line) => line.replaceAll('"', "").replace("=", "+="));
   return h("li", { data: { effect: id } },
-    h("div", {}, h("b", {}, "a formula"), h("code", {}, lines.join("; ")), h("span", { class: "quiet" }, unexplained.where ?? ""), h("span", { class: "marks" }, h("i", { class: "mark" }, "found by the diagnosis"))),
-    h("button", { type: "button", class: "add found", "aria-label": "add the formula that was found", data: { keep: "add found" }, onclick: () => pane.addFound() }, "Add"));
+    h("div", {}, h("b", {}, "a formula"), h("code", {}, lines.join("; ")), h("span", { class: "quiet" }, unexplained.where ?? ""), h("span", { class: "marks" }, h("i", { class: "mark" }, "identified by the diagnosis"))),
+    h("button", { type: "button", class: "add found", "aria-label": "add the formula of the diagnosis", data: { keep: "add found" }, onclick: () => pane.addFound() }, "Add"));
 };
 
 const tellNothing = (session, diagnosis) => {
-  if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is named: the run is too short.";
+  if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is identified: the run is too short.";
   const room = session.floor ? session.errors.t / session.floor.t : Infinity;
   if (room < 1.5) return "No effect is missing: the remaining error is at the noise floor.";
-  return "No effect of the catalogue helps further. The residual may be noise, or an effect that you can write as a formula.";
+  return "No further effect of the catalogue reduces the error. The residual may be noise, or an effect that you can write as a formula.";
 };
 
 // Chosen and said apart: with keys one passes every entry of a list.
@@ -170,6 +170,6 @@ const buildFormula = (pane) => {
     await pane.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value });
     pane.tryAll();
   } }, parts.effect, channel, parts.formula, parts.parameters, h("button", { type: "submit" }, "Add formula"),
-  h("p", { class: "quiet" }, "Signals: v0, s0 (sideways), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
+  h("p", { class: "quiet" }, "Signals: v0, s0 (lateral), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
   return h("details", { class: "formula" }, h("summary", {}, "Write a formula"), form);
 };

@@ -29,9 +29,9 @@ const showRuns = () => {
   find("bench").classList.toggle("empty", !listed.runs.length);
   document.body.classList.toggle("without-runs", !listed.runs.length);
   // On an empty page the field for logs, and what becomes of them, stand in its middle.
-  if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed here, and nothing leaves this machine."),
+  if (!listed.runs.length) find("panes").replaceChildren(h("div", { class: "blank" }, h("h2", {}, "No runs yet"), h("p", {}, "Drop an MCAP anywhere on this page: it is analyzed on this machine, and nothing is uploaded."),
     find("drop"), find("jobs"),
-    h("p", {}, "No log at hand?"), h("button", { type: "button", class: "sample", onclick: () => order(() => post("/api/sample", {})) }, "Try it with a sample log")));
+    h("p", {}, "No log available?"), h("button", { type: "button", class: "sample", onclick: () => order(() => post("/api/sample", {})) }, "Try it with a sample log")));
   else if (find("drop").closest(".blank")) {
     find("catalogue").after(find("drop"));
     document.querySelector("main").after(find("jobs"));
@@ -191,7 +191,7 @@ const watch = async () => {
 
 const take = async (files) => {
   for (const file of files) {
-    const line = h("li", { class: "job" }, h("b", {}, file.name), h("span", {}, "taking the log in"), h("i", { class: "progress", bar: 0 }));
+    const line = h("li", { class: "job" }, h("b", {}, file.name), h("span", {}, "receiving the log"), h("i", { class: "progress", bar: 0 }));
     find("jobs").prepend(line);
     try {
       await upload(file, (share) => line.querySelector(".progress").style.setProperty("--share", share / 7));

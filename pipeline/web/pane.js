@@ -165,7 +165,7 @@ export class Pane {
       run.verdict && h("p", { class: run.refusal ? "verdict refused" : "verdict" }, run.verdict),
       this.warn(run),
       h("div", { class: "tools" },
-        tool("fit", "Fit again", () => this.act("fit"), "fits all values that are not held fixed to the motion over half seconds; the errors over 2 s need not be smallest there"),
+        tool("fit", "Fit again", () => this.act("fit"), "fits all values that are not held fixed to the motion over half seconds; the errors over 2 s are not necessarily minimal there"),
         tool("save", "Save model", () => this.save(), "write the model file into the results folder"),
         h("a", { class: "download button", href: `/model.toml?${new URLSearchParams({ run: session.run, slot: this.slot })}` }, "Download"),
         run.report && h("a", { class: "report button", href: `/report?${new URLSearchParams({ run: session.run })}`, target: "_blank", rel: "noopener" }, "Report")),

@@ -41,7 +41,7 @@ const fill = async (planned, run) => {
   const list = (texts) => h("ul", {}, texts.map((text) => h("li", {}, text)));
   const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, "Not answered"), list(plan.impossible));
   if (!plan.drives) {
-    node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers the open questions." : "Nothing is open."), left].filter(Boolean));
+    node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers the open questions." : "No open questions."), left].filter(Boolean));
     return;
   }
   const place = h("div", { class: "plot", role: "img", "aria-label": plan.words, data: { figure: "ways" } });

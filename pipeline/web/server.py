@@ -135,7 +135,7 @@ class WorkbenchProtocol(H11Protocol):
             head = data.partition(b"\r\n\r\n")[0]
             self._lines += head.count(b"\n")
             if len(head) > _HEAD_BYTES or self._lines > _HEAD_LINES:
-                self.send_400_response("The head of the request is too long.")
+                self.send_400_response("The header of the request is too long.")
                 return
         super().data_received(data)
 

@@ -156,7 +156,7 @@ class SessionFile:
         """
         hint = "Free some space, or choose a results folder that can be written."
         guard = naming_os_errors(
-            WorkbenchError, "desk_not_written", "the state cannot be kept", where=self.path, hint=hint
+            WorkbenchError, "desk_not_written", "the state cannot be saved", where=self.path, hint=hint
         )
         with guard:
             make_folder(self.path.parent)

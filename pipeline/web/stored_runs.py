@@ -265,7 +265,7 @@ class Uploads:
             WorkbenchError: too large or too many, not enough disk space, or the connection broke; the
                 received data are then deleted.
         """
-        what, hint = "the log cannot be kept", "Free some space."
+        what, hint = "the log cannot be stored", "Free some space."
         with naming_os_errors(WorkbenchError, "upload_not_written", what, where=name, hint=hint):
             upload = self.make_room(name, total)
             try:

@@ -318,7 +318,7 @@ class Sessions:
             is_diagnosed = diagnosis is not None
             raise WorkbenchError(
                 "nothing_to_add" if is_diagnosed else "not_diagnosed",
-                "the model has all effects that the diagnosis found"
+                "the model has all effects of the diagnosis"
                 if is_diagnosed
                 else "this run was not diagnosed",
                 where=ask.run,
@@ -327,7 +327,7 @@ class Sessions:
         # The joint fit begins with the values of the diagnosis, whatever was fitted or set before.
         own = editor.model
         known = [one for one in _list_named(diagnosis) if one.id in own and not own.effect(one.id).fixed]
-        said = f"+ all {len(missing)} that were found"
+        said = f"+ all {len(missing)} of the diagnosis"
         return editor.add_effects(missing, said, anyway=True, begin=own.swap(*known))
 
     def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:

@@ -43,7 +43,7 @@ def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
     same = check(place, "husky.toml", "logs/b.mcap", code=0)
     late = check(place, "husky.toml", "logs/late.mcap", code=4)
 
-    assert same.startswith("No change shown in 1 number.")
+    assert same.startswith("No change shown in 1 quantity.")
     assert late.startswith("Changed: drive lag 0.3")
     assert "-> 1.19 s" in late
     rows = late.splitlines()[1:]

@@ -35,7 +35,7 @@ def unchecked(samples: Path, tmp_path: Path) -> Path:
     return path
 
 
-WORDS = "no checksum covers its messages: damage in them cannot be seen"
+WORDS = "no checksum covers its messages: damage in them cannot be detected"
 
 
 def test_a_log_without_checksums_is_called_unchecked_wherever_its_health_is_shown(

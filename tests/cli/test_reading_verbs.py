@@ -93,7 +93,7 @@ def test_a_damaged_diagnosis_is_not_exported(place: Path, capsys: pytest.Capture
     words = ["export", "field/wide", "--to", "mcap", "--file", place / "x.mcap", "--out", place / "results"]
     assert slip(*words) == 1
     (line,) = capsys.readouterr().err.splitlines()
-    assert "is not what was written" in line
+    assert "has changed since it was written" in line
 
 
 def test_a_copied_log_is_the_stored_run(place: Path) -> None:

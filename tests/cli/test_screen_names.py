@@ -168,5 +168,5 @@ def test_a_screen_of_80_columns_is_kept_to_and_a_file_takes_in_whole_lines(
 
 
 def test_a_row_goes_on_below_its_second_column_where_that_is_far_to_the_right() -> None:
-    row = f"not shown {'contact_friction.creep':<30} 0.0188 -> 0.239  p = 1; too few runs to see it"
+    row = f"not shown {'contact_friction.creep':<30} 0.0188 -> 0.239  p = 1; too few runs to detect a"
     assert fold_line(row, 80) == [row[: row.index("  p = 1")], " " * 10 + row[row.index("p = 1") :]]

@@ -283,13 +283,13 @@ def test_a_loss_is_shown_with_the_time_it_took() -> None:
             "duration_s": 90.0,
             "losses": [
                 {"text": "chunk of 9 bytes at 70", "start_s": 72.70, "end_s": 96.94},
-                {"text": "the file breaks off", "start_s": None, "end_s": None},
+                {"text": "the file is truncated", "start_s": None, "end_s": None},
             ],
         },
     }
     lines = format_run(summary, unchanged=False).splitlines()
     assert lines[1].endswith("chunk of 9 bytes at 70 (72.7 to 96.9 s of the log)")
-    assert lines[2].endswith("the file breaks off")
+    assert lines[2].endswith("the file is truncated")
 
 
 def test_an_interval_beside_the_poses_is_named_as_what_is_wrong(field: Path, tmp_path: Path) -> None:

@@ -161,5 +161,5 @@ def test_a_lost_entry_of_the_seal_or_the_register_is_repaired_with_the_key(
     Store(out).write_results_text("page.html", "y")
     assert slip(capsys, "results", "verify", out, "--key", key_file) == (
         0,
-        "0 runs checked\nall is unchanged\n",
+        "0 runs checked\nall files are unchanged\n",
     )

@@ -145,7 +145,7 @@ def test_own_datasets_stand_on_the_map_by_their_slip(tmp_path: Path) -> None:
     drawn = draw_up_map(store)
     assert drawn.own["dataset"].to_list() == ["warthog_ice"]
     assert drawn.own["complexity"].to_list() == pytest.approx([6.0])
-    assert any("scale does not know" in note and "warthog_moon" in note for note in drawn.notes)
+    assert any("complexity scale" in note and "warthog_moon" in note for note in drawn.notes)
     assert any("cart_ice" in note for note in drawn.notes)
     # On the command, as `slip compare` chooses it, unless something else is asked for.
     assert (drawn.input, drawn.own["value"].to_list()) == ("command", pytest.approx([2.0], rel=0.2))

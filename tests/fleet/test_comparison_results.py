@@ -310,7 +310,7 @@ def test_pages_and_terminal_count_pairs_alike(store: Store, capsys: pytest.Captu
 
     rows = [row(0.3, 0.02), *[row(0.3, 0.1)] * 3, *[row(0.01, 0.01, "blocks")] * 2]
     assert count_pairs(rows) == (
-        "Of 6 pairs of datasets, none differs significantly, 2 differ only as two single runs, "
+        "Of 6 pairs of datasets, none differs significantly, 2 differ, but as two single runs only, "
         "1 shows no significant difference, 3 have too few runs for a test."
     )
     assert count_pairs([*rows, row(0.01, 0.01)]).startswith(

@@ -67,7 +67,7 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     (alert,) = found.alerts
     assert alert.text == (
         "effective_track.k of warthog-2 1.8 -> 2.1 since 2026-05-03 (13 runs before, 6 since, p < 0.001): "
-        "likely a change of tyre pressure or load, or other ground"
+        "likely a change of tyre pressure or load, or other terrain"
     )
     quantities = {one.quantity for one in found.series}
     assert {"median_modulus (command)", "finding heading_skew", "warnings", "suspect share"} <= quantities
@@ -100,7 +100,8 @@ def test_a_run_whose_table_is_gone_or_damaged_is_left_out_and_named(
     (note,) = [note for note in found.notes if "run_00" in note]
     said = {
         "gone": f"the file {table}.parquet of the results is gone; slip results verify --repair",
-        "damaged": f"the table {table} cannot be read: it is not what was written; analyze the log again",
+        "damaged": f"the table {table} cannot be read: it has changed since it was written; "
+        "analyze the log again",
     }
     assert note.startswith(f"left out, {said[what]}")
 
@@ -142,7 +143,7 @@ def test_where_all_stands_still_nothing_moved(store: Store) -> None:
     drive_a_season(store, [1.8] * 8)
     found = follow(store)
     assert not found.alerts
-    assert format_quiet(found.series, found.parameters) == "nothing moved beyond the threshold"
+    assert format_quiet(found.series, found.parameters) == "no change exceeds the threshold"
     assert "Nothing moved beyond the threshold" in write_trend(store, found).read_text(encoding="utf-8")
 
 
@@ -151,9 +152,9 @@ def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store
     found = follow(store)
     assert not found.alerts
     assert any(
-        "too few runs to find a change of slip, 9 are needed: warthog-2" in note for note in found.notes
+        "too few runs to detect a change of slip, 9 are needed: warthog-2" in note for note in found.notes
     )
-    lack = "a change takes 1 more run on ground that was driven before"
+    lack = "1 more run on a terrain driven before needed"
     assert any(lack in note and "effective_track.k" in note for note in found.notes)
     write_run(
         store,
@@ -188,10 +189,10 @@ def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
     with pytest.raises(SystemExit) as ended:
         main(["fleet", "trend", str(store.root), "--by", "vehicle"])
     assert ended.value.code == 0
-    said = "nothing could be tested: a change of slip takes 9 runs, the most of a group is 1"
+    said = "no test is possible: a change of slip needs 9 runs of a group (the largest has 1)"
     spoken = capsys.readouterr().out
     assert spoken.startswith(said)
-    assert "nothing moved" not in spoken
+    assert "no change exceeds" not in spoken
     page = (store.root / "trend.html").read_text(encoding="utf-8")
     assert said[1:] in page
     assert "Nothing moved" not in page
@@ -335,12 +336,12 @@ def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
     assert found.series[0].points["run"].to_list() == ["gravel_2023_12_12", "ice_2024_7_30"]
     assert found.notes[:2] == (
         (
-            "the clocks of 3 runs start at the very same instant of 2023-11-14, which names contradict: "
+            "the clocks of 3 runs start at the same instant of 2023-11-14, which names contradict: "
             "the dates in the names of 2 count; the others have no date"
         ),
         "left out, because no date is known: asphalt",
     )
-    assert "very same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
+    assert "same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
 
 
 def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:

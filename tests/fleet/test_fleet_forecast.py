@@ -119,7 +119,7 @@ def test_a_terrain_of_other_vehicles_is_no_unknown_one() -> None:
     )
     forecast = Forecast("warthog", "snow", "command", (), (), ("w0", "w1"))
     assert _note_terrain(labels, forecast) == (
-        "no run of warthog is on snow: the forecast is that of another ground, from asphalt, gravel"
+        "no run of warthog is on snow: the prediction is for another terrain, from runs on asphalt, gravel"
     )
 
 

@@ -72,7 +72,7 @@ def test_other_ground_is_no_change_of_the_vehicle() -> None:
 def test_on_one_ground_the_ground_may_have_changed() -> None:
     trend = follow_one(make_season(np.random.default_rng(3), ["asphalt"] * 12, step=0.2, since=6))
     (change,) = trend.changes
-    assert change.likely == "a change of tyre pressure or load, or other ground"
+    assert change.likely == "a change of tyre pressure or load, or other terrain"
 
 
 def test_a_run_that_stands_apart_is_no_change_and_hides_none() -> None:
@@ -117,7 +117,7 @@ def test_a_run_that_does_not_determine_a_number_sets_no_scale() -> None:
 def test_grounds_driven_once_cannot_be_compared_over_time() -> None:
     trend = follow_one(make_season(np.random.default_rng(7), ["asphalt", "gravel", "sand"]))
     assert trend.changes == ()
-    assert trend.need == "3 more runs on ground that was driven before"
+    assert trend.need == "3 more runs on a terrain driven before"
 
 
 def test_a_second_change_is_found_beside_the_first() -> None:

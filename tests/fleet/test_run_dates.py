@@ -23,7 +23,7 @@ def test_a_start_that_a_name_contradicts_dates_no_other_run() -> None:
     assert found.days == {"ice_2024_7_30": "2024-07-30", "gravel": None, "tile": "2023-11-14"}
     assert found.notes == (
         (
-            "the clocks of 2 runs start at the very same instant of 2023-11-14, which names contradict: "
+            "the clocks of 2 runs start at the same instant of 2023-11-14, which names contradict: "
             "the dates in the names of 1 count; the others have no date"
         ),
     )
@@ -60,7 +60,7 @@ def test_runs_of_one_instant_are_ordered_by_name_and_that_is_said() -> None:
     }
     assert found.notes == (
         (
-            "2 runs start at the very same instant, 2023-11-14 22:13:20 UTC, "
+            "2 runs start at the same instant, 2023-11-14 22:13:20 UTC, "
             "and are in the order of their names: a, b"
         ),
     )

@@ -102,7 +102,7 @@ def test_nothing_is_called_a_change_where_nothing_changed(same: Sides) -> None:
 
     assert found.code == KEPT
     verdict = format_verdict(found)
-    assert verdict.startswith("No change shown in 4 numbers.")
+    assert verdict.startswith("No change shown in 4 quantities.")
     assert "is not detectable with these 6 runs" in verdict
     assert "default spread" not in verdict
 
@@ -114,7 +114,7 @@ def test_a_check_in_which_most_numbers_are_unknown_shows_nothing(same: Sides) ->
     blind = replace(found, changes={**found.changes, **hidden})
     assert (found.is_compared, blind.is_compared) == (True, False)
     assert blind.code == UNDETERMINED
-    assert "most numbers of the model cannot be compared" in format_verdict(blind)
+    assert "most parameters of the model cannot be compared" in format_verdict(blind)
 
 
 def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> None:
@@ -125,7 +125,7 @@ def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> N
     unseen = replace(check, changes={**check.changes, name: blind})
     rows = [text for label, text in list_lines(unseen) if label == "not shown"]
     (row,) = (text for text in rows if text.startswith(name))
-    assert row.endswith("too few runs to see one of its own size")
+    assert row.endswith("too few runs to detect a change of its own size")
     (case,) = (one for one in read_suite(unseen).iter("testcase") if one.get("name") == name)
     assert case.find("skipped") is not None
     assert "| not shown |" in format_markdown(unseen)
@@ -138,7 +138,7 @@ def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) 
         changed = replace(check, changes={**check.changes, POSITION_ERROR: one})
         (row,) = ((label, text) for label, text in list_lines(changed) if text.startswith(POSITION_ERROR))
         assert row[0] == outcome
-        assert row[1].endswith("too few runs to see it double") == (outcome == "not shown")
+        assert row[1].endswith("too few runs to detect a factor of two") == (outcome == "not shown")
 
 
 def test_what_a_model_states_without_an_interval_beside_others_is_not_compared(model: ModelFile) -> None:
@@ -176,7 +176,7 @@ def test_an_error_that_no_number_explains_is_a_finding_of_its_own(windy: Sides) 
     found = compare(windy)
 
     assert set(found.list_status("changed")) & {"error.position", "error.heading"}
-    assert "by no effect of the model: run slip diagnose on AFTER" in format_verdict(found)
+    assert "and no effect of the model explains it: run slip diagnose on AFTER" in format_verdict(found)
 
 
 def read_suite(found: Check) -> ET.Element:

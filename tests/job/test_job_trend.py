@@ -84,7 +84,7 @@ def test_a_track_that_changed_raises_the_alert(three: Path, capsys: pytest.Captu
         one for one in found["parameters"] if (one["effect"], one["parameter"]) == ("effective_track", "k")
     ]
     assert [point["day"] for point in number["points"]] == ["2026-05-01", "2026-05-02", "2026-05-03"]
-    assert number["need"] == "1 more run on ground that was driven before"
+    assert number["need"] == "1 more run on a terrain driven before"
     for point, track in zip(number["points"], [1.4, 1.5, 1.9], strict=True):
         assert math.isclose(point["value"], track, rel_tol=0.03)
 
@@ -123,4 +123,4 @@ def test_a_track_that_changed_on_two_grounds_is_one_alert_in_analyzed_logs(tmp_p
     assert alert.text.startswith(f"{QUANTITY} of husky_a200 1.6")
     assert "since 2026-05-07 (" in alert.text
     assert "likely a change of tyre pressure or load" in alert.text
-    assert "other ground" not in alert.text
+    assert "other terrain" not in alert.text

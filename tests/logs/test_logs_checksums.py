@@ -126,7 +126,7 @@ def test_a_log_without_checksums_is_called_unchecked(tmp_path: Path) -> None:
     write_official(path, enable_crcs=False)
     data, _ = read_small(path)
     assert not data.losses
-    assert data.unchecked == "no checksum covers its messages: damage in them cannot be seen"
+    assert data.unchecked == "no checksum covers its messages: damage in them cannot be detected"
     write_official(path)
     assert not read_small(path)[0].unchecked
 

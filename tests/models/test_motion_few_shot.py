@@ -184,15 +184,12 @@ def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.Captu
     assert other["high"] - other["low"] > k["high"] - k["low"]
     assert (elsewhere["runs_on_terrain"], elsewhere["runs_elsewhere"]) == (0, 3)
     assert elsewhere["notes"] == [
-        (
-            "ice is an unknown terrain, no run is on it: the forecast is that of another ground, from tile. "
-            "Known: tile"
-        )
+        ("no run is on ice: the prediction is for another terrain, from runs on tile. Known: tile")
     ]
     assert told["notes"] == []
     typo = run_slip(capsys, *chosen, "--terrain", "tille")[1].splitlines()
     assert typo[0] == "husky_a200 on tille: 0 runs there, 3 elsewhere"
-    assert typo[1].startswith("! tille is an unknown terrain, no run is on it")
+    assert typo[1].startswith("! no run is on tille: the prediction is for another terrain")
     assert "Did you mean tile?" in typo[1]
     text = run_slip(capsys, *chosen, "--terrain", "tile")[1]
     assert "position error over 2 s" in text
@@ -215,7 +212,7 @@ def test_a_run_with_a_damaged_table_is_left_out_and_named_by_all_of_the_fleet(
     damaged = Store(known).manifests()[1]
     path = damaged.path("poses")
     path.write_bytes(path.read_bytes()[:1000])
-    why = "the table poses cannot be read: it is not what was written"
+    why = "the table poses cannot be read: it has changed since it was written"
     note = f"left out, {why}; analyze the log again with --force: {damaged.run}"
     there = ("--vehicle", "husky_a200", "--terrain", "tile", "--input", "measured")
     for words in (("fit",), ("predict", *there), ("trend",)):

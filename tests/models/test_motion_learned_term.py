@@ -371,7 +371,7 @@ def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list
     assert worse is not None
     assert found.bands is not None
     assert worse.bands is not None
-    assert found.bands.of == "of 2 grounds, each left out in turn"
+    assert found.bands.of == "of 2 terrains, each left out in turn"
     # What differs between grounds belongs into the band.
     assert worse.bands.position > 1.2 * found.bands.position
     assert leave_grounds_out(alone, model) is None

@@ -341,9 +341,9 @@ def test_what_a_plan_leaves_open_says_what_decides_it(
 
 def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reaches() -> None:
     (left,) = _ask_for("speed_slip", 15.0, "20x10m", 0.3).impossible
-    tried = "none of the drives that were tried, of up to 114 s, decides it"
-    assert left.because.startswith(f"{tried}; what shows it: ")
-    assert re.fullmatch(r"at best t = [1-4]\.\d of 5", left.reached)
+    tried = "no drive of up to 114 s that was tried decides it"
+    assert left.because.startswith(f"{tried}; to observe it: ")
+    assert re.fullmatch(r"expected t = [1-4]\.\d, required 5", left.reached)
 
 
 class _Promising:
@@ -390,17 +390,18 @@ def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
     steepest = float(np.abs(np.diff(plan.commands.turn)).max()) * RATE_HZ
     (stated,) = re.findall(r"([\d.]+) rad/s\^2", limits)
     assert steepest <= 1.001 * float(stated)
-    assert why == "not decided  a or b: too small"
+    assert why == "undecided    a or b: too small"
 
 
 def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
     two = ("no drive; turn both ways; drive backward", "no drive; drive backward; turn both ways")
     questions = (
-        *(Impossible(f"q{i}", (), reason, f"at best t = {i}.0 of 5") for i, reason in enumerate(two)),
+        *(Impossible(f"q{i}", (), reason, f"expected t = {i}.0, required 5") for i, reason in enumerate(two)),
         Impossible("q2", (), "give a larger --area"),
     )
+    both = "q0 (expected t = 0.0, required 5); q1 (expected t = 1.0, required 5)"
     assert replace(plan, impossible=questions).list_impossible() == [
-        "q0 (at best t = 0.0 of 5); q1 (at best t = 1.0 of 5): no drive; turn both ways; drive backward",
+        f"{both}: no drive; turn both ways; drive backward",
         "q2: give a larger --area",
     ]
 
@@ -485,7 +486,7 @@ def test_time_that_is_left_answers_later_questions_or_is_said_to_be_of_no_use(pl
     new = {one.question for one in both.promises} - {one.question for one in plan.promises}
     assert new == {"whether deadband acts"}
     assert plan.spare_s == pytest.approx(60.0 - plan.commands.duration_s)
-    assert replace(plan, spare_s=20.0).format_rest().endswith("20 s more would decide nothing else")
+    assert replace(plan, spare_s=20.0).format_rest().endswith("20 more seconds would decide nothing else")
     interval = replace(plan.promises[0], kind="interval")
     narrow = replace(plan, promises=(interval,), spare_s=20.0, spare_gain=0.07)
-    assert narrow.format_rest().endswith("20 s more would narrow no interval by more than 7 %")
+    assert narrow.format_rest().endswith("20 more seconds would narrow no interval by more than 7 %")

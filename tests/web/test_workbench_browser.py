@@ -285,7 +285,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.wait("document.querySelectorAll('.card').length === 2")
         chrome.click("[data-tab=effects]")
         chrome.wait("document.querySelectorAll('[data-figure=ladder] .mark-rect path').length === 3")
-        chrome.wait("document.querySelector('.said').textContent === '+ all 2 that were found'")
+        chrome.wait("document.querySelector('.said').textContent === '+ all 2 of the diagnosis'")
         look_for_trouble(chrome)
 
 

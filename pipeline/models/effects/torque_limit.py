@@ -3,8 +3,8 @@
     dOmega/dt = (u - Omega) / tau within +-limit, each wheel
 
 tau [s] and limit [rad/s^2]. After a small step the wheels follow like a drive lag; after a large one the
-motors give all they have, and the lag begins where limit tau is left. A ramp that is commanded to the drive is
-another thing: there the lag follows the ramp. Command small and large steps of speed.
+motors give their maximum, and the lag begins where limit tau remains. A commanded ramp is different: there
+the lag follows the ramp. Command small and large steps of speed.
 
 Source: saturation of a speed controller; Astrom and Murray, Feedback Systems, chapter 10.
 """

@@ -27,7 +27,7 @@ from pipeline.report.theme import Channel, Chart, encode_column, find_range, lay
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),
-    "y": ("sideways velocity v_y, left positive", "m/s"),
+    "y": ("lateral velocity v_y, left positive", "m/s"),
     "w": ("yaw rate v_w, left positive", "rad/s"),
 }
 
@@ -79,7 +79,7 @@ def _format_velocities(scene: Scene) -> str:
     """Names of the lines and their root mean square distance."""
     words = [figures.SERIES_WORDS[name] for name in scene.slip]
     return (
-        "Forward velocity, sideways velocity and yaw rate over time in three panels: measured"
+        "Forward velocity, lateral velocity and yaw rate over time in three panels: measured"
         + "".join(f", {word}" for word in words)
         + (", model" if scene.report.motion else "")
         + ". The distance between a line and the measured one is the slip in that direction."
@@ -359,7 +359,7 @@ def draw_budget(scene: Scene) -> Drawing | None:
     note = (
         "Bars: share of the mean square slip; the 2 s error is the mean square error of position. "
         "Shapley shares (independent of order). Lines are 95 % intervals. "
-        "A bar to the right makes slip larger."
+        "Shares are taken off from 100 %; a negative share is a step to the right: it increases slip."
     )
     return Drawing(chart, {"budget": rows}, note, _format_split(scene, rows))
 

@@ -70,7 +70,7 @@ REACH = Figure(
     id="reach",
 )
 
-QUANTITIES = {"x": ("forward", "m/s"), "y": ("sideways", "m/s"), "w": ("yaw rate", "rad/s")}
+QUANTITIES = {"x": ("forward", "m/s"), "y": ("lateral", "m/s"), "w": ("yaw rate", "rad/s")}
 
 _BINS = 18
 _FEWEST = 12
@@ -88,7 +88,7 @@ def draw_residuals(scene: Scene) -> Drawing | None:
     rows = list_residuals(scene)
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
     chart = stack(*panels).resolve_scale(x="independent", y="independent")
-    note = "Lines: medians; bands: the middle half. A line along zero does not depend on that signal."
+    note = "Lines: medians; bands: interquartile range. A residual with a line along zero does not depend on that signal."
     return Drawing(
         chart.properties(usermeta={"gutter": figures.GUTTER}), rows, note, _format_residuals(motion)
     )
@@ -213,7 +213,7 @@ def draw_autocorrelation(scene: Scene) -> Drawing | None:
         return None
     titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
     chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
-    note = "Grey: 95 % band of white noise. A curve outside of it for seconds is unmodelled structure."
+    note = "Grey: 95 % band of white noise. A curve outside of it for seconds shows unmodelled structure."
     return Drawing(chart, rows, note, _format_autocorrelation(rows))
 
 
@@ -314,7 +314,7 @@ AUTOCORRELATION = Figure(
     id="autocorrelation",
 )
 
-_WORDS = {"f_x": "speed", "f_y": "sideways speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
+_WORDS = {"f_x": "speed", "f_y": "lateral speed", "f_w": "yaw rate", "f_x_f_w": "speed \u00d7 yaw rate"}
 
 
 def draw_crosscorrelation(scene: Scene) -> Drawing | None:
@@ -372,7 +372,7 @@ CROSSCORRELATION = Figure(
     id="crosscorrelation",
 )
 
-_SERIES = {"before": "error without it", "after": "with it", "curve": "what it does"}
+_SERIES = {"before": "error without it", "after": "with it", "curve": "its effect"}
 
 
 def draw_signature(scene: Scene) -> Drawing | None:
@@ -466,7 +466,7 @@ def _draw_panel_of_signature(signature: Signature, colour: str) -> Chart:
 
 def _note(signature: Signature) -> str:
     variable = VARIABLES[signature.variable][0]
-    return f"{format_known_share(signature.explained)} of what it does is a function of the {variable}."
+    return f"{format_known_share(signature.explained)} of its effect is a function of the {variable}."
 
 
 def _format_signature(signature: Signature) -> str:

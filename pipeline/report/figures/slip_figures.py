@@ -292,7 +292,7 @@ def draw_navigator(scene: Scene) -> Drawing | None:
         figures.SHOWN_SPAN: pl.DataFrame({"t_start": [span[0]], "t_end": [span[1]]}),
     }
     length = span[1] - span[0]
-    note = f"Drawn large below: the {length:g} s with the most slip. Drag over the strip to draw others."
+    note = f"Enlarged below: the {length:g} s with the most slip. Drag over the strip to draw others."
     words = (
         f"Slip speed {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
         f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
@@ -403,7 +403,7 @@ def draw_step_response(scene: Scene) -> Drawing | None:
     if not panels:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
-    note = "Change since the step, median over commands held for three seconds; 1 is what was asked."
+    note = "Change since the step, median over commands held for three seconds; 1 is the commanded change."
     return Drawing(chart, rows, note, _format_step_response(rows))
 
 
