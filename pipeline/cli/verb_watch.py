@@ -16,7 +16,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Choices, build_options, print_lines, print_note, spell_choices
-from pipeline.core import SlipError, format_duration, format_share, naming_os_errors, suffix_unit
+from pipeline.core import INPUT_WORDS, SlipError, format_duration, format_share, naming_os_errors, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.job.watch import Watch
@@ -186,7 +186,7 @@ def list_statements(seen: Content) -> list[tuple[str, str]]:
 
 
 def _format_medians(medians: Mapping[str, float], when: str) -> str:
-    parts = [f"{value:.3g} m/s from {name.replace('measured', 'wheels')}" for name, value in medians.items()]
+    parts = [f"{value:.3g} m/s {INPUT_WORDS.get(name, name)}" for name, value in medians.items()]
     return f"{', '.join(parts)} {when}" if parts else ""
 
 

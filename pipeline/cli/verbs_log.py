@@ -236,7 +236,7 @@ def _format_log(seen: Inspection) -> list[str]:
         for role in _ROLES:
             source = getattr(seen.sources, role)
             if source or role != "power":
-                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else '-'}")
+                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else 'none'}")
         lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
     if seen.choice is not None:
         lines += _format_ratings(seen.choice.ratings)
@@ -259,7 +259,7 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
     """Table of the ratings of the pose candidates, the chosen one first."""
     if not ratings:
         return []
-    rows = [("pose candidates", "frames", "new Hz", "of time", "not wheels'", "verdict")]
+    rows = [("pose candidates", "frames", "Hz", "coverage", "off wheels", "reason")]
     for rating in ratings:
         share = "-" if rating.beside_wheels is None else format_share(rating.beside_wheels)
         frames = f"{rating.parent or '?'} -> {rating.child or '?'}"

@@ -445,7 +445,7 @@ _INDENT = 2
 def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
     """Comment lines above the parameters: the head, and the effects that none of them covers."""
     unmapped = facts.list_unmapped(sheet)
-    lines = [*sheet.head, *(["No parameter there stands for:"] if unmapped else [])]
+    lines = [*sheet.head, *(["Not covered by these parameters:"] if unmapped else [])]
     return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
 
 

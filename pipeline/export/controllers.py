@@ -112,7 +112,7 @@ def _add_differential(facts: Facts, sheet: Sheet) -> None:
     sheet.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
     sheet.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
     track = facts.take(Quantity.TRACK)
-    sheet.add(f"{node}.wheel_separation_multiplier", track, "in place of the one in use")
+    sheet.add(f"{node}.wheel_separation_multiplier", track, "replaces the present multiplier")
     left = combine(lambda k, e: k * (1.0 - e / 2.0), radius, difference)
     right = combine(lambda k, e: k * (1.0 + e / 2.0), radius, difference)
     sheet.add(f"{node}.left_wheel_radius_multiplier", left)
@@ -227,9 +227,7 @@ def _warn(file: ModelFile, step: _Step, known: Collection[Quantity]) -> list[str
     """Reasons why the variances are larger than necessary."""
     lines = []
     if file.fit.get("input") != "measured":
-        lines.append(
-            "fitted on commands; for odometry of encoders: --on LOG, whose measured wheels then count"
-        )
+        lines.append("fitted from commands; for wheel odometry give --on LOG, which fits from wheel encoders")
     unseen = " ".join(effect.id for effect in file.model if not _is_seen(effect, known))
     if unseen and len(step.effects) < len(file.model.effects):
         lines.append(f"odometry does not follow {unseen}; sharper: slip model drop MODEL {unseen} --on LOG")
@@ -279,7 +277,7 @@ def write_autoware(file: ModelFile, current: Current) -> str:
 
 def _add_offset(facts: Facts, sheet: Sheet) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
-    sign = "measured less true angle: what is steered of itself to the left is a negative bias"
+    sign = "measured minus true angle: an offset to the left is a negative bias"
     sheet.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
     if offset.is_known:
         sheet.head.append(

@@ -433,8 +433,9 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
     most = max((one.points.height for one in series), default=0)
     if most >= FEWEST_RUNS or any(not one.need for one in parameters):
         return "no change exceeds the threshold"
+    largest = f"(the largest has {most})"
     return (
-        f"no test is possible: a change of slip needs {FEWEST_RUNS} runs of a group (the largest has {most}), "
+        f"no test is possible: a change of slip needs {FEWEST_RUNS} runs of a group {largest}, "
         "a change of a parameter four runs on one terrain"
     )
 

@@ -50,7 +50,7 @@ def test_ramps_of_the_command_are_limits_of_acceleration() -> None:
     # Of two limits the smaller one holds; ros2_control has a parameter for both.
     steep = make(*effects, find_effect("acceleration_limit")(limit=99.0))
     assert take("nav2", steep)["FollowPath.ax_max"] == p["FollowPath.ax_max"]
-    assert "No parameter there stands for" not in export_model(make(*effects[2:]), "ros2_control")
+    assert "Not covered by these parameters" not in export_model(make(*effects[2:]), "ros2_control")
 
 
 def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
@@ -59,7 +59,7 @@ def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
     file = make(*effects)
     spin = predict(file, [(-1.0, -99.0, 99.0)], 4.0)
     assert spin[-1, 6] == pytest.approx(take("nav2", file)["FollowPath.wz_max"], rel=1e-4)
-    assert "# No parameter there stands for:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
+    assert "# Not covered by these parameters:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
     # What the body reaches is not known with a track that is not: the command's own limit is written.
     leo = vehicle_of("leo_rover")
     fit = FIT | {"undecided": [["effective_track", "icr_lateral"]]}
