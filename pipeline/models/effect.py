@@ -256,7 +256,8 @@ class Effect(ABC):
             names = [name for _, name, _, _ in Formatter().parse(part) if name]
             if unknown.isdisjoint(name if name in self.values else name_of_first for name in names):
                 parts.append(part.format(**words))
-        return ", ".join(parts)
+        # A part in brackets stands without its comma.
+        return ", ".join(parts).replace(", (", " (")
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""

@@ -256,7 +256,7 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
         ]
         for row in shown.sort("median_modulus").iter_rows(named=True)
     ]
-    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; every run has the same weight, whatever its length"
+    caption = f"Medians over runs, slip {INPUT_WORDS[input_name]}; every run has the same weight"
     # Columns without any value, not computed or not in the logs, are omitted.
     columns = [
         i for i in range(len(_DATASETS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)

@@ -25,7 +25,7 @@ def test_what_is_clear_is_not_refused() -> None:
     ("gain", "word"),
     [
         (Improvement(t=12.0, t_stable=9.0, gain=0.004), "less than 1 %"),
-        (Improvement(t=3.0, t_stable=2.6, gain=0.05), "t = 3.0; 5 is needed"),
+        (Improvement(t=3.0, t_stable=2.6, gain=0.05), "t = 3.0, required 5"),
         (Improvement(t=9.0, t_stable=0.5, gain=0.05), "not significant"),
     ],
     ids=["small", "uncertain", "of_one_event"],
@@ -74,5 +74,7 @@ def test_errors_that_rise_or_do_not_fall_speak_against_an_addition(
 def test_refusals_are_said_in_one_clause() -> None:
     one = "with these values it acts as drive_lag"
     assert format_refusals({"side_lag": one}) == f"side_lag is not supported by the data ({one})"
-    assert format_refusals({"side_lag": one, "turn_lag": one}).startswith("side_lag, turn_lag do not help")
+    assert format_refusals({"side_lag": one, "turn_lag": one}).startswith(
+        "side_lag, turn_lag are not supported by the data"
+    )
     assert format_refusals({"side_lag": one, "turn_lag": "no"}).endswith(f"(side_lag: {one}; turn_lag: no)")

@@ -88,7 +88,7 @@ def draw_residuals(scene: Scene) -> Drawing | None:
     rows = list_residuals(scene)
     panels = [_draw_panel(motion, component, rows[f"residual_{component}"]) for component in COMPONENTS]
     chart = stack(*panels).resolve_scale(x="independent", y="independent")
-    note = "Lines: medians; bands: interquartile range. A residual with a line along zero does not depend on that signal."
+    note = "Lines: medians; bands: interquartile range. A line along zero means no dependence on that signal."
     return Drawing(
         chart.properties(usermeta={"gutter": figures.GUTTER}), rows, note, _format_residuals(motion)
     )
