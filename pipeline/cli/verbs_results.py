@@ -180,7 +180,7 @@ def status(  # noqa: D417 - arguments document themselves
     *,
     json: bool = False,
 ) -> int:
-    """Show the state of the logs of all batches, and the size of the results.
+    """Show the state of all logs, and the size of the results.
 
     Args:
         json: print one JSON object.

@@ -89,7 +89,7 @@ def test_two_models_are_compared_on_one_input(
     change(results, capsys, "fit", model, "--input", "measured")
     found = change(results, capsys, "compare", model, other)
 
-    (own,) = (text for text in found["warnings"] if "is not held out" in text)
+    (own,) = (text for text in found["warnings"] if "is not a held-out error" in text)
     assert own.startswith(f"{model} was fitted to {RUN}")
     assert found["input"] == "command"
     assert len(change(results, capsys, "compare", model, model)["compared"]) == 1

@@ -51,7 +51,7 @@ def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("name", "words"),
     [
         ("missing.mcap", ["no such file", "Check the path"]),
-        ("empty.mcap", ["no bytes"]),
+        ("empty.mcap", ["is empty"]),
         ("text.mcap", ["MCAP"]),
         ("no_pose.mcap", ["pose", "None of its topics holds any: record", "/cmd_vel"]),
         ("no_command.mcap", ["command", "[command] topic", "/odom"]),
@@ -245,7 +245,7 @@ def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> No
                 ("fleet", "predict", "--vehicle", "warthog", "--terrain", "ice"),
             )
         ),
-        (("diagnose", "no/such", "--apply", "model.toml"), "there is no run 'no/such'"),
+        (("diagnose", "no/such", "--apply", "model.toml"), "'no/such' is neither a log nor a run"),
         (("inspect", "missing.mcap"), "missing.mcap: there is no such file. Check the path."),
         (("plan", "--check", "robot.toml", "log.mcap"), "this is not a plan.toml"),
         (("model", "add", "robot.toml", "drive_lag", "--on"), "--on names no run"),

@@ -144,7 +144,7 @@ def test_where_all_stands_still_nothing_moved(store: Store) -> None:
     found = follow(store)
     assert not found.alerts
     assert format_quiet(found.series, found.parameters) == "no change exceeds the threshold"
-    assert "Nothing moved beyond the threshold" in write_trend(store, found).read_text(encoding="utf-8")
+    assert "No change exceeds the threshold" in write_trend(store, found).read_text(encoding="utf-8")
 
 
 def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store) -> None:

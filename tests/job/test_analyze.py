@@ -297,7 +297,7 @@ def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(
     misspelt = whole.replace(b'"reason"', b'"reas0n"')
     for damaged in (whole[:-9], b"[]", b"[" * 5000, b"\xff" + whole[1:], misspelt):
         path.write_bytes(damaged)
-        with pytest.raises(SlipError, match="not what was written") as caught:
+        with pytest.raises(SlipError, match="has changed since it was written") as caught:
             analyze(log, out)
         assert caught.value.code == "file_damaged"
     assert analyze(log, out, force=True).summary["run"]

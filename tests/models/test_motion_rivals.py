@@ -259,7 +259,7 @@ def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Pat
 
     shown = run_verb("model", "compare", "--against", "literature", *on).stdout
     assert "icr_asymmetric" in shown
-    assert "* smallest; = larger by no more than chance" in shown
+    assert "* smallest; = not significantly larger" in shown
     assert "has the smallest error of heading" in shown
 
 

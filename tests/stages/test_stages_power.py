@@ -91,7 +91,7 @@ def test_power_is_told_over_time_and_over_the_way(tmp_path: Path) -> None:
     assert power.filter(pl.col("t") < 1.0)["energy_per_m"].null_count() >= 1
     (told,) = manifest.read("findings").filter(pl.col("id") == "power_drawn").to_dicts()
     assert told["value"] == pytest.approx(PER_METRE, rel=0.02)
-    assert "J a metre" in told["text"]
+    assert " J/m (median)" in told["text"]
 
 
 def test_inspect_says_where_power_is_read(tmp_path: Path) -> None:

@@ -130,7 +130,7 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(results: Path) -> None:
     assert found["value"] == pytest.approx(0.30 / 0.165, rel=1e-6)
     # In turns the wheels differ by half of what it says: its track, too, is the Warthog's.
     assert "their difference is 0.53 times the commanded one" in found["text"]
-    assert "wheels of 0.3 m radius on a track of 1.08 m, as those of Clearpath Warthog" in found["text"]
+    assert "a wheel radius of 0.3 m and a track of 1.08 m, as of Clearpath Warthog" in found["text"]
 
 
 @pytest.mark.parametrize("name", ["husky_wheels_wetgrass", "warthog_wheels_asphalt_2024_9_20_8h13s12"])

@@ -298,7 +298,7 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
     assert {finding.where for finding in found} == {"command speed", "command yaw rate"}
     assert all(finding.value is not None and 0.2 < finding.value < 0.8 for finding in found)
     (speed,) = (finding for finding in found if finding.where == "command speed")
-    assert speed.text.endswith("so that this limit does not act")
+    assert speed.text.endswith("so this limit does not act")
     clipped = drive(replace(FIELD, vehicle=eager, effects={"body_speed_limit": 1.0}))
     texts = {one.where: one.text for one in clipped.findings if one.id == "command_beyond_limit"}
     assert texts["command speed"].endswith("the controller may clip it")
@@ -309,7 +309,7 @@ def test_trap_19_commands_beyond_the_limits_are_told(drive: TakeThrough) -> None
 def test_trap_21_a_command_of_another_radius_is_found(drive: TakeThrough, scale: float) -> None:
     taken = drive(replace(LONGER, recording=Recording(command_scale=scale)))
     assert taken.finding("command_scale").value == pytest.approx(1.0 / scale, rel=0.02)
-    assert "no single scale holds" not in taken.finding("command_scale").text
+    assert "no single scale fits" not in taken.finding("command_scale").text
     assert "controller_multiplier" not in taken.ids()
 
 

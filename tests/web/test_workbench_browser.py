@@ -274,7 +274,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.wait(SHOWN)
         named = (
             "[...document.querySelectorAll('.proposals li')].filter((entry) =>"
-            " entry.textContent.includes('found by the diagnosis')).map((entry) => entry.dataset.effect)"
+            " entry.textContent.includes('identified by the diagnosis')).map((entry) => entry.dataset.effect)"
         )
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
         manifest = Store(tmp_path / "out").manifest("field/late")
