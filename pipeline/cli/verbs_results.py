@@ -323,7 +323,7 @@ def _format_check(verification: Verification) -> list[str]:
     lines = [f"{verification.checked} runs checked"]
     files, read_logs = verification.examination.files, verification.read_logs
     is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
-    read = "all that was read" if is_sample or verification.remote else "all"
+    read = "all files that were read" if is_sample or verification.remote else "all files"
     if is_sample:
         lines.append(
             f"sample   {files.looked_at} of {files.all} files and "
@@ -346,7 +346,7 @@ def _format_check(verification: Verification) -> list[str]:
             "`slip results verify --repair` adds them."
         )
     if verification.is_clean:
-        lines.append(f"{read} is unchanged")
+        lines.append(f"{read} are unchanged")
     else:
         if any(each.action == "queued" for each in verification.repairs):
             lines.append("`slip batch` over those logs makes it again.")

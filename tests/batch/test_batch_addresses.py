@@ -141,7 +141,7 @@ def test_verify_says_what_was_not_asked_and_finds_nothing_wrong_with_it(
     said = capsys.readouterr().out
     assert "remote   s3://stranger/logs/a.mcap (season/a)" in said
     assert "--follow-remote" in said
-    assert "all that was read is unchanged" in said
+    assert "all files that were read are unchanged" in said
     for scheme in ("http", "ftp", "sftp", "github", "s3x"):
         name_address(out, f"{scheme}://{host}/a.mcap")
         for option in ("--logs", "--follow-remote"):

@@ -104,7 +104,7 @@ def test_a_sample_says_how_much_was_looked_at(tmp_path: Path, capsys: pytest.Cap
     assert max(looked_at) < files["all"]
     code, said = slip(capsys, "results", "verify", out, "--sample", "20%", "--seed", seed)
     assert f"sample   {files['looked_at']} of {files['all']} files" in said
-    assert "all that was read is unchanged" in said
+    assert "all files that were read are unchanged" in said
     for manifest in Store(out).manifests():
         manifest.path("slip").unlink()
     assert slip(capsys, "results", "verify", out, "--sample", "0.001%")[0] == 1
