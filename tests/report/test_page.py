@@ -350,7 +350,7 @@ def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     assert "Easily confused with wheel_radius." in told
     assert "lateral skid or centre of rotation: drive circles" in told
     assert "not observable in this log" in told
-    assert "off by 1.06 m and 55 degrees; with the named effects 31 cm" in told
+    assert "ideal model 1.06 m and 55 degrees; with the named effects 31 cm" in told
     assert "slip diagnose field/2026-11-02_warthog --apply model.toml" in told
 
 

@@ -73,7 +73,7 @@ def test_late_starts_are_marked_for_as_long_as_they_are_late(vehicle: Vehicle) -
     (found,) = findings
     assert (found.id, found.count) == ("late_start", 4)
     assert found.value == pytest.approx(0.8, abs=0.06)
-    assert "late in 4 of 10 starts" in found.text
+    assert "in 4 of 10 starts" in found.text
 
 
 @pytest.mark.parametrize("seed", range(6))
