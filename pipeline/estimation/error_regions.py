@@ -252,6 +252,7 @@ def _cut_sideways(aside: Floats) -> list[tuple[str, str, Flags]]:
     return regions
 
 
+_KNOWN_TO = 1.2  # factor to which a noise floor is known: nine of ten drawn logs are within it
 ABOVE_FLOOR = 1.5
 """Factor over the (estimated) noise floor above which an error over 2 s is not noise."""
 # A larger share is rounded to more than 100 %: the error is below the noise floor.
@@ -382,7 +383,7 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
 def format_excess(ratio: float) -> str:
     """A remaining error in times the noise floor: `at`, `1.6 times`."""
     text = f"{ratio:.2g}" if ratio < 9.95 else f"{ratio:.0f}"  # noqa: PLR2004 - 10 has two digits
-    return f"{text} times" if float(text) >= ABOVE_FLOOR else "at"
+    return f"{text} times" if float(text) >= _KNOWN_TO else "at"
 
 
 def format_errors(errors: Mapping[str, object]) -> str:

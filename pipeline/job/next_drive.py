@@ -197,7 +197,7 @@ class Wish:
             time, all open questions.
         speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for those of the vehicle.
         topic, type_name: topic and type of the played commands; None for those of the recorded command.
-        seed: seed seed of the random draws.
+        seed: seed of the random draws.
     """
 
     area: Area

@@ -121,9 +121,9 @@ def test_what_is_too_small_to_be_named_is_not_unexplained() -> None:
     )
     alone = draw_diagnosis({}, [(0.4, 0.2)], immaterial=[small])
     assert check_verdict(alone).endswith(
-        "Beside lateral skid, too small to be named, no known effect explains it."
+        "Beside lateral skid, too small to be named, no known effect explains the error."
     )
-    assert check_verdict({**alone, "immaterial": [unknown]}).endswith("No known effect explains it.")
+    assert check_verdict({**alone, "immaterial": [unknown]}).endswith("No known effect explains the error.")
 
 
 def test_what_removes_less_than_a_tenth_is_counted_and_not_told() -> None:
