@@ -13,7 +13,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
-from pipeline.simulate import VEHICLES, Disturbance, Ground, Scenario, simulate_run, write_log
+from pipeline.simulate import VEHICLES, Disturbance, Ground, Scenario, simulate_case, simulate_run, write_log
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -69,3 +69,15 @@ def test_on_level_ground_no_slope_loads_the_wheels() -> None:
     assert load.can_show(Conditions(largest, slope_rad=0.05))
     assert not load.can_show(Conditions(largest, encoders=True, slope_rad=0.01))
     assert not load.can_show(Conditions(largest, encoders=True))
+
+
+def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp_path: Path) -> None:
+    """4 m/s^2 are 78 rad/s^2 of a wheel of 5 cm: it was named a brake lag and a pause of reversals."""
+    hidden = {"acceleration_limit": 78.0, "steering_lag": 0.1, "steering_gain": 0.88}
+    out = tmp_path / "run.mcap"
+    log = simulate_case(None, hidden, out=out, seed=3, duration_s=120.0, platform="f1tenth")
+    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(log, options).manifest)
+    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    found = {effect.id: next(iter(effect.parameters.values())).value for effect in told.effects}
+    assert found == pytest.approx(hidden, rel=0.05)

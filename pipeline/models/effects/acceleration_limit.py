@@ -30,7 +30,7 @@ class AccelerationLimit(DriveEffect):
             INF,
             "largest wheel acceleration",
             3.0,
-            starts=(1.0, 2.5, 6.0, 12.0, 25.0),
+            starts=(1.0, 2.5, 6.0, 12.0, 25.0, 60.0),
             step=1e-2,
             quantities=(Quantity.WHEEL_ACCELERATION_LIMIT,),
         ),
