@@ -75,7 +75,7 @@ def format_verdict(diagnosis: Content) -> str:
     elif SEARCH_CUT in noted:
         open_ends.append("the budget ended the search for effects early")
     elif measure_excess(diagnosis) >= ABOVE_FLOOR:
-        open_ends.append(f"{_tell_small(diagnosis)}no known effect explains the rest")
+        open_ends.append(f"{_name_small(diagnosis)}no known effect explains the rest")
     rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
@@ -160,17 +160,19 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     ]
     if open_groups:
         return [*sentences, f"The cause is {open_groups[0]}, which this log does not separate"]
-    return [*sentences, f"{_tell_small(diagnosis)}no known effect explains the error"]
+    return [*sentences, f"{_name_small(diagnosis)}no known effect explains the error"]
 
 
-def _tell_small(diagnosis: Content) -> str:
+def _name_small(diagnosis: Content) -> str:
     """What explains some of the rest and is left out of the model, as the beginning of a clause."""
     small = []
     for one in objects_in(diagnosis, "immaterial"):
         numbers = mapping_in(one, "parameters")
         if not any(mapping_in(numbers, key).get("undetermined") for key in numbers):
             small.append(str(one["id"]))
-    return f"beside {enumerate_texts(_list_names(small))}, too small to be named, " if small else ""
+    return (
+        f"apart from {enumerate_texts(_list_names(small))} below the detection threshold, " if small else ""
+    )
 
 
 def _list_clauses(diagnosis: Content) -> dict[str, str]:

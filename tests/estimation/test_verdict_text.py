@@ -117,11 +117,11 @@ def test_what_is_too_small_to_be_named_is_not_unexplained() -> None:
     unknown = {"id": "acceleration_limit", "parameters": {"limit": {"value": 143.0, "undetermined": True}}}
     drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)], immaterial=[small, unknown])
     assert check_verdict(drawn).endswith(
-        "Beside lateral skid, too small to be named, no known effect explains the rest."
+        "Apart from lateral skid below the detection threshold, no known effect explains the rest."
     )
     alone = draw_diagnosis({}, [(0.4, 0.2)], immaterial=[small])
     assert check_verdict(alone).endswith(
-        "Beside lateral skid, too small to be named, no known effect explains the error."
+        "Apart from lateral skid below the detection threshold, no known effect explains the error."
     )
     assert check_verdict({**alone, "immaterial": [unknown]}).endswith("No known effect explains the error.")
 
