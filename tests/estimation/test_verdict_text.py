@@ -177,9 +177,9 @@ def test_alternatives_stand_in_and_doubts_are_named() -> None:
 
 
 def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
-    close, far = [(0.06, 0.02)], [(0.4, 0.2)]
+    close, far = [(0.055, 0.02)], [(0.4, 0.2)]
     nothing = check_verdict(draw_diagnosis({}, close))
-    assert nothing.endswith(f"6 cm and 1.1 degrees off, at the noise floor. {NOTHING_MISSING}.")
+    assert nothing.endswith(f"5.5 cm and 1.1 degrees off, at the noise floor. {NOTHING_MISSING}.")
     assert check_verdict(draw_diagnosis({}, far)).endswith(
         "off, 10 times the noise floor in heading and 8 times in position. "
         "No known effect explains the error."
@@ -286,7 +286,8 @@ def test_without_a_noise_floor_nobody_says_that_nothing_is_missing() -> None:
 @pytest.mark.parametrize(
     ("error", "says"),
     [
-        (0.072, "at the noise floor"),
+        (0.057, "at the noise floor"),
+        (0.072, "1.4 times the noise floor"),
         (0.074, "1.5 times the noise floor"),
         (0.08, "1.6 times the noise floor"),
     ],
