@@ -2,7 +2,7 @@
 
     abs(ddelta/dt) <= limit
 
-limit [rad/s], 0.2 to 0.6 at the tyres of a car. Ask for large and quick changes of the steering: slow ones
+limit [rad/s], 0.2 to 0.6 at the tyres of a car. Command large and quick changes of steering: slow ones
 are reached at once and do not show it.
 
 Source: the steering rate limit of vehicle models; Rajamani, Vehicle Dynamics and Control, steering actuators.
