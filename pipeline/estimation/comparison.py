@@ -352,7 +352,7 @@ class Comparison:
         _, velocity = self._measure_velocity(first, last)
         # The velocity over this time is used after its end only, so that no earlier score depends on it.
         known = (self._locate_nodes(last), velocity)
-        unknown = np.full((grid.first.size, 3), np.nan)
+        unknown = np.full((grid.first.size, 4), np.nan)
         spans = Resets(grid.span, grid.first, grid.first, unknown)
         return RunContext(
             vehicle=vehicle,
@@ -378,7 +378,7 @@ class Comparison:
         number = np.searchsorted(first, np.arange(grid.times.size), side="right") - 1
         wheels = base.wheels
         if self.run.wheels is not None:
-            wheels = Resets(number, first, first, np.full((first.size, 3), np.nan))
+            wheels = Resets(number, first, first, np.full((first.size, 4), np.nan))
         at, velocity = self._measure_velocity(before, origin)
         good = np.isfinite(velocity).all(axis=1)
         at = np.concatenate((base.body.at, at[good]))

@@ -232,8 +232,9 @@ class _Drive:
 
 def _map_resets(resets: Resets) -> dict[int, tuple[float, float, float]]:
     """Known states, by the cell before which they are set."""
-    good = np.isfinite(resets.start).all(axis=1)
-    rows = zip(resets.at[good].tolist(), resets.start[good].tolist(), strict=True)
+    start = resets.start[:, :3]
+    good = np.isfinite(start).all(axis=1)
+    rows = zip(resets.at[good].tolist(), start[good].tolist(), strict=True)
     return {cell: (one, two, three) for cell, (one, two, three) in rows}
 
 

@@ -225,7 +225,7 @@ class Forward:
         return made
 
     def _hold(self, effects: Sequence[Effect], delay_s: float) -> Wheels:
-        first = np.full((self.grid.first.size, 3), np.nan)
+        first = np.full((self.grid.first.size, 4), np.nan)
         if self._encoders is not None:
             first = self._encoders.interpolate(self.grid.starts, delay_s).stack()
         commands = self._held.begin_spans(first)

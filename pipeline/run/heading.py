@@ -179,15 +179,16 @@ class HeldDrive:
         self._held = Commands(times[order], *sides, sideways)
 
     def begin_spans(self, measured: Floats) -> Commands:
-        """Commands with a first value for every span: the wheel speeds there, or its first command.
+        """Commands with a first value for every span: what is measured there, or its first command.
 
         Args:
-            measured: left, right and sideways speeds at each span's start, NaN where unknown, shape (k, 3).
+            measured: at each span's start, as `Wheels.stack`; NaN where unknown, shape (k, 4).
         """
         held = self._held
         left, right = self._begin(held.left, measured[:, 0]), self._begin(held.right, measured[:, 1])
         sideways = None if held.sideways is None else self._begin(held.sideways, measured[:, 2])
-        return replace(held, left=left, right=right, sideways=sideways)
+        steering = self._begin(held.steering, measured[:, 3])
+        return replace(held, left=left, right=right, sideways=sideways, steering=steering)
 
     def _begin(self, values: Floats, seen: Floats) -> Floats:
         started = values.copy()

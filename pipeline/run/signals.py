@@ -105,9 +105,9 @@ class Wheels:
     idle: Floats | None = None
 
     def stack(self) -> Floats:
-        """Columns left, right and sideways [rad/s], shape (n, 3)."""
+        """Columns left, right and sideways [rad/s], and steering [rad], shape (n, 4)."""
         sideways = np.zeros_like(self.left) if self.sideways is None else self.sideways
-        return np.column_stack((self.left, self.right, sideways))
+        return np.column_stack((self.left, self.right, sideways, self.steering))
 
     def change_each_wheel(self, change: ChangeWheel, context: RunContext) -> Wheels:
         """The output with the speed of every wheel changed, each from its own state.
@@ -117,10 +117,10 @@ class Wheels:
 
         Args:
             change: function of the speed of a wheel, shape (n,), resets, and its state at each, shape (k,).
-            context: of the run; left, right and sideways are the states of its resets, shape (k, 3).
+            context: of the run; of its resets, left, right and sideways are the states.
         """
         asked, resets = split_wheels(self), context.wheels
-        left, right, sideways = resets.start.T
+        left, right, sideways = resets.start[:, :3].T
         states = split_wheels(Wheels(left, right, np.zeros(0), None if self.sideways is None else sideways))
         if self.sideways is not None and resets is not context.spans:
             free = [change(wheel, context.spans, context.spans.start[:, 0]) for wheel in asked]
@@ -231,8 +231,8 @@ class RunContext:
         start_s: start of the run [s].
         step_s: width of a cell [s].
         duration_s: length of the run [s].
-        spans: resets at the starts of spans; states unknown.
-        wheels: resets with known wheel speeds: (left, right, sideways) [rad/s].
+        spans: resets at the starts of spans, with the same columns.
+        wheels: resets with known output of the drivetrain: columns of `Wheels.stack`.
         body: resets with known body velocity: (v_x, v_y, v_w).
         attitude: roll, pitch, yaw as reported [rad], shape (n, 3).
         position: x, y as reported [m], shape (n, 2).

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
 import pytest
-from motion_runs import simulate, vehicle_of
+from motion_runs import align, extract, make_scenario, simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.parts import WheelPart
 from pipeline.estimation.problem import average_sustained, measure_exceeded
 from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.parameter import OVERSHOOT
-from pipeline.simulate import VEHICLES
+from pipeline.run import load_run
+from pipeline.simulate import VEHICLES, Program, simulate_run
 
 HUSKY = vehicle_of("husky_a200")
 
@@ -54,6 +56,33 @@ def test_four_wheels_that_turn_against_each_other_go_on_where_a_prediction_begin
         found = comparison.find_horizon_errors(known, state.timing[0])
         errors.append(float(np.sqrt(np.mean(found.yaw**2))))
     assert errors[1] < 1.5 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "values"), [("steering_lag", {"tau": 0.6}), ("steering_rate_limit", {"limit": 0.2})]
+)
+def test_after_a_gap_a_car_goes_on_with_the_measured_steering(name: str, values: dict[str, float]) -> None:
+    """The steering [rad] began at the speed of the left wheel [rad/s]: 100 rad/s of wrong yaw rate."""
+    half_speed, car = Program(speed_scale=0.5), vehicle_of("ackermann_car")
+    made = simulate_run(make_scenario({name: values}, vehicle=VEHICLES["car"], program=half_speed))
+    whole = extract(made, car)
+    times, steering = whole["wheels"]["t"].to_numpy(), whole["wheels"]["steering"].to_numpy()
+    middle = (times > 30.0) & (times < 100.0)
+    end = float(times[np.argmax(np.abs(np.gradient(steering**2, times)) * middle)])
+    outside = (pl.col("t") < end - 10.0) | (pl.col("t") > end)
+    cut = {key: table.filter(outside) for key, table in whole.items()}
+    rates = []
+    for tables in (whole, cut):
+        problem = Problem([load_run(align(tables, car), car, name="cut")], car, Input.COMMAND)
+        (comparison,), timing = problem.comparisons, problem.start_state().timing[0]
+        velocity = comparison.predict_velocity([find_effect(name)(**values)], timing)
+        rates.append((comparison.grid.times, velocity.w))
+    assert comparison.grid.starts.size == 2
+    after = (comparison.grid.times > end) & (comparison.grid.times < end + 20.0)
+    expected = np.interp(comparison.grid.times[after], *rates[0])
+    error, size = rates[1][1][after] - expected, np.sqrt(np.mean(expected**2))
+    assert np.abs(steering[np.searchsorted(times, end)]) > 0.1
+    assert np.sqrt(np.mean(error**2)) < 0.05 * size
 
 
 def test_one_wrong_reading_is_no_speed_that_lasts() -> None:

@@ -45,5 +45,5 @@ class SteeringLag(DriveEffect):
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         spans = context.spans
-        lagged = lag_signal(wheels.steering, self.values["tau"], context.step_s, spans, spans.start[:, 0])
+        lagged = lag_signal(wheels.steering, self.values["tau"], context.step_s, spans, spans.start[:, 3])
         return replace(wheels, steering=lagged)

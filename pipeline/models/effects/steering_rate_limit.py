@@ -45,5 +45,5 @@ class SteeringRateLimit(DriveEffect):
         if self.is_neutral:
             return wheels
         spans = context.spans
-        turned = limit_rate(wheels.steering, self.values["limit"], context.step_s, spans, spans.start[:, 0])
+        turned = limit_rate(wheels.steering, self.values["limit"], context.step_s, spans, spans.start[:, 3])
         return replace(wheels, steering=turned)
