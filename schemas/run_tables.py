@@ -81,7 +81,7 @@ UNIT_TOLERANCE = 1e-6
 class Poses(Table):
     """One row a pose message of base_link in a fixed frame."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     t = schemas.seconds()
     stamp = schemas.stamp()
@@ -94,6 +94,7 @@ class Poses(Table):
     )
     outlier = schemas.flag("in an incident, or the localization is at fault: left out of medians and fits")
     held = schemas.flag("repeats the pose before it: an old estimate sampled again")
+    corrected = schemas.flag("the localization corrected the odometry since the pose before it")
     active = schemas.flag("inside an interval in which commands are live")
 
     @dy.rule()

@@ -153,6 +153,9 @@ LONGEST_WAIT_S = 1.5
 """Longest time between two poses of a waiting localization [s]; above it, waiting and a vehicle at rest are
 not distinguishable. On the recordings 99 of 100 times are at most 1.2 s. Half and double change no finding of
 two recordings."""
+_REPEATED_SHARE = 0.2
+"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
+recordings have none, or 0.49 to 0.80."""
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
@@ -355,3 +358,18 @@ def cut_segments(poses: pl.DataFrame) -> list[dict[str, NDArray[Any]]]:
     return [
         {name: values[rows] for name, values in columns.items()} for rows in group_rows(columns["segment"])
     ]
+
+
+def measure_repeats(poses: pl.DataFrame) -> float:
+    """Period of the stamps of table `poses` [s] if many of them repeat the pose before; else zero."""
+    held = poses["held"].mean()
+    repeated = isinstance(held, float) and held > _REPEATED_SHARE
+    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
+
+
+def measure_corrections(poses: pl.DataFrame) -> float:
+    """Median time between corrections in table `poses` [s]; zero if there are none."""
+    if "corrected" not in poses.columns:
+        return 0.0
+    times = poses.filter("corrected")["t"].to_numpy()
+    return float(np.median(np.diff(times))) if times.size > 1 else 0.0

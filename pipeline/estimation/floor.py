@@ -30,8 +30,8 @@ _LAGS = 6
 NEAR_S = 0.07
 """Tolerance of the start of a paired window [s]."""
 # Correlation times [s] of random motion, and of structure.
-_PASSING_S = (0.25, 0.5)
-_LASTING_S = (1.5, 4.0, 16.0)
+_PASSING_S: tuple[float, ...] = (0.25, 0.5)
+_LASTING_S: tuple[float, ...] = (1.5, 4.0, 16.0)
 """Correlation times of structure, which a model could still explain [s]."""
 # Weight of the variance itself: covariances are known less accurately.
 _FIRST = 4.0
@@ -54,9 +54,10 @@ class Makeup:
     Attributes:
         jitter: variance by errors of single poses.
         walk: variance by a random walk: independent errors of each window.
-        passing: variance of random motion, by `_PASSING_S`, shape (2,).
-        lasting: variance of structure, by `_LASTING_S`, shape (3,).
+        passing: variance of random motion, by correlation time, shape (k,).
+        lasting: variance of structure, by correlation time, shape (l,).
         correlation: correlation with the window 0.5, 1, ... s later, shape (lags,).
+        passing_s: correlation times of random motion [s].
     """
 
     jitter: float
@@ -64,6 +65,7 @@ class Makeup:
     passing: Floats
     lasting: Floats
     correlation: Floats
+    passing_s: tuple[float, ...] = _PASSING_S
 
     @property
     def lasting_share(self) -> float:
@@ -76,19 +78,11 @@ class Makeup:
         """Error of a single pose [m or rad]: a window is the difference of two over its length."""
         return WINDOW_S * math.sqrt(0.5 * self.jitter)
 
-    def spread_after(self, seconds: Floats, *, lasting: bool) -> Floats:
-        """Variance of the integral of the residual over ``seconds``, with or without structure.
-
-        Args:
-            seconds: shape (n,).
-            lasting: whether structure is included.
-        """
+    def spread_after(self, seconds: Floats) -> Floats:
+        """Variance of the integral of the residual without structure over ``seconds``, shape (n,)."""
         total = self.jitter * WINDOW_S**2 + self.walk * WINDOW_S * seconds
-        for share, time in zip(self.passing.tolist(), _PASSING_S, strict=True):
+        for share, time in zip(self.passing.tolist(), self.passing_s, strict=True):
             total = total + share * _grow(seconds, time) / _grow(np.array([WINDOW_S]), time) * WINDOW_S**2
-        if lasting:
-            for share, time in zip(self.lasting.tolist(), _LASTING_S, strict=True):
-                total = total + share * _grow(seconds, time) / _grow(np.array([WINDOW_S]), time) * WINDOW_S**2
         return total
 
 
@@ -193,39 +187,39 @@ def _split(covariance: Floats) -> Makeup:
     )
 
 
-def split_differences(squares: Floats, windows: int) -> Makeup:
+def split_differences(squares: Floats, windows: int, corrected_s: float = 0.0) -> Makeup:
     """Components of the motion of one channel under the same input.
 
     Args:
         squares: half the mean squares of the differences of windows 0, 0.5, 1, ... s apart, NaN where there
             are too few, shape (k,), k <= 6.
         windows: number of windows: with few of them, structure is not distinguishable from chance.
+        corrected_s: time between two corrections of the localization [s], between which its error grows
+            steadily: motion for half of it is noise.
     """
+    passing, lasting = _PASSING_S, _LASTING_S
+    if corrected_s > 0.0:
+        passing = (*passing, 0.5 * corrected_s)
+        lasting = tuple(time for time in lasting if time > 2.0 * corrected_s)
     jitter = np.ones(squares.size)
     jitter[0] = 1.5
-    passing = [
-        jitter,
-        np.ones(squares.size),
-        *(1.0 - _repeat(time)[1 : squares.size + 1] for time in _PASSING_S),
-    ]
-    lasting = [1.0 - _repeat(time)[1 : squares.size + 1] for time in _LASTING_S]
-    design, known = np.column_stack([*passing, *lasting]), len(passing)
+    grown = (1.0 - _repeat(time)[1 : squares.size + 1] for time in (*passing, *lasting))
+    design, known = np.column_stack([jitter, np.ones(squares.size), *grown]), 2 + len(passing)
     measured = np.isfinite(squares)
     if not measured.any():
         measured, squares = ~measured, np.full(squares.size, _LEAST)
     design, squares = design[measured], squares[measured]
     parts = solve_nonnegative(design, squares)
-    grown = float((design[:, known:] @ parts[known:])[-1])
-    if grown < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
+    structure = float((design[:, known:] @ parts[known:])[-1])
+    if structure < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
         # Differences grow a little with the time between them by chance: that is not structure.
         parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
         parts[known:] = 0.0
     # Noise within two standard errors of the first square cannot be told from none.
     least = 2.0 * math.sqrt(2.0 * _PAIRS_EACH / max(windows, 1)) * float(squares[0])
     parts[1] += max(least - float(design[0, :known] @ parts[:known]), 0.0)
-    return Makeup(
-        float(parts[0]), float(parts[1]), parts[2:known], parts[known:], 1.0 - squares / squares[-1]
-    )
+    correlation = 1.0 - squares / squares[-1]
+    return Makeup(float(parts[0]), float(parts[1]), parts[2:known], parts[known:], correlation, passing)
 
 
 def _repeat(time: float) -> Floats:
@@ -304,11 +298,12 @@ def estimate_floor(problem: Problem) -> Errors:
     squares = repeats[:, 0] * np.array([_smooth_falling(shares) for shares in repeats[:, 1].T]).T
     # Differences that grow with the time between windows are structure: they have an unknown cause.
     windows = sum(history.shape[0] for history, _ in described)
-    x, y, w = (split_differences(np.maximum(row, _LEAST), windows) for row in squares.T)
+    corrected = max(comparison.run.corrected_s for comparison in comparisons)
+    x, y, w = (split_differences(np.maximum(row, _LEAST), windows, corrected) for row in squares.T)
     after = np.linspace(0.25, 2.0, 8)
-    turned = w.spread_after(after, lasting=False)
+    turned = w.spread_after(after)
     speed = np.concatenate([np.abs(history[:, 0, 0]) for history, _ in described])
-    along = x.spread_after(after, lasting=False) + y.spread_after(after, lasting=False)
+    along = x.spread_after(after) + y.spread_after(after)
     position = np.sqrt(along + float(np.mean(speed**2)) * after**2 * _share_lever(w, turned))
     yaw = np.sqrt(turned)
     rms = np.sqrt([part.jitter + part.walk + part.passing.sum() for part in (x, y, w)])

@@ -93,6 +93,8 @@ class TransformSeries:
         log_time: log times of the link next to the child [ns], int64, shape (n,).
         position: [m], shape (n, 3).
         quaternion: (x, y, z, w), unit, shape (n, 4).
+        corrected: whether a link above the moving one changed since the stamp before: a localization
+            corrected the odometry, shape (n,).
         notes: held, omitted or ambiguous transforms.
     """
 
@@ -102,6 +104,7 @@ class TransformSeries:
     log_time: Ints
     position: Floats
     quaternion: Floats
+    corrected: Flags
     notes: tuple[str, ...]
 
 
@@ -181,7 +184,10 @@ class TransformBuffer:
             notes.append(f"{int((~known).sum())} of {known.size} stamps lie where the chain is not known")
         time = time[known]
         position, quaternion = np.zeros((time.size, 3)), np.tile([0.0, 0.0, 0.0, 1.0], (time.size, 1))
+        corrected = np.zeros(time.size, dtype=np.bool_)
         for link, forward in steps:
+            if link is not leading:
+                corrected |= _changes(link, time)
             step_position, step_quaternion = _pose_at(link, leading, time)
             if not forward:
                 step_quaternion = invert_quaternions(step_quaternion)
@@ -190,7 +196,7 @@ class TransformBuffer:
             quaternion = multiply_quaternions(quaternion, step_quaternion)
         log_time = leading.log_time[known] if leading is not None and at is None else time
         return TransformSeries(
-            _clean(parent), _clean(child), time, log_time, position, quaternion, tuple(notes)
+            _clean(parent), _clean(child), time, log_time, position, quaternion, corrected, tuple(notes)
         )
 
     def _steps(self, chain: tuple[str, ...]) -> list[tuple[Link, bool]]:
@@ -308,6 +314,14 @@ def _covers(link: Link, time: Ints) -> Flags:
     held = int(_HELD_INTERVALS * interval + lead)
     covered: Flags = (time >= link.time[0] - held) & (time <= link.time[-1] + held)
     return covered
+
+
+def _changes(link: Link, time: Ints) -> Flags:
+    """Stamps before which, and after the stamp before, a link changed."""
+    changed = link.time[~find_held(link.position, link.quaternion)][1:]
+    counted = np.searchsorted(changed, time, side="right")
+    flags: Flags = np.diff(counted, prepend=counted[:1]) > 0
+    return flags
 
 
 def _date_back(link: Link, leading: Link, notes: list[str]) -> Link:

@@ -32,9 +32,6 @@ class MotionError(SlipError):
 
 _DEAD = 1e-9
 """Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
-_REPEATED_SHARE = 0.2
-"""Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
-recordings have none, or 0.49 to 0.80."""
 _ROLLS = 0.3
 """Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 cm/s of a Warthog."""
 _INPUTS = ("command", "measured")
@@ -157,6 +154,7 @@ class MotionRun:
         alignment: corrections of the recording.
         repeats_s: period of the published poses [s] if they are repeated until the next one is computed; zero
             if each is new.
+        corrected_s: time between corrections of an odometry by its localization [s]; zero if unknown.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
         origin: where its zero lies in the recording, see `anchored`.
     """
@@ -174,6 +172,7 @@ class MotionRun:
     duration_s: float
     alignment: Alignment
     repeats_s: float = 0.0
+    corrected_s: float = 0.0
     is_on_course: bool = False
     origin: Origin = Origin()
 
@@ -316,7 +315,8 @@ def make_run(
         excluded=excluded,
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
-        repeats_s=_measure_repeats(tables["poses"]),
+        repeats_s=rigid.measure_repeats(tables["poses"]),
+        corrected_s=rigid.measure_corrections(tables["poses"]),
         is_on_course=_is_on_course(tables.get("findings")),
     )
 
@@ -324,13 +324,6 @@ def make_run(
 def _is_on_course(findings: pl.DataFrame | None) -> bool:
     """See `MotionRun.is_on_course`."""
     return findings is not None and not findings.is_empty() and "heading_from_course" in findings["id"]
-
-
-def _measure_repeats(poses: pl.DataFrame) -> float:
-    """See `MotionRun.repeats_s`."""
-    held = poses["held"].mean()
-    repeated = isinstance(held, float) and held > _REPEATED_SHARE
-    return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
 _ALIGNED = (

@@ -248,6 +248,7 @@ class _Extraction:
                 **{name: track.position[:, i] for i, name in enumerate("xyz")},
                 **{f"q_{name}": track.quaternion[:, i] for i, name in enumerate("xyzw")},
                 "held": track.held,
+                "corrected": arrays.corrected if arrays.corrected is not None else np.zeros_like(track.held),
                 "active": is_inside(times, spans),
             }
         )
@@ -260,7 +261,9 @@ class _Extraction:
             raise self._nothing("pose", topic)
         if self.chain is not None:
             chain, order = self.chain, self._order(clock)
-            arrays = reading.PoseArrays(chain.position, chain.quaternion, chain.parent, chain.child)
+            arrays = reading.PoseArrays(
+                chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
+            )
             arrays, log_times = arrays.take(order), chain.log_time
             self.findings += pose_topics.report_chain(chain, topic)
         elif columns is None:

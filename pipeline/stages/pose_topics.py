@@ -23,6 +23,9 @@ from pipeline.stages.satellite import Located, Receiver, find_heading, follow_tr
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
 """Extent of the positions [m] above which a body moves; the noise of bodies at rest is smaller."""
+_SPARSE_S: Final = 1.0
+"""Time between two corrections [s] above which they are sparse: two windows of velocities. AMCL comes to
+0.3 s, slam_toolbox to 1 to 3 s."""
 _LISTED: Final = 8
 """Number of bodies that an error lists."""
 
@@ -383,6 +386,13 @@ def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
             "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
         )
         findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
+    period = np.diff(series.time[series.corrected]) * 1e-9
+    if period.size and (often := float(np.median(period))) > _SPARSE_S:
+        text = (
+            f"the localization corrects the odometry every {often:.2g} s (median): the poses between are the "
+            "odometry, with each correction spread along the path before it"
+        )
+        findings.append(Finding("sparse_corrections", "info", text, where=topic))
     return findings + [Finding("transform_note", "info", note, where=topic) for note in series.notes]
 
 

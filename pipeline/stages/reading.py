@@ -338,16 +338,23 @@ def with_stamps(columns: TopicColumns) -> TopicColumns:
 
 @dataclass(frozen=True)
 class PoseArrays:
-    """Poses as recorded: position (n, 3) [m], quaternion (n, 4), and their frames."""
+    """Poses as recorded: position (n, 3) [m], quaternion (n, 4), and their frames.
+
+    Those of a chain of transforms know where a localization corrected the odometry, shape (n,).
+    """
 
     position: Floats
     quaternion: Floats
     parent: str
     child: str
+    corrected: Flags | None = None
 
     def take(self, rows: Ints) -> PoseArrays:
         """Some of the poses, in the given order."""
-        return replace(self, position=self.position[rows], quaternion=self.quaternion[rows])
+        corrected = None if self.corrected is None else self.corrected[rows]
+        return replace(
+            self, position=self.position[rows], quaternion=self.quaternion[rows], corrected=corrected
+        )
 
 
 def read_pose_topic(columns: TopicColumns) -> PoseArrays:

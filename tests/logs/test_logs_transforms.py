@@ -142,6 +142,7 @@ def test_a_correction_that_waits_for_motion_is_the_drift_along_the_path(tmp_path
     assert np.allclose(off[moved], 3.0)
     assert np.abs(off[(rows > changes[jump - 1]) & (rows < changes[jump] - 4)]).max() < 0.05
     assert [note for note in series.notes if "dated 1 s ahead" in note]
+    assert rows[series.corrected].tolist() == [row for row in changes.tolist() if row in rows]
 
 
 def test_a_missing_chain_names_the_known_frames(tmp_path: Path) -> None:

@@ -64,7 +64,7 @@ TIMES = {"t": 0.0, "stamp": 1, "log_time": 1}
 POSE = {
     **WHO, **TIMES, "segment": 0, "x": 0.0, "y": 0.0, "z": 0.0,
     "q_x": 0.0, "q_y": 0.0, "q_z": 0.0, "q_w": 1.0, "latency": 0.0, "outlier": False,
-    "held": False, "active": True,
+    "held": False, "corrected": False, "active": True,
 }  # fmt: skip
 DRIVE = {**WHO, **TIMES, "left": 1.0, "right": 1.0, "speed": None, "steering": None, "active": True}
 WHEEL = {**DRIVE, "latency": 0.0}
