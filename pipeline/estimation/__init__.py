@@ -192,7 +192,7 @@ def _explore(
 def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
     search = search_body(context, source, known, budget)
     comparisons = search.selection.part.comparisons
-    places = np.concatenate([find_places(comparison) for comparison in comparisons])
+    places = find_places(comparisons)
     final = search_formula(search.selection, search.start, search.final, places)
     # Where a formula explains the residual, boosting is skipped.
     features = None if collect_terms(final) else list_window_signals(comparisons)[0]

@@ -25,6 +25,7 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.apportion import apportion, find_moments
 from pipeline.estimation.comparison import Input
+from pipeline.estimation.constancy import find_change
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Unexplained
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
@@ -129,7 +130,7 @@ def summarize(
     unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
-    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
+    places = find_places(part.comparisons)
     hidden = {name for item in undecided for name in item.candidates}
     hidden = hidden.union(*({effect.id, *effect.searched_as} for effect in taken))
     described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
@@ -139,7 +140,7 @@ def summarize(
         near = (one for path in paths for one in path.not_significant)
         conditions = list(find_unless(judgement, named, near, hidden))
         named = _note_unless(named, conditions)
-        doubts += [one.note for name, one in conditions if name is None]
+        doubts += [*(one.note for name, one in conditions if name is None), *find_change(judgement)]
         hidden.update(one.id for _, one in conditions)
     stated = hidden.union(*(effect.contains for effect in taken))
     unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
@@ -189,8 +190,7 @@ def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
     """
     search = paths[0].search
     part = search.selection.part
-    places = np.concatenate([find_places(comparison) for comparison in part.comparisons])
-    region = find_main_region(part, search.final.held, places)
+    region = find_main_region(part, search.final.held, find_places(part.comparisons))
     if region is not None:
         return f"the remaining error is not spread evenly: {region.sentence}"
     room = _find_room(judgement)

@@ -299,11 +299,11 @@ def _average(signal: Floats, at: Floats, comparison: Comparison) -> Floats:
     return (ends[1] - ends[0]) / 0.5
 
 
-def find_places(comparison: Comparison) -> Floats:
-    """Where the vehicle was at the middle of every window: x, y in the map [m], shape (n, 2)."""
-    at = comparison.windows.times.mean(axis=1)
-    track = comparison.run.track
-    return np.column_stack([np.interp(at, track.times, column) for column in track.position.T])
+def find_places(comparisons: Sequence[Comparison]) -> Floats:
+    """Where the vehicle was at the middle of every window of runs: x, y in the map [m], shape (n, 2)."""
+    middles = [(comparison.windows.times.mean(axis=1), comparison.run.track) for comparison in comparisons]
+    places = [np.array([np.interp(at, t.times, column) for column in t.position.T]).T for at, t in middles]
+    return np.concatenate(places)
 
 
 _BINS = 8

@@ -22,6 +22,8 @@ Entry = TypeVar("Entry")
 
 FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 """Findings of which one makes every fit meaningless: no effect is named."""
+CHANGE = "changing_number"
+"""The finding of a run during which a number of the model changes."""
 SEARCH_CUT = "search_cut"
 """The finding of a run whose budget ended the search for effects before it was complete."""
 FORMULA = "unexplained"
@@ -68,15 +70,7 @@ def format_verdict(diagnosis: Content) -> str:
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
-    open_ends = [_describe_choice(diagnosis)]
-    noted = {one.get("id") for one in findings}
-    if BREVITY in noted:
-        open_ends.append("the run is too short for certainty")
-    elif SEARCH_CUT in noted:
-        open_ends.append("the budget ended the search for effects early")
-    elif measure_excess(diagnosis) >= ABOVE_FLOOR:
-        open_ends.append(f"{_name_small(diagnosis)}no known effect explains the rest")
-    rest = [text] if (text := "; ".join(filter(None, open_ends))) else []
+    rest = [text] if (text := "; ".join(filter(None, _list_open_ends(diagnosis)))) else []
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
@@ -87,6 +81,19 @@ def format_verdict(diagnosis: Content) -> str:
         if len(verdict) <= _LONGEST:
             break
     return verdict
+
+
+def _list_open_ends(diagnosis: Content) -> tuple[str, str]:
+    """What the log does not decide, and why error remains, as clauses; empty without."""
+    noted = {one.get("id"): str(one.get("text")) for one in objects_in(diagnosis, "findings")}
+    why = noted.get(CHANGE, "")
+    if not why and BREVITY in noted:
+        why = "the run is too short for certainty"
+    elif not why and SEARCH_CUT in noted:
+        why = "the budget ended the search for effects early"
+    elif not why and measure_excess(diagnosis) >= ABOVE_FLOOR:
+        why = f"{_name_small(diagnosis)}no known effect explains the rest"
+    return _describe_choice(diagnosis), why
 
 
 def rank_main(ladder: Sequence[Content]) -> dict[str, float]:

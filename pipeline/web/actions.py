@@ -193,7 +193,7 @@ class PreparedRun:
             state = self.state(model, timing)
             whole, comparison = self.problem.whole, self.problem.comparisons[0]
             residual = whole.find_residuals(state)
-            regions = map_errors(whole, residual, find_places(comparison))
+            regions = map_errors(whole, residual, find_places([comparison]))
             return Shown(
                 view=self.stage.view(state, ladder, floor),
                 where=[region.sentence for region in pick_regions(regions, residual, whole.noise)],

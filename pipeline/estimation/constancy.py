@@ -1,0 +1,143 @@
+"""Whether a number of the model changes during a run: a structural break at a time that nobody recorded.
+
+A lag that grows when a load is taken on is no function of any input, and a model with one value for it is
+wrong on both sides of the change. At every time the model is extended by one number, the change of one of its
+own numbers from then on; the Wald statistic of that change is largest at the break (tests for parameter
+instability with unknown change point: Andrews, Econometrica 61, 1993). Its standard error is that of sums
+over blocks, as residuals are autocorrelated. A change is reported if it is significant and if the model,
+fitted before and after it, predicts better.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pipeline.core import suffix_unit
+from pipeline.core.arrays import Floats
+from pipeline.estimation.acceptance import LEAST_T
+from pipeline.estimation.error_regions import format_errors
+from pipeline.estimation.folds import refit, score
+from pipeline.estimation.intervals import sum_blocks
+from pipeline.estimation.ladder import ERRORS_OVER_2S
+from pipeline.estimation.terms import is_term
+from pipeline.estimation.verdict import CHANGE, name_effect
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
+
+    from pipeline.estimation.diagnosis import Json
+    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.ladder import Judgement
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.state import Free, State
+
+_TRIM = 0.15
+"""Share of the blocks at either end within which a change cannot be told from noise (Andrews 1993)."""
+_FALLS = 0.1
+"""Share of an error over 2 s that two values instead of one must remove: on twelve recordings no change of a
+number removes more than 0.02."""
+_RIDGE = 1e-9
+"""Regularization that keeps the equations solvable."""
+
+
+@dataclass(frozen=True)
+class _Change:
+    """The most significant change of a number of a part of the path.
+
+    Attributes:
+        part, fit: the part and its fit.
+        number: the number.
+        time: end of the last block before the change [s].
+        t: the change over its standard error.
+    """
+
+    part: Part
+    fit: PartFit
+    number: Free
+    time: float
+    t: float
+
+
+def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
+    """A finding about the most significant change of a number during a run; empty without a change.
+
+    Of several runs that were fitted together none is examined: they differ from one another.
+    """
+    problem, fitted = judgement.problem, judgement.fitted
+    if len(problem.comparisons) > 1:
+        return []
+    parts = zip(problem.parts, fitted.fits, strict=True)
+    changes = [one for part, fit in parts if fit.free for one in _list_changes(part, fit)]
+    one_value = score(problem, fitted.state).pooled
+    for change in sorted(changes, key=lambda one: -abs(one.t)):
+        errors, values = _fit_both(problem, fitted.state, change)
+        if any(error < (1.0 - _FALLS) * getattr(one_value, name) for name, error in errors.items()):
+            number, since = change.number, change.time - problem.comparisons[0].run.start_s
+            before, after = (f"{value:.2g}{suffix_unit(number.unit)}" for value in values)
+            text = (
+                f"the {name_effect(number.effect)} changes during the run, at {since:.0f} s: {number.name} "
+                f"is {before} before and {after} after; with both values {format_errors(errors)} remain"
+            )
+            return [{"id": CHANGE, "text": text, "where": number.effect, "severity": "warning"}]
+    return []
+
+
+def _fit_both(problem: Problem, state: State, change: _Change) -> tuple[dict[str, float], list[float]]:
+    """Errors over 2 s of the model fitted before and after a change, and both values of the number."""
+    first = change.part.times[:, 1] <= change.time
+    sides = [refit(change.part, change.fit, rows) for rows in (first, ~first)]
+    scored = [score(problem, state.take_over(side, change.fit.free)) for side in sides]
+    early = problem.comparisons[0].horizons.times.mean(axis=1) < change.time
+    position = np.where(early, *(one.position[0] for one in scored))
+    yaw = np.where(early, *(one.yaw[0] for one in scored))
+    rms = (float(np.sqrt(np.nanmean(errors**2))) for errors in (position, yaw))
+    return dict(zip(ERRORS_OVER_2S, rms, strict=True)), [side.get(change.number) for side in sides]
+
+
+def _list_changes(part: Part, fit: PartFit) -> Iterator[_Change]:
+    """The most significant change of every number of the effects, where it is significant."""
+    blocks = sum_blocks(part, fit)
+    numbers, label = blocks.numbers, blocks.label
+    size = np.sqrt(np.einsum("bii->i", numbers.normals)) + 1e-300
+    normals, pulls = numbers.normals / np.outer(size, size), numbers.gradients / size
+    pulls = pulls - pulls.mean(axis=0)
+    margin = max(int(np.ceil(_TRIM * blocks.count)), 2)
+    for index, number in enumerate(fit.free):
+        if not number.effect or is_term(number.effect) or not number.is_smooth:
+            continue
+        statistics = _compare_sides(normals, pulls, index)[margin - 1 : blocks.count - margin]
+        best = int(np.abs(statistics).argmax()) if statistics.size else 0
+        if statistics.size and abs(statistics[best]) > LEAST_T:
+            time = float(part.times[label <= best + margin - 1, 1].max())
+            yield _Change(part, fit, number, time, float(statistics[best]))
+
+
+def _compare_sides(normals: Floats, pulls: Floats, index: int) -> Floats:
+    """Change of a number after each block over its standard error, with all numbers fitted again.
+
+    Args:
+        normals: normal matrices of the blocks, shape (b, p, p).
+        pulls: gradients of the blocks, which sum to zero, shape (b, p).
+        index: of the number.
+
+    Returns:
+        Shape (b - 1,).
+    """
+    whole = normals.sum(axis=0) + _RIDGE * np.eye(normals.shape[1])
+    columns, statistics = normals[:, :, index], np.zeros(normals.shape[0] - 1)
+    for last in range(statistics.size):
+        later = np.arange(normals.shape[0])[:, None] > last
+        beside = np.linalg.solve(whole, (columns * later).sum(axis=0))
+        influence = (pulls[:, index] * later[:, 0]) - pulls @ beside
+        information = float((columns * later).sum(axis=0) @ (np.eye(beside.size)[index] - beside))
+        if information < _RIDGE:
+            continue
+        change = float(influence.sum()) / information
+        rest = pulls + change * (normals @ beside - columns * later)
+        influence = rest[:, index] * later[:, 0] - rest @ beside
+        statistics[last] = change * information / max(float(np.sqrt(np.sum(influence**2))), 1e-300)
+    return statistics
