@@ -5,7 +5,7 @@ wrong on both sides of the change. At every time the model is extended by one nu
 own numbers from then on; the Wald statistic of that change is largest at the break (tests for parameter
 instability with unknown change point: Andrews, Econometrica 61, 1993). Its standard error is that of sums
 over blocks, as residuals are autocorrelated. A change is reported if it is significant and if the model,
-fitted before and after it, predicts better.
+fitted before and after it, predicts better what it was not fitted to.
 """
 
 from __future__ import annotations
@@ -16,20 +16,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import suffix_unit
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Flags, Floats
 from pipeline.estimation.acceptance import LEAST_T
 from pipeline.estimation.error_regions import format_errors
-from pipeline.estimation.folds import refit, score
+from pipeline.estimation.folds import find_in_test, refit, score
 from pipeline.estimation.intervals import sum_blocks
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import CHANGE, name_effect
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.estimation.diagnosis import Json
     from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.folds import HeldOut
     from pipeline.estimation.ladder import Judgement
     from pipeline.estimation.parts import Part
     from pipeline.estimation.problem import Problem
@@ -49,17 +50,25 @@ class _Change:
     """The most significant change of a number of a part of the path.
 
     Attributes:
+        place: of the part among those of the problem.
         part, fit: the part and its fit.
         number: the number.
         time: end of the last block before the change [s].
         t: the change over its standard error.
     """
 
+    place: int
     part: Part
     fit: PartFit
     number: Free
     time: float
     t: float
+
+    def fit_sides(self, state: State, train: Flags) -> list[State]:
+        """The model fitted to the windows before the change, and to those after it."""
+        early = self.part.times[:, 1] <= self.time
+        sides = (refit(self.part, self.fit, train & side) for side in (early, ~early))
+        return [state.take_over(side, self.fit.free) for side in sides]
 
 
 def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
@@ -67,42 +76,59 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
 
     Of several runs that were fitted together none is examined: they differ from one another.
     """
-    problem, fitted = judgement.problem, judgement.fitted
+    problem, state = judgement.problem, judgement.fitted.state
     if len(problem.comparisons) > 1:
         return []
-    parts = zip(problem.parts, fitted.fits, strict=True)
-    changes = [one for part, fit in parts if fit.free for one in _list_changes(part, fit)]
-    one_value = score(problem, fitted.state).pooled
+    parts = enumerate(zip(problem.parts, judgement.fitted.fits, strict=True))
+    changes = [one for place, (part, fit) in parts if fit.free for one in _list_changes(place, part, fit)]
     for change in sorted(changes, key=lambda one: -abs(one.t)):
-        errors, values = _fit_both(problem, fitted.state, change)
-        if any(error < (1.0 - _FALLS) * getattr(one_value, name) for name, error in errors.items()):
-            number, since = change.number, change.time - problem.comparisons[0].run.start_s
-            before, after = (f"{value:.2g}{suffix_unit(number.unit)}" for value in values)
-            text = (
-                f"the {name_effect(number.effect)} changes during the run, at {since:.0f} s: {number.name} "
-                f"is {before} before and {after} after; with both values {format_errors(errors)} remain"
-            )
-            return [{"id": CHANGE, "text": text, "where": number.effect, "severity": "warning"}]
+        sides = change.fit_sides(state, np.ones(change.part.run.size, dtype=np.bool_))
+        if not _is_lower(_predict(problem, change, [sides]), score(problem, state)):
+            continue
+        folds = [change.fit_sides(state, training[change.place]) for training in problem.training]
+        errors = _predict(problem, change, folds)
+        if not _is_lower(errors, judgement.whole.held_out):
+            continue
+        number, since = change.number, change.time - problem.comparisons[0].run.start_s
+        before, after = (f"{side.get(number):.2g}{suffix_unit(number.unit)}" for side in sides)
+        text = (
+            f"the {name_effect(number.effect)} changes during the run, at {since:.0f} s: {number.name} "
+            f"is {before} before and {after} after; with both values {format_errors(errors)} remain"
+        )
+        return [{"id": CHANGE, "text": text, "where": number.effect, "severity": "warning"}]
     return []
 
 
-def _fit_both(problem: Problem, state: State, change: _Change) -> tuple[dict[str, float], list[float]]:
-    """Errors over 2 s of the model fitted before and after a change, and both values of the number."""
-    first = change.part.times[:, 1] <= change.time
-    sides = [refit(change.part, change.fit, rows) for rows in (first, ~first)]
-    scored = [score(problem, state.take_over(side, change.fit.free)) for side in sides]
-    early = problem.comparisons[0].horizons.times.mean(axis=1) < change.time
-    position = np.where(early, *(one.position[0] for one in scored))
-    yaw = np.where(early, *(one.yaw[0] for one in scored))
-    rms = (float(np.sqrt(np.nanmean(errors**2))) for errors in (position, yaw))
-    return dict(zip(ERRORS_OVER_2S, rms, strict=True)), [side.get(change.number) for side in sides]
+def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:
+    return any(error < (1.0 - _FALLS) * getattr(than.pooled, name) for name, error in errors.items())
 
 
-def _list_changes(part: Part, fit: PartFit) -> Iterator[_Change]:
+def _predict(problem: Problem, change: _Change, fitted: Sequence[Sequence[State]]) -> dict[str, float]:
+    """Errors over 2 s with the models before and after a change, by their names in `Errors`.
+
+    Args:
+        problem: the run.
+        change: the change.
+        fitted: both models; of every fold, fitted without its stretches, or one pair for the whole run.
+    """
+    (comparison,) = problem.comparisons
+    early = comparison.horizons.times.mean(axis=1) < change.time
+    squares = np.full((2, early.size), np.nan)
+    tested = [find_in_test(comparison, problem.whole.times, fold.test) for fold in problem.folds]
+    if len(fitted) == 1:
+        tested = [np.ones_like(early)]
+    for sides, near in zip(fitted, tested, strict=True):
+        for state, rows in zip(sides, (near & early, near & ~early), strict=True):
+            errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
+            squares[:, rows] = np.array((errors.position, errors.yaw))[:, rows] ** 2
+    return dict(zip(ERRORS_OVER_2S, np.sqrt(np.nanmean(squares, axis=1)).tolist(), strict=True))
+
+
+def _list_changes(place: int, part: Part, fit: PartFit) -> Iterator[_Change]:
     """The most significant change of every number of the effects, where it is significant."""
     blocks = sum_blocks(part, fit)
     numbers, label = blocks.numbers, blocks.label
-    size = np.sqrt(np.einsum("bii->i", numbers.normals)) + 1e-300
+    size = np.sqrt(np.einsum("bii->i", numbers.normals)) + 1e-100
     normals, pulls = numbers.normals / np.outer(size, size), numbers.gradients / size
     pulls = pulls - pulls.mean(axis=0)
     margin = max(int(np.ceil(_TRIM * blocks.count)), 2)
@@ -113,7 +139,7 @@ def _list_changes(part: Part, fit: PartFit) -> Iterator[_Change]:
         best = int(np.abs(statistics).argmax()) if statistics.size else 0
         if statistics.size and abs(statistics[best]) > LEAST_T:
             time = float(part.times[label <= best + margin - 1, 1].max())
-            yield _Change(part, fit, number, time, float(statistics[best]))
+            yield _Change(place, part, fit, number, time, float(statistics[best]))
 
 
 def _compare_sides(normals: Floats, pulls: Floats, index: int) -> Floats:

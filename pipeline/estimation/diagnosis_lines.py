@@ -35,6 +35,7 @@ from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
 from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     CAUSE_NAMES,
+    CHANGE,
     SEARCH_CUT,
     format_verdict,
     holds_formula,
@@ -279,6 +280,8 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     if measure_excess(run.to_json()) < ABOVE_FLOOR:
         return []
     noted = {one.get("id") for one in run.findings}
+    if CHANGE in noted:
+        return ["next steps: find out what changed at that time: load, tyres, battery, controller or terrain"]
     if SEARCH_CUT in noted:
         return ["next steps: diagnose the run again with a larger --budget"]
     if BREVITY in noted:
