@@ -10,6 +10,7 @@ fitted before and after it, predicts better what it was not fitted to.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 _TRIM = 0.15
 """Share of the blocks at either end within which a change cannot be told from noise (Andrews 1993)."""
 _FALLS = 0.1
-"""Share of an error over 2 s that two values instead of one must remove: on twelve recordings no change of a
+"""Share of the errors over 2 s that two values instead of one must remove: on twelve recordings no change of a
 number removes more than 0.02."""
 _RIDGE = 1e-9
 """Regularization that keeps the equations solvable."""
@@ -100,7 +101,9 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
 
 
 def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:
-    return any(error < (1.0 - _FALLS) * getattr(than.pooled, name) for name, error in errors.items())
+    """Whether the errors of position and heading are lower, in their geometric mean."""
+    ratios = [error / max(getattr(than.pooled, name), 1e-12) for name, error in errors.items()]
+    return math.sqrt(math.prod(ratios)) < 1.0 - _FALLS
 
 
 def _predict(problem: Problem, change: _Change, fitted: Sequence[Sequence[State]]) -> dict[str, float]:
