@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 _TRIM = 0.15
 """Share of the blocks at either end within which a change cannot be told from noise (Andrews 1993)."""
 _FALLS = 0.1
-"""Share of the errors over 2 s that two values instead of one must remove: on twelve recordings no change of a
-number removes more than 0.02."""
+"""Share of the errors over 2 s that two values instead of one must remove: on twelve recordings no change
+removes more than 0.02."""
 _RIDGE = 1e-9
 """Regularization that keeps the equations solvable."""
 
