@@ -11,7 +11,7 @@ fitted before and after it, predicts better what it was not fitted to.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +71,12 @@ class _Change:
         sides = (refit(self.part, self.fit, train & side) for side in (early, ~early))
         return [state.take_over(side, self.fit.free) for side in sides]
 
+    def locate(self, sides: Sequence[State]) -> _Change:
+        """The change at the time at which both models together fit best: blocks are several seconds long."""
+        before, after = (self.fit.weights.cost(self.part.find_residuals(side)) for side in sides)
+        first = int(np.argmin(np.cumsum(before - after)))
+        return replace(self, time=float(self.part.times[first, 1]))
+
 
 def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
     """A finding about the most significant change of a number during a run; empty without a change.
@@ -83,7 +89,9 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
     parts = enumerate(zip(problem.parts, judgement.fitted.fits, strict=True))
     changes = [one for place, (part, fit) in parts if fit.free for one in _list_changes(place, part, fit)]
     for change in sorted(changes, key=lambda one: -abs(one.t)):
-        sides = change.fit_sides(state, np.ones(change.part.run.size, dtype=np.bool_))
+        windows = np.ones(change.part.run.size, dtype=np.bool_)
+        change = change.locate(change.fit_sides(state, windows))  # noqa: PLW2901 - the same, more exactly
+        sides = change.fit_sides(state, windows)
         if not _is_lower(_predict(problem, change, [sides]), score(problem, state)):
             continue
         folds = [change.fit_sides(state, training[change.place]) for training in problem.training]

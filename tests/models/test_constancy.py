@@ -67,7 +67,7 @@ def test_a_number_that_changes_is_found_with_its_time(
     findings = find_change(judgement)
     effect, time, first, second = find(findings)
     assert effect == name
-    assert abs(time - LENGTH_S) < 25.0
+    assert abs(time - LENGTH_S - 0.5 * PAUSE_S) < 8.0
     assert (first, second) == (pytest.approx(before, rel=0.1), pytest.approx(after, rel=0.1))
     steps = [
         {"t_mrmse_m": 0.2, "r_mrmse_rad": 0.1},
