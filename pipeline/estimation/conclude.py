@@ -65,6 +65,7 @@ from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
+from pipeline.estimation.verdict import rank_effects
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
@@ -423,10 +424,9 @@ def _note_unless(
 
 
 def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
-    """Effects in the order of the ladder, those without a step last."""
-    top = () if judgement is None else judgement.ladder.steps
-    first = {name: index for index in range(len(top) - 1, -1, -1) for name in top[index].effects}
-    return sorted(effects, key=lambda effect: first.get(effect.id, len(top)))
+    """Effects in the order of `rank_effects`, those without a step last."""
+    ranked = [] if judgement is None else [*rank_effects(_list_steps(judgement))]
+    return sorted(effects, key=lambda effect: [*ranked, effect.id].index(effect.id))
 
 
 def _path_of(effect: Effect, paths: Sequence[Explored]) -> Explored:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
+from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
 from pipeline.core import enumerate_texts
@@ -96,14 +96,14 @@ def _list_open_ends(diagnosis: Content) -> tuple[str, str]:
     return _describe_choice(diagnosis), why
 
 
-def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
-    """Effects that remove a tenth of the ideal model's error over 2 s, in metres or radians, most first.
+def rank_effects(ladder: Sequence[Content]) -> dict[str, float]:
+    """Effects in the order in which they are listed everywhere: the one that removes most error first.
 
     Args:
         ladder: rungs with ``effects``, ``t_mrmse_m`` and ``r_mrmse_rad``, from the ideal model up.
 
     Returns:
-        The share of the error that each removes by id; of effects that all remove less the first alone.
+        The share of the ideal model's error over 2 s that each removes, in position or heading, by id.
     """
     shares: dict[str, float] = {}
     for before, after in pairwise(ladder):
@@ -116,7 +116,12 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
         ]
         for name in list_added(before, after):
             shares.setdefault(name, max(falls, default=0.0))
-    ranked = sorted(shares.items(), key=lambda one: -one[1])
+    return dict(sorted(shares.items(), key=lambda one: -one[1]))
+
+
+def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
+    """Effects of `rank_effects` that remove a tenth of the error; where all remove less, the first alone."""
+    ranked = [*rank_effects(ladder).items()]
     return dict([one for one in ranked if one[1] >= _MAIN_SHARE] or ranked[:1])
 
 
@@ -230,11 +235,9 @@ def name_effect(name: str) -> str:
 
 
 def _join_clauses(clauses: Sequence[str]) -> str:
-    """Clauses as one sentence: what the robot does first, then those with a subject of their own."""
-    predicates = [one for one in clauses if not one.startswith("the ")]
-    own = [one for one in clauses if one.startswith("the ")]
-    parts = [f"the robot {enumerate_texts(predicates)}"] if predicates else []
-    return ", and ".join([*parts, *own]) if predicates else enumerate_texts(own)
+    """Clauses in their order as one sentence, neighbours with the same subject joined."""
+    groups = groupby(clauses, key=lambda one: one.startswith("the "))
+    return ", and ".join(f"{'' if own else 'the robot '}{enumerate_texts([*some])}" for own, some in groups)
 
 
 def _name_model(step: Content, shown: int) -> str:

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_excess, format_remaining_error
-from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_main, split_main
+from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_effects, rank_main, split_main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
@@ -148,6 +148,16 @@ def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> N
     drawn = draw_diagnosis(effects, [(0.2, 0.1), (0.21, 0.12), (0.2, 0.115)])
     assert list(rank_main(drawn["ladder"])) == ["deadband"]
     assert "below 0.01 m/s; with both effects in the model" in check_verdict(drawn)
+
+
+def test_the_verdict_keeps_the_order_of_the_effects_whatever_their_subject() -> None:
+    effects = {"heading_skew": {"d": 0.1}, "effective_track": {"k": 1.5}, "drive_lag": {"tau": 0.3}}
+    drawn = draw_diagnosis(effects, [(1.0, 1.0), (0.4, 0.6), (0.2, 0.3), (0.05, 0.02)])
+    assert [*rank_effects(drawn["ladder"])] == list(effects)
+    assert (
+        "The heading is 100 ms older than the position, and the robot turns at 67 % of the ideal rate and "
+        "follows commands with a time constant of 0.3 s; with these in the model"
+    ) in check_verdict(drawn)
 
 
 def test_drivetrain_ground_and_sensors_stand_in_one_sentence() -> None:

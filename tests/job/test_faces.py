@@ -12,7 +12,8 @@ from verbs import run_verb
 import pipeline as slip
 from pipeline.cli.screen import format_run
 from pipeline.estimation.diagnosis_lines import format_stored
-from pipeline.estimation.verdict import format_verdict
+from pipeline.estimation.verdict import format_verdict, rank_effects
+from pipeline.report.scene import RunReport
 from pipeline.simulate import simulate_case
 from pipeline.web.stored_runs import summarize_run as describe_in_workbench
 
@@ -48,6 +49,21 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
     assert run.report is not None
     for page in (run.report, results / "index.html"):
         assert f">{html.escape(verdict)}</p>" in page.read_text()
+
+
+def test_effects_stand_in_one_order_on_every_face(run: slip.Run) -> None:
+    stored = json.loads(run.manifest.path("diagnosis.json").read_text())
+    effects = {effect["id"]: effect for effect in stored["effects"]}
+    ids = [*rank_effects(stored["ladder"])]
+    # The ladder begins with the lag, which removes less.
+    assert ids == [*effects] == ["effective_track", "drive_lag"] != stored["ladder"][-1]["effects"]
+    screen, page = format_stored(stored), RunReport(run.summary, diagnosis=stored)
+    assert [entry["id"] for entry in page.effects[0]] == ids
+    for shown in (
+        [run.verdict.index(effects[name]["clause"]) for name in ids],
+        [screen.index(f" {name}  ") for name in ids],
+    ):
+        assert shown == sorted(shown)
 
 
 def test_the_short_screen_has_one_slip_and_one_interval_a_number(run: slip.Run) -> None:
