@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite, suffix_unit
+from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite, round_digits, suffix_unit
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
@@ -29,6 +29,10 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
+_LEAST_UNITS = 3.55
+"""Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
+moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
+lost."""
 
 
 @dataclass(frozen=True)
@@ -57,13 +61,21 @@ class Value:
         return max(self.high - self.value, self.value - self.low)
 
     @property
+    def digits(self) -> int:
+        """Significant digits that its interval supports, at least one; as in JSON where it has none."""
+        if not self.value or not 0.0 < self.half < math.inf:
+            return JSON_DIGITS
+        last = math.floor(math.log10(self.half / _LEAST_UNITS))
+        return min(max(math.floor(math.log10(abs(self.value))) - last + 1, 1), JSON_DIGITS)
+
+    @property
     def suffix(self) -> str:
         """The unit as a suffix of a number; empty where dimensionless."""
         return suffix_unit(self.unit)
 
     def __str__(self) -> str:
         """The value as text, with its interval where there is one, and whether it is at its bound."""
-        text = f"{self.value:.3g}{self.suffix}"
+        text = f"{round_digits(self.value, self.digits):.3g}{self.suffix}"
         if math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
         if self.at_bound:

@@ -273,16 +273,16 @@ def restore(name: str, values: Mapping[str, Value]) -> Effect:
 
 
 def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect for text output, which leaves out undetermined values of an effect with several parameters.
+    """The effect for text output: digits that intervals support, and of several values those that are known.
 
     A value at neutral is an estimate, not a start value, and stays; so does a single parameter.
     """
-    effect = restore(name, values)
-    neutral = {parameter.name: parameter.neutral for parameter in effect.parameters}
-    if len(neutral) == 1:
+    new = find_effect(name)()
+    effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
+    if len(new.parameters) == 1:
         return effect
     return effect.omit_open(
-        key for key, one in values.items() if one.is_undetermined and one.value != neutral[key]
+        key for key, one in values.items() if one.is_undetermined and one.value != new.parameter(key).neutral
     )
 
 

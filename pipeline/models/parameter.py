@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from pipeline.core import round_digits
+from pipeline.core import JSON_DIGITS, round_digits
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
@@ -367,10 +367,10 @@ class Parameter:
         usual = f"a quarter of its usual size, the median over the numbers of {WARTHOG_RUNS}"
         return self.between_runs or Spread(USUAL_SPREAD * self.usual_size, usual)
 
-    def round(self, value: float) -> float:
-        """A value as model files have it: of six digits, unless that moves it out of its bounds."""
+    def round(self, value: float, digits: int = JSON_DIGITS) -> float:
+        """A value of so many digits, as in model files by default, unless that moves it out of its bounds."""
         low, high = self.bounds
-        rounded = round_digits(value)
+        rounded = round_digits(value, digits)
         return rounded if low <= rounded <= high and value != self.neutral else value
 
     def is_one_sided(self, low: float, high: float) -> bool:

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
+from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.folds import errors_as_json
@@ -129,7 +130,8 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
         assert {key: written[key] for key in ERRORS} == {key: rung[key] for key in ERRORS}
     for effect, name, number in list_numbers(told):
         assert same(file.model.effect(effect).values[name], number["value"])
-        shown = re.escape(f"{number['value']:.3g}")
+        low, high = (math.nan if number[end] is None else number[end] for end in ("low", "high"))
+        shown = re.escape(str(Value(number["value"], low, high, "1")).split()[0])
         assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import restore_known
-from pipeline.sources import find_preset
+from pipeline.sources import Vehicle, find_preset
 
 _UNITS = {
     "tau": "s",
@@ -21,6 +21,12 @@ _UNITS = {
 }
 
 
+def find_vehicle() -> Vehicle:
+    vehicle = find_preset("warthog")
+    assert vehicle is not None
+    return vehicle
+
+
 def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -> tuple[str, str]:
     values = {
         key: Value(
@@ -28,9 +34,7 @@ def put_in_words(name: str, numbers: dict[str, float], known: tuple[str, ...]) -
         )
         for key, value in numbers.items()
     }
-    vehicle = find_preset("warthog")
-    assert vehicle is not None
-    effect = restore_known(name, values)
+    effect, vehicle = restore_known(name, values), find_vehicle()
     return effect.describe_motion(vehicle), effect.describe_clause(vehicle)
 
 
@@ -60,3 +64,15 @@ def test_without_any_number_the_name_remains() -> None:
 @pytest.mark.parametrize("known", [(), ("tau",)])
 def test_an_effect_of_one_number_tells_it(known: tuple[str, ...]) -> None:
     assert put_in_words("drive_lag", {"tau": 0.3}, known)[0] == "Drive lag: time constant 0.30 s"
+
+
+def test_a_sentence_has_the_digits_that_the_interval_supports() -> None:
+    wide, narrow = (Value(0.4213, 0.4213 - half, 0.4213 + half, "s") for half in (0.26, 0.0018))
+    said = [
+        restore_known("clock_offset", {"d": one}).describe_clause(find_vehicle()) for one in (wide, narrow)
+    ]
+    assert said == ["the poses are stamped 420 ms late", "the poses are stamped 421 ms late"]
+    assert [str(one) for one in (wide, narrow)] == ["0.42 s [0.161, 0.681]", "0.421 s [0.419, 0.423]"]
+    # Without an interval nothing is known of the digits, and one remains however wide it is.
+    assert str(Value(0.4213, math.nan, math.nan, "s")).startswith("0.421 s")
+    assert str(Value(-0.4213, -5.0, 5.0, "1")) == "-0.4 [-5, 5]"

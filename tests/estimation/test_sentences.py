@@ -137,7 +137,7 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
     at = texts.index("Wheel servo: lag 0.68 s")
     assert [text.strip() for text in texts[at + 1 : at + 5]] == [
         "wheel_servo         60 -> 54 cm",
-        "tau = 0.681 s [0.587, 0.775]",
+        "tau = 0.68 s [0.587, 0.775]",
         "reset = 0 1/s (at its bound)",
         "bound = 1.03 m/s [0.91, 1.15]",
     ]

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_excess, format_remaining_error
+from pipeline.estimation.estimates import restore_known
 from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_effects, rank_main, split_main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -71,17 +73,21 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
     # A formula is said as what it is.
     known.add(str(len([name for name in ladder[-1]["effects"] if name != "unexplained"])))
     effects = [
-        find_effect(entry["id"])().change(**{key: one["value"] for key, one in entry["parameters"].items()})
+        restore_known(entry["id"], {key: read_value(one) for key, one in entry["parameters"].items()})
         for entry in diagnosis["effects"]
     ]
-    for entry, effect in zip(diagnosis["effects"], effects, strict=True):
-        # Of several numbers those without an interval are not told.
-        open_numbers = [key for key, one in entry["parameters"].items() if one.get("low", 0.0) is None]
-        told = effect.omit_open(open_numbers) if len(entry["parameters"]) > 1 else effect
+    for entry, told in zip(diagnosis["effects"], effects, strict=True):
         clause = told.describe_clause(vehicle, effects)
         assert entry["clause"].startswith(clause)
         known |= set(_NUMBER.findall(clause))
     return known
+
+
+def read_value(stored: Diagnosis) -> Value:
+    """A stored value; one without an interval in the JSON is drawn, and exact."""
+    ends = (stored.get(end, stored["value"]) for end in ("low", "high"))
+    low, high = (math.nan if end is None else end for end in ends)
+    return Value(stored["value"], low, high, "1", at_bound=stored.get("undetermined", False))
 
 
 def check_verdict(diagnosis: Diagnosis, vehicle: Vehicle = _WARTHOG) -> str:
