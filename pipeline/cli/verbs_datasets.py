@@ -87,7 +87,7 @@ def _compare_causes(
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
         parts = ", ".join(
-            f"{causes.names.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.parts
+            f"{causes.names.get(one.name, one.name)} {format_share(one.share, 1)}" for one in budget.parts
         )
         runs = f"{budget.runs} run{'s' * (budget.runs != 1)}"
         lines += [

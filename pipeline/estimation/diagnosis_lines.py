@@ -341,7 +341,7 @@ def _format_budget(run: RunDiagnosis) -> str:
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [
-                f"{CAUSE_NAMES.get(one.name, one.name)} {format_share(one.share, 0)}" for one in budget.shares
+                f"{CAUSE_NAMES.get(one.name, one.name)} {format_share(one.share, 1)}" for one in budget.shares
             ]
             signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"

@@ -107,7 +107,7 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
 
 def format_known_share(value: float | None) -> str:
     """Share as a percentage, a dash if missing."""
-    return MISSING if value is None else format_share(value, 0).replace("-", "\u2212").replace(" ", "\u202f")
+    return MISSING if value is None else format_share(value, 1).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 def format_split(drivetrain: float, ground: float, cross: float) -> str:

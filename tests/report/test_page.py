@@ -428,7 +428,7 @@ def test_durations_shares_and_dates_are_said_in_words() -> None:
     assert format_recorded(646.0, 629.0) == "10 min 46 s"
     assert format_recorded(646.0, 230.0) == "10 min 46 s, 3 min 50 s of it compared"
     assert format_known_share(0.385) == "38\u202f%"
-    assert format_known_share(-0.004) == "0\u202f%"
+    assert format_known_share(-0.004) == "\u22120.4\u202f%"
     assert format_date("a", 0) == ""
     assert format_date("a", 2**62) == "2116-02-20 23:53 UTC"
 
