@@ -120,9 +120,10 @@ def rank_effects(ladder: Sequence[Content]) -> dict[str, float]:
 
 
 def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
-    """Effects of `rank_effects` that remove a tenth of the error; where all remove less, the first alone."""
-    ranked = [*rank_effects(ladder).items()]
-    return dict([one for one in ranked if one[1] >= _MAIN_SHARE] or ranked[:1])
+    """Those of `rank_effects` that remove a tenth of the error, and the first effect whatever it removes."""
+    ranked = rank_effects(ladder)
+    first = next((name for name in ranked if name != FORMULA), FORMULA)
+    return {name: share for name, share in ranked.items() if share >= _MAIN_SHARE or name == first}
 
 
 def split_main(
@@ -138,10 +139,10 @@ def split_main(
         read: the id of one of them, and whether it was corrected.
 
     Returns:
-        Main and smaller effects in their order; where `rank_main` lists none, nor a formula, all are main.
+        Main and smaller effects in their order; where `rank_main` lists none, all are main.
     """
     first = rank_main(ladder)
-    if not first.keys() & {FORMULA, *(read(effect)[0] for effect in effects)}:
+    if not first.keys() & {read(effect)[0] for effect in effects}:
         return list(effects), []
     is_main = [name in first or corrected for name, corrected in map(read, effects)]
     main = [effect for effect, chosen in zip(effects, is_main, strict=True) if chosen]

@@ -14,7 +14,14 @@ import pytest
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.error_regions import ABOVE_FLOOR, format_excess, format_remaining_error
 from pipeline.estimation.estimates import restore_known
-from pipeline.estimation.verdict import NOTHING_MISSING, format_verdict, rank_effects, rank_main, split_main
+from pipeline.estimation.verdict import (
+    NOTHING_MISSING,
+    format_verdict,
+    is_small,
+    rank_effects,
+    rank_main,
+    split_main,
+)
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
@@ -147,6 +154,17 @@ def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
     lag, band, clock = ("drive_lag", False), ("deadband", False), ("clock_offset", True)
     assert split_main([lag, band, clock], ladder, lambda one: one) == ([lag, clock], [band])
     assert split_main([band, clock], ladder, lambda one: one) == ([band, clock], [])
+
+
+def test_no_effect_is_smaller_where_none_is_larger() -> None:
+    """A formula that removed most left `1 smaller effect` as all that was said of effects."""
+    drawn = draw_diagnosis({"deadband": {"d": 0.01}}, [(1.0, 0.5), (0.95, 0.5)])
+    drawn["ladder"].append({"effects": ["deadband", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.1})
+    assert [*rank_main(drawn["ladder"])] == ["unexplained", "deadband"]
+    band = ("deadband", False)
+    assert split_main([band], drawn["ladder"], lambda one: one) == ([band], [])
+    assert not is_small("deadband", drawn["ladder"])
+    assert "ignores wheel speeds below 0.01 m/s; with this and a fitted formula" in check_verdict(drawn)
 
 
 def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> None:
