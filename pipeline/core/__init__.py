@@ -119,18 +119,33 @@ def enumerate_texts(texts: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
+def format_digits(value: float, digits: int = 2) -> str:
+    """A number of so many significant digits, at least those before the point; a whole number for 0."""
+    leading = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
+    places = max(digits - 1 - leading, 0) if digits else 0
+    text = f"{value:z.{places}f}"
+    return text.rstrip("0").rstrip(".") if places else text
+
+
 def format_share(share: float, digits: int = 2) -> str:
     """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
 
     Args:
         share: 1 is the whole.
-        digits: significant digits, at least those before the decimal point; 0 for whole percent.
+        digits: see `format_digits`.
     """
-    percent = 100.0 * share
-    leading = math.floor(math.log10(abs(percent))) if percent and math.isfinite(percent) else 0
-    places = max(digits - 1 - leading, 0) if digits else 0
-    text = f"{percent:z.{places}f}"
-    return f"{text.rstrip('0').rstrip('.') if places else text} %"
+    return f"{format_digits(100.0 * share, digits)} %"
+
+
+def format_length(metres: float) -> str:
+    """A length as text: `1.06 m`, or below one metre `5.7 cm`."""
+    return f"{format_digits(metres, 3)} m" if metres >= 1.0 else f"{format_digits(100.0 * metres)} cm"
+
+
+def format_angle(radians: float) -> str:
+    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`."""
+    text = format_digits(math.degrees(radians))
+    return f"{text} degree{'s' * (text != '1')}"
 
 
 def format_duration(seconds: float) -> str:

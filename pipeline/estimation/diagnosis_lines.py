@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
-from pipeline.core import INPUT_WORDS, format_share, mark_finding
+from pipeline.core import INPUT_WORDS, format_angle, format_length, format_share, mark_finding
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
@@ -25,10 +25,8 @@ from pipeline.estimation.diagnosis import (
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
     BREVITY,
-    format_angle,
     format_enough,
     format_errors,
-    format_length,
     format_remaining_error,
 )
 from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import finite_or_none, format_share
+from pipeline.core import finite_or_none, format_angle, format_digits, format_length, format_share
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.estimation.fit import Fitted
 from pipeline.estimation.intervals import narrow_part
@@ -382,7 +382,7 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
 
 def format_excess(ratio: float) -> str:
     """A remaining error in times the noise floor: `at`, `1.6 times`."""
-    text = f"{ratio:.2g}" if ratio < 9.95 else f"{ratio:.0f}"  # noqa: PLR2004 - 10 has two digits
+    text = format_digits(ratio)
     return f"{text} times" if float(text) >= _KNOWN_TO else "at"
 
 
@@ -396,19 +396,6 @@ def format_errors(errors: Mapping[str, object]) -> str:
     sizes = [format_length(metres)] if isinstance(metres, int | float) else []
     sizes += [format_angle(angle)] if isinstance(angle, int | float) else []
     return " and ".join(sizes) or "by an unknown amount"
-
-
-def format_length(metres: float) -> str:
-    """A length as text: centimetres below one metre, to two digits."""
-    # 99.6 cm would round to 1e+02 cm.
-    return f"{metres:.3g} m" if metres >= 0.995 else f"{100.0 * metres:.2g} cm"  # noqa: PLR2004
-
-
-def format_angle(radians: float) -> str:
-    """An angle as text: degrees, to two digits."""
-    degrees = math.degrees(radians)
-    text = f"{degrees:.0f}" if degrees >= 9.95 else f"{degrees:.2g}"  # noqa: PLR2004
-    return f"{text} degree{'s' * (text != '1')}"
 
 
 _SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}

@@ -7,8 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core import enumerate_texts, format_share, suffix_unit
-from pipeline.estimation.error_regions import format_angle, format_length
+from pipeline.core import enumerate_texts, format_angle, format_length, format_share, suffix_unit
 from pipeline.estimation.verdict import name_effect
 from pipeline.job.check import Check, find_pace
 from pipeline.job.stored_fits import ERRORS, POSITION_ERROR, Label

@@ -10,7 +10,7 @@ from copy import copy
 from string import Formatter
 from typing import ClassVar, Self, TypeVar
 
-from pipeline.core import format_share, suffix_unit
+from pipeline.core import format_angle, format_length, format_share, suffix_unit
 from pipeline.models.parameter import (
     Conditions,
     Excitation,
@@ -103,11 +103,11 @@ class Effect(ABC):
         twin: its role in the body of the exported twin; None where that body cannot represent it.
         motion: name and numbers as a sentence, with `{name}` for a parameter. For the first parameter also
             `{size}`, the absolute value times `size_in`, `{way}`, the one of `ways` for its sign,
-            `{percent}`, and `{share}`, the deviation from one of `share_of` (a constant, and the factor of
-            the parameter).
+            `{percent}`, `{length}` or `{angle}`, the size in metres or radians as text, and `{share}`, the
+            deviation from one of `share_of` (a constant, and the factor of the parameter).
         clause: what the vehicle does, as a predicate of "the robot" or as a clause that begins with "the"; it
-            takes the fields of `motion`, `{degrees}`, the size of an angle, and `{rim}`, the rim speed of a
-            wheel of this rate. Empty where the part of `motion` after the colon serves.
+            takes the fields of `motion`, and `{rim}`, the rim speed of a wheel of this rate. Empty where the
+            part of `motion` after the colon serves.
         python: its step in the exported function, parameters as `{name}`; None where there is none.
         python_state: state variables of its step; zero at the start.
         readings: its interpretation if its parameters prove to belong to the vehicle, the ground or a run,
@@ -247,7 +247,8 @@ class Effect(ABC):
             "way": self.ways[first < 0.0],
             "share": format_share_of_gain(base + slope * first),
             "percent": format_share(first, 3),
-            "degrees": math.degrees(size),
+            "length": format_length(size),
+            "angle": format_angle(size),
             "rim": abs(first) * vehicle.wheel_radius_m,
         }
         unknown = {*self.open_numbers, *(name for name, value in self.values.items() if math.isinf(value))}

@@ -83,7 +83,7 @@ def test_no_metres_are_said_of_a_vehicle_of_which_only_the_body_motion_is_known(
 
 def test_a_point_metres_away_is_told_in_plain_digits() -> None:
     arm = find_effect("lever_arm")().change(l_x=1.804, l_y=-0.0312).describe_motion(CAR)
-    assert arm == "Lever arm: the pose is measured 180 cm ahead of base_link and 3.1 cm to the right"
+    assert arm == "Lever arm: the pose is measured 1.8 m ahead of base_link and 3.1 cm to the right"
 
 
 def test_understeer_is_told_at_a_speed() -> None:

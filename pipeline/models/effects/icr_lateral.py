@@ -32,9 +32,8 @@ class IcrLateral(LinearEffect):
             plausible=Plausible(-0.5, 0.5, "further out it lies beside the wheels of a Warthog"),
         ),
     )
-    motion = "Lateral centre of rotation: {size:.2g} cm to the {way} of base_link"
-    clause = "rotates about a point {size:.3g} cm to the {way} of its reference point"
-    size_in = 100.0
+    motion = "Lateral centre of rotation: {length} to the {way} of base_link"
+    clause = "rotates about a point {length} to the {way} of its reference point"
     needs = (Excitation.TURNING,)
     confused_with = ("wheel_asymmetry",)
     equivalent_to = ("lever_arm",)

@@ -49,10 +49,9 @@ class IcrOffset(LinearEffect):
             between_runs=Spread(0.013),
         ),
     )
-    motion = "Centre of rotation: {size:.2g} cm {way} base_link"
-    clause = "rotates about a point {size:.3g} cm {way} its reference point"
+    motion = "Centre of rotation: {length} {way} base_link"
+    clause = "rotates about a point {length} {way} its reference point"
     ways = ("ahead of", "behind")
-    size_in = 100.0
     needs = (Excitation.TURNING,)
     confused_with = ("lateral_skid", "heading_skew")
     equivalent_to = ("lever_arm",)

@@ -9,6 +9,7 @@ Source: rigid body motion of a point; see any text on mechanics.
 
 from collections.abc import Iterable, Mapping
 
+from pipeline.core import format_length
 from pipeline.models.effect import Column, Effect, Excitation, LinearEffect, Parameter, Part, Place, name_side
 from pipeline.run.signals import Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
@@ -34,10 +35,9 @@ class LeverArm(LinearEffect):
         """What the vehicle does, with numbers."""
         ahead, sideways = self.values["l_x"], self.values["l_y"]
         direction = "ahead of" if ahead >= 0.0 else "behind"
-        lengths = [f"{abs(arm) * 100.0:.{2 if abs(arm) < 0.995 else 3}g} cm" for arm in (ahead, sideways)]  # noqa: PLR2004
         return (
-            f"Lever arm: the pose is measured {lengths[0]} {direction} base_link and {lengths[1]} to the "
-            f"{name_side(sideways)}"
+            f"Lever arm: the pose is measured {format_length(abs(ahead))} {direction} base_link and "
+            f"{format_length(abs(sideways))} to the {name_side(sideways)}"
         )
 
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:

@@ -33,8 +33,8 @@ class SteeringOffset(DriveEffect):
             quantities=(Quantity.STEERING_OFFSET,),
         ),
     )
-    motion = "Steering offset: {degrees:.2g} degrees to the {way} at zero command"
-    clause = "steers {degrees:.2g} degrees to the {way} at zero command"
+    motion = "Steering offset: {angle} to the {way} at zero command"
+    clause = "steers {angle} to the {way} at zero command"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("yaw_drift",)
     equivalent_to = ("steering_sensor_offset",)

@@ -35,8 +35,8 @@ class SteeringPlay(DriveEffect):
             plausible=Plausible(0.0, 0.15, "three times a worn linkage"),
         ),
     )
-    motion = "Steering play: {degrees:.2g} degrees of free travel when the steering reverses"
-    clause = "has {degrees:.2g} degrees of free travel in its steering"
+    motion = "Steering play: {angle} of free travel when the steering reverses"
+    clause = "has {angle} of free travel in its steering"
     size_in = 2.0
     needs = (Excitation.STEERING, Excitation.CHANGES)
     confused_with = ("steering_gain", "steering_lag")

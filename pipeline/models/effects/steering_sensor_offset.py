@@ -30,8 +30,8 @@ class SteeringSensorOffset(KinematicEffect):
     parameters = (
         replace(SteeringOffset.parameters[0], about="true minus measured steering angle", typical=0.02),
     )
-    motion = "Steering sensor offset: the tyres are {degrees:.2g} degrees to the {way} of its reading"
-    clause = "the tyres are {degrees:.2g} degrees to the {way} of the steering sensor's reading"
+    motion = "Steering sensor offset: the tyres are {angle} to the {way} of its reading"
+    clause = "the tyres are {angle} to the {way} of the steering sensor's reading"
     needs, confused_with = SteeringOffset.needs, SteeringOffset.confused_with
     equivalent_to = ("steering_offset",)
     equivalent_when = SteeringOffset.equivalent_when

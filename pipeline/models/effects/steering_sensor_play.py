@@ -31,8 +31,8 @@ class SteeringSensorPlay(KinematicEffect):
     parameters = (
         replace(SteeringPlay.parameters[0], about="half of the play between steering sensor and tyres"),
     )
-    motion = "Steering sensor play: {degrees:.2g} degrees of free travel between steering sensor and tyres"
-    clause = "has {degrees:.2g} degrees of free travel between steering sensor and tyres"
+    motion = "Steering sensor play: {angle} of free travel between steering sensor and tyres"
+    clause = "has {angle} of free travel between steering sensor and tyres"
     size_in = SteeringPlay.size_in
     needs, confused_with = SteeringPlay.needs, SteeringPlay.confused_with
     python_state = ("behind",)

@@ -33,8 +33,7 @@ class YawMisalignment(ReportEffect):
             plausible=Plausible(-0.35, 0.35, "wider than the 1 to 5 degrees that were seen"),
         ),
     )
-    motion = "Yaw misalignment: the heading is {size:.2g} degrees too far {way}"
-    size_in = math.degrees(1.0)
+    motion = "Yaw misalignment: the heading is {angle} too far {way}"
     needs = (Excitation.BOTH_SIGNS,)
     confused_with = ("lateral_drift",)
     readings = (

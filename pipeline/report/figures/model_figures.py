@@ -6,10 +6,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS
+from pipeline.core import INPUT_WORDS, format_angle, format_length
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
 from pipeline.estimation.acceptance import LEAST_T
-from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal, format_angle, format_length
+from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal
 from pipeline.estimation.ladder import format_rises
 from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
