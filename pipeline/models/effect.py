@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import enum
 import math
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import copy
@@ -237,7 +238,7 @@ class Effect(ABC):
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
     def _fill(self, template: str, vehicle: Vehicle) -> str:
-        """A template with its numbers, less parts between commas with one that is open or infinite."""
+        """A template with its numbers, less parts after a comma or in brackets with one that is open."""
         (name_of_first, first), *_ = self.values.items()
         base, slope = self.share_of
         size = abs(first) * self.size_in
@@ -253,12 +254,11 @@ class Effect(ABC):
         }
         unknown = {*self.open_numbers, *(name for name, value in self.values.items() if math.isinf(value))}
         parts = []
-        for part in template.split(", "):
+        for part in re.split(r"(?=, | \()", template):
             names = [name for _, name, _, _ in Formatter().parse(part) if name]
             if unknown.isdisjoint(name if name in self.values else name_of_first for name in names):
                 parts.append(part.format(**words))
-        # A part in brackets stands without its comma.
-        return ", ".join(parts).replace(", (", " (")
+        return "".join(parts).removeprefix(", ")
 
     def choose_python(self, kind: str) -> str | None:
         """Its step in the exported function on a kind of vehicle; see `python`."""

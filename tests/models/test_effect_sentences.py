@@ -140,6 +140,14 @@ def test_a_clause_of_two_numbers_is_none_with_one_of_them(name: str, values: dic
         assert effect.omit_open({number}).describe_clause(HUSKY) == f"shows signs of {name.replace('_', ' ')}"
 
 
+def test_a_part_in_brackets_is_left_out_with_its_number() -> None:
+    servo = find_effect("wheel_servo")().change(tau=0.68)
+    assert servo.describe_clause(HUSKY).endswith("by ground friction (time constant 0.68 s)")
+    assert servo.omit_open({"tau"}).describe_clause(HUSKY).endswith("by ground friction")
+    lag = find_effect("turn_lag")().change(tau_mean=0.31, tau_diff=1.2).omit_open({"tau_diff"})
+    assert lag.describe_motion(HUSKY) == "Turning lag: 0.31 s for speed"
+
+
 def test_contact_without_a_bound_tells_no_coefficient() -> None:
     contact = find_effect("contact_friction")(k=1.75)
     assert contact.describe_motion(HUSKY) == "Contact friction: effective track 1.75 times nominal"

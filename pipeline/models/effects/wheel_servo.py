@@ -164,7 +164,7 @@ class WheelServo(DriveEffect):
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
     motion = "Wheel servo: ground friction slows the wheels below their commanded speed"
-    clause = "has its wheels slowed by ground friction, (time constant {tau:.2g} s)"
+    clause = "has its wheels slowed by ground friction (time constant {tau:.2g} s)"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
     contains = ("deadband", "drive_lag", "turn_lag")
