@@ -34,6 +34,7 @@ from pipeline.simulate import (
     Recording,
     Scenario,
     SkidSteer,
+    list_effects,
     simulate_run,
     simulate_skid_steer,
     write_log,
@@ -69,6 +70,7 @@ EMPTY = ("plain", "jumps", "noisy", "tilted")
 CLOSED = ("closed", "closed_rough")
 MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
+_ONLY_CARS = {spec.id for spec in list_effects() if spec.kinds == ("ackermann",)}
 # On top of these two an equipped vehicle has one effect more, or nothing.
 _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
@@ -188,14 +190,9 @@ def open_seal(text: str) -> Answer:
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:
     """Everything but the riddle itself."""
-    car = effect in (
-        *CAR,
-        "steering_sensor_offset",
-        "steering_sensor_play",
-        "steering_rate_limit",
-        "steering_play",
-        "effective_wheelbase",
-    ) or (effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS)
+    car = effect in _ONLY_CARS or (
+        effect in {"drive_lag", "wheel_radius", "time_drift"} and draw.random() < _CARS
+    )
     name = "car" if car else str(draw.choice(["husky", "husky", "warthog", "jackal", "marmotte"]))
     vehicle = VEHICLES[name]
     layouts = [key for key, item in LAYOUTS.items() if item.kind == vehicle.kind]

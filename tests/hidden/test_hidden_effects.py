@@ -28,7 +28,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
-from pipeline.simulate import State
+from pipeline.simulate import EffectSpec, State, list_effects
 
 
 def test_a_seal_hides_its_answer_until_it_is_opened(tmp_path: Path) -> None:
@@ -54,6 +54,12 @@ def test_a_seed_draws_the_same_riddle_each_time() -> None:
     assert one.answer == two.answer
     assert one.scenario == two.scenario
     assert seal(one.answer) == seal(two.answer)
+
+
+@pytest.mark.parametrize("spec", list_effects(), ids=lambda spec: str(spec.id))
+def test_an_effect_is_hidden_in_a_vehicle_on_which_it_exists(spec: EffectSpec) -> None:
+    if spec.id in POOLS["single"]:
+        assert draw_riddle("single", 5, spec.id).scenario.vehicle.kind in spec.kinds
 
 
 def test_scores_tell_named_undecided_missed_and_false_apart() -> None:
