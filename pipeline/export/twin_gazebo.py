@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 import msgspec
 
-from pipeline.export import Current, Facts, Sheet, Target, list_comments, make_plain, start_sheet
+from pipeline.export import Current, Facts, Sheet, Target, list_comments, start_sheet
 from pipeline.export.twin_body import GRIP, TwinBody, TwinWheel, weigh_chassis, weigh_wheel
 from pipeline.export.twin_files import build_twin, format_numbers, list_head, list_notes, write_comment
 from pipeline.models import Model
@@ -62,18 +62,13 @@ def _write_element(facts: Facts, sheet: Sheet) -> str:
     filename, name = _DRIVE_PLUGINS[facts.vehicle.kind]
     plugin = ET.Element("plugin", {"filename": filename, "name": name})
     for line in list_comments(facts, sheet):
-        plugin.append(ET.Comment(_make_comment(line)))
+        plugin.append(ET.Comment(write_comment(line)))
     for setting in sheet.settings:
         for line in setting.sources:
-            plugin.append(ET.Comment(_make_comment(line)))
+            plugin.append(ET.Comment(write_comment(line)))
         ET.SubElement(plugin, setting.path.rpartition(".")[2]).text = repr(setting.value)
     ET.indent(plugin)
     return ET.tostring(plugin, encoding="unicode") + "\n"
-
-
-def _make_comment(text: str) -> str:
-    """Format a comment; XML does not allow two adjacent dashes in it."""
-    return f" {'- -'.join(make_plain(text).split('--'))} "
 
 
 GAZEBO = Target(

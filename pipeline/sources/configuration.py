@@ -299,8 +299,9 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         return f"Not known: {' and '.join(self.stand_ins)}. {GIVE_GEOMETRY}" if self.stand_ins else ""
 
 
+# Without a command's options: a comment in XML must not contain two adjacent dashes.
 GIVE_GEOMETRY: Final = (
-    "Analyze the log with --vehicle, with --wheel-radius and --track-width, or with [vehicle] in run.toml; "
+    "Give the vehicle or its dimensions under [vehicle] in a run.toml beside the log, analyze it again, and "
     "apply its diagnosis to a new model."
 )
 
