@@ -237,13 +237,15 @@ def find_recordings(targets: Sequence[str], *, settle_s: float, patience_s: floa
         patience_s: time limit of one access to a file or folder [s].
 
     Raises:
-        BatchError: ``logs_not_found``, ``list_unreadable``.
+        BatchError: ``logs_not_found``: a target or all of them hold nothing; ``list_unreadable``.
         LogError: ``log_unreadable``, an object store does not answer.
     """
     looker = Looker(patience_s)
     listed: set[Path] = set()
     for target in _expand_lists(targets):
         listed |= set(_find_in(target, looker))
+    if not listed and not looker.skipped:
+        raise _refuse(", ".join(targets))
     growing = _find_growing(listed, settle_s, looker)
     silent = {each.path for each in looker.skipped}
     skipped = {each.path: each for each in looker.skipped}
@@ -268,9 +270,14 @@ def list_named(names: str) -> list[str]:
             continue
         recordings = find_recordings([word], settle_s=0.0).recordings
         if not recordings:
-            raise BatchError("logs_not_found", "there is no log in it", where=word, hint="Give another one")
+            raise _refuse(word)
         resolved += map(str, recordings)
     return resolved
+
+
+def _refuse(where: str) -> BatchError:
+    hint = "Recordings are files that end in .mcap, .db3 or .bag, and folders of rosbag2"
+    return BatchError("logs_not_found", "there is no recording in it", where=where, hint=hint)
 
 
 def _is_there(name: str) -> bool:

@@ -169,8 +169,6 @@ def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
     """The closing table: how many logs came out how, and of those that need a look, why."""
     counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
     lines = [f"{format_state(state):<14}{count:>6}" for state, count in counts.items()]
-    if is_search and not outcome.lines:
-        lines.append("no recording was found; they are files that end in .mcap, .db3 or .bag")
     for state in ("growing", "left", "skipped"):
         count = sum(line.state == state for line in outcome.lines)
         lines += [f"{format_state(state):<14}{count:>6}"] if count else []

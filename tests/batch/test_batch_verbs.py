@@ -52,17 +52,11 @@ def test_batch_tells_what_became_of_every_log(
     assert slip(capsys, "batch", season, "--out", out, *INLINE, "--quiet") == (0, "", "")
 
 
-def test_batch_names_copies_and_empty_folders(
-    capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path
-) -> None:
+def test_batch_names_copies(capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path) -> None:
     (season / "z.mcap").write_bytes((season / "a.mcap").read_bytes())
     text = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)[1]
     assert "copies, counted once" in text
     assert f"{season / 'z.mcap'}\n      the same content as season/a" in text
-    (tmp_path / "empty").mkdir()
-    code, text, _ = slip(capsys, "batch", tmp_path / "empty", "--out", tmp_path / "out", *INLINE)
-    assert code == 0
-    assert "no recording was found" in text
 
 
 def test_a_name_that_begins_with_a_dash_goes_behind_two(
@@ -98,6 +92,9 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
     [
         (("batch",), "no log is given"),
         (("batch", "nowhere"), "no such file or folder"),
+        (("batch", "."), "there is no recording in it. Recordings are files that end in .mcap"),
+        (("batch", "*.bag"), "*.bag: there is no recording in it"),
+        (("check", ".", "."), "there is no recording in it. Recordings are files that end in .mcap"),
         (("results", "status", "nowhere"), "there are no results"),
         (("results", "verify", "nowhere"), "there are no results"),
         (("results", "query", "SELECT * FROM runs", "--out", "nowhere"), "there are no results"),
