@@ -105,15 +105,17 @@ def find_material(
             continue
         holders[digest] = manifest.run
         manifests[manifest.run] = manifest
-    dates = date_runs({run: manifest.start_ns for run, manifest in manifests.items()})
-    notes += dates.notes if not {*by}.isdisjoint(_DATES) else ()
-    labelled = [_label_run(manifest, dates.days[run]) for run, manifest in manifests.items()]
+    # Runs that are left out date the others all the same.
+    days = date_runs({manifest.run: manifest.start_ns for manifest in survey.manifests}).days
+    date_notes = date_runs({run: manifest.start_ns for run, manifest in manifests.items()}).notes
+    notes += date_notes if not {*by}.isdisjoint(_DATES) else ()
+    labelled = [_label_run(manifest, days[run]) for run, manifest in manifests.items()]
     rows = pl.DataFrame(labelled, schema=_SCHEMA, orient="row")
     dated = rows.with_columns(
         pl.col("day").str.slice(0, 7).alias("month"), pl.col("day").str.slice(0, 4).alias("year")
     )
     labels = label_runs(dated, by)
-    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, dates.notes)
+    compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, date_notes)
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
     return _leave_out_untrusted(compared) if trusted_only else compared

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from dataframely import FailureInfo
 
     from pipeline.store.files import Manifest
+    from pipeline.store.listing import Partition
 
 BROKEN_RULES = "broken_rules"
 
@@ -303,23 +304,32 @@ _RUNS_SCHEMA = pl.Schema(
 )
 
 
-def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.LazyFrame:
+def scan_table(
+    table: str, *, root: Path, manifests: Sequence[Manifest], partition: Partition | None = None
+) -> pl.LazyFrame:
     """A table over the given generations and the results folder itself.
 
     Tables written under another version of the contract are fitted to the present one: columns that were not
     there are null, columns that are no more are left out.
+
+    Args:
+        table: its name.
+        root: the results folder.
+        manifests: the generations, which date each other.
+        partition: those of them to look at.
 
     Raises:
         StoreError: ``no_such_table``; ``file_outside`` or ``not_a_file``, a link or a pipe stands for it.
     """
     if table == RUNS_TABLE:
         days = date_runs({one.run: one.start_ns for one in manifests}).days
-        return pl.LazyFrame([one.summarize(days[one.run]) for one in manifests], schema=_RUNS_SCHEMA)
+        rows = [one.summarize(days[one.run]) for one in _select(manifests, partition)]
+        return pl.LazyFrame(rows, schema=_RUNS_SCHEMA)
     schema = schema_of(table)
     present = find_contract(table.removeprefix(QUARANTINE)).version
     current: list[Path] = []
     others: list[Path] = []
-    for manifest in manifests:
+    for manifest in _select(manifests, partition):
         entry = manifest.tables.get(table.removeprefix(QUARANTINE))
         if entry is not None and (table in manifest.tables or f"{table}.parquet" in manifest.files):
             path = manifest.path(table)
@@ -335,15 +345,25 @@ def scan_table(table: str, *, root: Path, manifests: Sequence[Manifest]) -> pl.L
     return pl.concat(frames) if frames else pl.LazyFrame(schema=schema)
 
 
+def _select(manifests: Sequence[Manifest], partition: Partition | None) -> Sequence[Manifest]:
+    return manifests if partition is None else partition.select(manifests)
+
+
 def answer_query(
-    sql: str, *, root: Path, manifests: Sequence[Manifest], allow_files: bool = False
+    sql: str,
+    *,
+    root: Path,
+    manifests: Sequence[Manifest],
+    partition: Partition | None = None,
+    allow_files: bool = False,
 ) -> pl.DataFrame:
     """Answer SQL over all tables and their quarantines by name.
 
     Args:
         sql: the question.
         root: the results folder.
-        manifests: the generations to look at.
+        manifests: the generations, which date each other.
+        partition: those of them to look at.
         allow_files: whether the question may open files and addresses that are none of the results.
 
     Raises:
@@ -366,11 +386,12 @@ def answer_query(
     said = {word.lower() for word in re.findall(r"\w+", sql)}
     asked = [name for name in known if name in said]
     try:
-        frames = {name: scan_table(name, root=root, manifests=manifests) for name in asked}
+        scan = partial(scan_table, root=root, manifests=manifests, partition=partition)
+        frames = {name: scan(name) for name in asked}
         with name_disk_errors(root):
             return pl.SQLContext(frames).execute(sql, eager=True)
     except StoreError:
-        gone = [path for path in _list_files(asked, manifests) if not path.exists()]
+        gone = [path for path in _list_files(asked, _select(manifests, partition)) if not path.exists()]
         if gone:
             raise file_missing(gone[0]) from None
         raise

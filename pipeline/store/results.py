@@ -206,7 +206,7 @@ class Store:
         """
         from pipeline.store.parquet_tables import scan_table  # noqa: PLC0415 - heavy
 
-        return scan_table(table, root=self.root, manifests=self._select(partition))
+        return scan_table(table, root=self.root, manifests=self.manifests(), partition=partition)
 
     def query(
         self, sql: str, partition: Partition | None = None, *, allow_files: bool = False
@@ -223,12 +223,9 @@ class Store:
         """
         from pipeline.store.parquet_tables import answer_query  # noqa: PLC0415 - heavy
 
-        manifests = self._select(partition)
-        return answer_query(sql, root=self.root, manifests=manifests, allow_files=allow_files)
-
-    def _select(self, partition: Partition | None) -> tuple[Manifest, ...]:
-        manifests = self.manifests()
-        return tuple(manifests) if partition is None else partition.select(manifests)
+        return answer_query(
+            sql, root=self.root, manifests=self.manifests(), partition=partition, allow_files=allow_files
+        )
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""

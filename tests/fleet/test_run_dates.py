@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from comparison_store import Run, write_run
 
+from pipeline.job.compared_runs import find_material
 from pipeline.report import format_date, render_catalogue
 from pipeline.store import Partition, Store
 from pipeline.store.names import date_runs, read_day
@@ -78,5 +79,16 @@ def test_the_table_of_runs_the_list_of_runs_and_a_report_have_the_dates_of_the_t
     assert "2023-11-14" not in page
     assert store.scan("runs", Partition(day="2024-07")).collect()["run"].to_list() == ["ice_2024_7_30"]
     assert store.scan("runs", Partition(day="2023-11")).collect().is_empty()
+    # A question about one vehicle gives a run the date that it has among all.
+    write_run(store, Run(name="moss", vehicle="jackal", start_ns=PLACEHOLDER))
+    jackal = Partition(vehicle="jackal")
+    assert store.query("SELECT run, day FROM runs", jackal).rows() == [("moss", None)]
+    # So does a comparison that leaves the run out whose name contradicts the clock.
+    write_run(
+        store,
+        Run(name="moss", vehicle="jackal", start_ns=PLACEHOLDER, estimates=[("drive_lag", "tau", 0.3, 0.01)]),
+    )
+    compared = find_material(store, ["vehicle"], trusted_only=False, tables=("estimates",))
+    assert compared.labels.select("run", "day").rows() == [("moss", None)]
     assert format_date("ice_2024_7_30", PLACEHOLDER) == "2024-07-30"
     assert format_date("ice_2023_11_15", PLACEHOLDER) == "2023-11-14 22:13 UTC"
