@@ -329,10 +329,10 @@ class Work:
 
     def _slip(self) -> StageOutcome:
         setup, vehicle = self.setup, self.vehicle
-        velocities = self._read("velocities")
+        velocities, commands = self._read("velocities"), self._read("commands")
         made = slip_stage.compute_slip(
             velocities,
-            self._read("commands"),
+            commands,
             self._read("wheels"),
             vehicle=vehicle,
             configuration=setup.configuration,
@@ -346,6 +346,7 @@ class Work:
         outlier = velocities["outlier"].to_numpy()
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
         samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
+        findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
         return StageOutcome((*made.findings, *findings, *checks.run_checks(samples, vehicle)))
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:

@@ -5,13 +5,14 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
+import polars as pl
 
-from pipeline.core import format_share
+from pipeline.core import arrays, format_share
 from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.run.signals import LIVE_SHARE, STILL_MPS
-from pipeline.sources import Vehicle, list_factors
+from pipeline.sources import DriveSource, Vehicle, list_factors
 from pipeline.stages import SURE, Finding
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
@@ -29,7 +30,7 @@ from pipeline.stages.trust import (
 # contradicts the two others, it is wired or mounted wrongly; no physical effect exchanges left and right.
 # Only differential drives are checked, whose sides are known.
 
-FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead")
+FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead", "steering_as_yaw_rate")
 """Findings each of which makes every fit meaningless."""
 
 _LIVE: Final = 0.05
@@ -267,6 +268,46 @@ def _find_gain(samples: Samples, driven: Floats) -> float | None:
     gain = float(np.median(ratio))
     spread = robust_spread(ratio - gain)
     return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
+
+
+# A car that takes a Twist may take angular.z as its steering angle. Its yaw rate is then the speed times the
+# tangent of that number, over the wheelbase: at several speeds that is no multiple of the number itself.
+
+_HALF: Final = 0.5
+"""Part of the turning's power that steering angles leave, relative to that which yaw rates leave, below which
+they were commanded. On simulated cars with lags or understeer at most 0.49 where they were, and at least 1
+where not: half of it would miss some, and double would report chance."""
+
+
+def check_turn(
+    samples: Samples, commands: pl.DataFrame, vehicle: Vehicle, source: DriveSource | None
+) -> list[Finding]:
+    """Check for body commands of a car that have steering angles in place of yaw rates.
+
+    Args:
+        samples: of the run.
+        commands: table `commands`, sorted by time.
+        vehicle: as configured.
+        source: topics of the commands.
+    """
+    asked, turned = samples.command, samples.velocity[:, 2]
+    if source is None or asked is None or not samples.body_commanded or vehicle.kind != "ackermann":
+        return []
+    angles = commands["body_w"].to_numpy()[arrays.hold_indices(samples.times, commands["t"].to_numpy())]
+    steered = vehicle.kinematics.forward({"speed": asked[:, 0], "steering": angles}, vehicle)[2]
+    known = np.isfinite(asked).all(axis=1) & np.isfinite(turned)
+    if known.sum() < FEWEST_SAMPLES:
+        return []
+    by_rate, by_angle = (_correlate(turned[known], ideal[known]) for ideal in (asked[:, 2], steered))
+    unexplained = 1.0 - by_rate * abs(by_rate)
+    if unexplained < ONE_SCALE**2 or by_angle < 0.0 or 1.0 - by_angle**2 > _HALF * min(unexplained, 1.0):
+        return []
+    speed, turn = source.signals[:2]
+    text = (
+        f"{source} holds steering angles in place of yaw rates: the vehicle turns by the speed times their "
+        f'tangent; set speed_topic = "{speed}" and steering_topic = "{turn}" under [command] in run.toml'
+    )
+    return [Finding("steering_as_yaw_rate", "error", text, where="command", value=by_angle)]
 
 
 # Checks of a whole run: whether the vehicle moves at all, and whether encoders, command and pose agree.

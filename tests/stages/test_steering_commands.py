@@ -1,0 +1,94 @@
+"""Twist of a car whose angular.z is a steering angle, as some drivers of Ackermann vehicles take it."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from pipeline.core.untrusted import number_in
+from pipeline.job import Options
+from pipeline.job.analyze import analyze_log
+from pipeline.simulate import (
+    LAYOUTS,
+    VEHICLES,
+    Disturbance,
+    Program,
+    Recording,
+    Scenario,
+    simulate_run,
+    write_log,
+)
+from pipeline.simulate.facts import CommandTopic
+from pipeline.simulate.programs import Commands
+from pipeline.store import Manifest
+
+_LAYOUT = replace(LAYOUTS["ackermann"], commands=(CommandTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
+_FAULT = "steering_as_yaw_rate"
+
+
+def analyze(log: Path, results: Path) -> Manifest:
+    return analyze_log(log, Options(out=results, report=False, diagnosis=False)).manifest
+
+
+def find_fault(manifest: Manifest) -> str:
+    texts = [str(one["text"]) for one in manifest.read("findings").to_dicts() if one["id"] == _FAULT]
+    return "".join(texts)
+
+
+def read_median(manifest: Manifest) -> float:
+    median = number_in(manifest.read_json("summary.json"), "median_modulus")
+    assert median is not None
+    return median
+
+
+def drive(program: str, log: Path, effects: dict[str, float]) -> Path:
+    scene = Scenario(
+        vehicle=VEHICLES["car"],
+        program=Program(program),  # type: ignore[arg-type]
+        duration_s=90.0,
+        seed=3,
+        effects=effects,
+        disturbance=Disturbance(0.03, 0.05),
+        recording=Recording(_LAYOUT),
+    )
+    log.parent.mkdir()
+    write_log(simulate_run(scene), log)
+    return log
+
+
+@pytest.mark.parametrize(
+    ("program", "effects", "is_told"),
+    [
+        ("drive_steps", {"drive_lag": 0.4, "steering_lag": 0.3}, True),
+        ("teleop", {}, True),
+        ("smooth", {"understeer": 0.03}, True),
+        # At one speed a yaw rate is a multiple of a small angle: nothing tells them apart.
+        ("circle", {}, False),
+    ],
+)
+def test_steering_angles_in_place_of_yaw_rates_are_told_with_the_lines_that_mend_it(
+    program: str, effects: dict[str, float], *, is_told: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    true_rates = analyze(drive(program, tmp_path / "rates" / "run.mcap", effects), tmp_path / "out")
+    assert find_fault(true_rates) == ""
+    monkeypatch.setattr(Commands, "yaw_rate", lambda commands, _vehicle: commands.turn)
+    log = drive(program, tmp_path / "angles" / "run.mcap", effects)
+    made = analyze(log, tmp_path / "out")
+    text = find_fault(made)
+    assert bool(text) is is_told
+    if not is_told:
+        return
+    lines = re.findall(r'\w+ = "[^"]+"', text)
+    assert lines == [
+        'speed_topic = "/cmd_vel.twist.linear.x"',
+        'steering_topic = "/cmd_vel.twist.angular.z"',
+    ]
+    log.with_name("run.toml").write_text("[command]\n" + "\n".join(lines) + "\n")
+    mended = analyze(log, tmp_path / "out")
+    assert find_fault(mended) == ""
+    medians = [read_median(one) for one in (made, mended, true_rates)]
+    assert medians[1] == pytest.approx(medians[2], rel=0.02)
+    assert medians[0] > medians[1]
