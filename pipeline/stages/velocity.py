@@ -103,7 +103,7 @@ def report_gyro(alignment: Alignment, turning: Floats) -> list[Finding]:
     delay = alignment.heading_delay_s
     if abs(delay) > _LATE:
         late = "late" if delay > 0.0 else "early"
-        text = f"the poses are {abs(delay) * 1e3:.0f} ms {late} against the gyro: corrected"
+        text = f"the poses are {abs(delay):.2g} s {late} against the gyro: corrected"
         findings.append(Finding("pose_delay", "info", text, where="pose", value=delay))
     return findings
 
