@@ -51,14 +51,14 @@ class _Change:
     """The most significant change of a number of a part of the path.
 
     Attributes:
-        place: of the part among those of the problem.
+        index: of the part among those of the problem.
         part, fit: the part and its fit.
         number: the number.
         time: end of the last block before the change [s].
         t: the change over its standard error.
     """
 
-    place: int
+    index: int
     part: Part
     fit: PartFit
     number: Free
@@ -87,14 +87,14 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
     if len(problem.comparisons) > 1:
         return []
     parts = enumerate(zip(problem.parts, judgement.fitted.fits, strict=True))
-    changes = [one for place, (part, fit) in parts if fit.free for one in _list_changes(place, part, fit)]
+    changes = [one for index, (part, fit) in parts if fit.free for one in _list_changes(index, part, fit)]
     for change in sorted(changes, key=lambda one: -abs(one.t)):
         windows = np.ones(change.part.run.size, dtype=np.bool_)
         change = change.locate(change.fit_sides(state, windows))  # noqa: PLW2901 - the same, more exactly
         sides = change.fit_sides(state, windows)
         if not _is_lower(_predict(problem, change, [sides]), score(problem, state)):
             continue
-        folds = [change.fit_sides(state, training[change.place]) for training in problem.training]
+        folds = [change.fit_sides(state, training[change.index]) for training in problem.training]
         errors = _predict(problem, change, folds)
         if not _is_lower(errors, judgement.whole.held_out):
             continue
@@ -125,17 +125,17 @@ def _predict(problem: Problem, change: _Change, fitted: Sequence[Sequence[State]
     (comparison,) = problem.comparisons
     early = comparison.horizons.times.mean(axis=1) < change.time
     squares = np.full((2, early.size), np.nan)
-    tested = [find_in_test(comparison, problem.whole.times, fold.test) for fold in problem.folds]
+    near_folds = [find_in_test(comparison, problem.whole.times, fold.test) for fold in problem.folds]
     if len(fitted) == 1:
-        tested = [np.ones_like(early)]
-    for sides, near in zip(fitted, tested, strict=True):
+        near_folds = [np.ones_like(early)]
+    for sides, near in zip(fitted, near_folds, strict=True):
         for state, rows in zip(sides, (near & early, near & ~early), strict=True):
             errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
             squares[:, rows] = np.array((errors.position, errors.yaw))[:, rows] ** 2
     return dict(zip(ERRORS_OVER_2S, np.sqrt(np.nanmean(squares, axis=1)).tolist(), strict=True))
 
 
-def _list_changes(place: int, part: Part, fit: PartFit) -> Iterator[_Change]:
+def _list_changes(index: int, part: Part, fit: PartFit) -> Iterator[_Change]:
     """The most significant change of every number of the effects, where it is significant."""
     blocks = sum_blocks(part, fit)
     numbers, label = blocks.numbers, blocks.label
@@ -143,14 +143,14 @@ def _list_changes(place: int, part: Part, fit: PartFit) -> Iterator[_Change]:
     normals, pulls = numbers.normals / np.outer(size, size), numbers.gradients / size
     pulls = pulls - pulls.mean(axis=0)
     margin = max(int(np.ceil(_TRIM * blocks.count)), 2)
-    for index, number in enumerate(fit.free):
+    for column, number in enumerate(fit.free):
         if not number.effect or is_term(number.effect) or not number.is_smooth:
             continue
-        statistics = _compare_sides(normals, pulls, index)[margin - 1 : blocks.count - margin]
+        statistics = _compare_sides(normals, pulls, column)[margin - 1 : blocks.count - margin]
         best = int(np.abs(statistics).argmax()) if statistics.size else 0
         if statistics.size and abs(statistics[best]) > LEAST_T:
             time = float(part.times[label <= best + margin - 1, 1].max())
-            yield _Change(place, part, fit, number, time, float(statistics[best]))
+            yield _Change(index, part, fit, number, time, float(statistics[best]))
 
 
 def _compare_sides(normals: Floats, pulls: Floats, index: int) -> Floats:

@@ -249,6 +249,7 @@ def _integrate(t: np.ndarray, speed: np.ndarray, turn: np.ndarray, start_ns: int
             "latency": zero,
             "outlier": zero > 1.0,
             "held": zero > 1.0,
+            "corrected": zero > 1.0,
             "active": zero < 1.0,
         }
     )
