@@ -3,7 +3,7 @@
 import enum
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -52,7 +52,6 @@ class HorizonErrors:
     turned: Floats
 
 
-Cached = TypeVar("Cached")
 Spot = tuple[Ints, Floats]
 
 
@@ -81,6 +80,7 @@ class Comparison:
         windows: displacements that are compared.
         horizons: predictions that are compared.
         heading: source of the heading.
+        forward: predictions from the input.
     """
 
     def __init__(
@@ -119,8 +119,8 @@ class Comparison:
         self._headings: dict[float, Floats] = {}
         self._measured: dict[float, Measured] = {}
         base = self._make_context(vehicle)
-        self._forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
-        self._reaching = replace_context(self._forward, self._look_from_horizons(base))
+        self.forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
+        self._reaching = replace_context(self.forward, self._look_from_horizons(base))
 
     @property
     def has_gyro(self) -> bool:
@@ -130,7 +130,7 @@ class Comparison:
     @property
     def context(self) -> RunContext:
         """Data of the run available to effects."""
-        return self._forward.context
+        return self.forward.context
 
     @property
     def restarts(self) -> RunContext:
@@ -161,8 +161,8 @@ class Comparison:
             restarted: reset states to measured values where 2 s predictions begin.
         """
         if self.source is Input.COMMAND:
-            timing = self._complete_timing(effects, timing)
-        return self._run(self._reaching if restarted else self._forward, effects, timing)
+            timing = self.complete_timing(effects, timing)
+        return self._run(self._reaching if restarted else self.forward, effects, timing)
 
     def predict_wheels(
         self, effects: Sequence[Effect], timing: Timing, *, restarted: bool = False
@@ -174,7 +174,7 @@ class Comparison:
             timing: of the run: initial states are the wheel speeds at that time, whenever reported.
             restarted: see `predict_velocity`.
         """
-        return self._run(self._reaching if restarted else self._forward, effects, timing)
+        return self._run(self._reaching if restarted else self.forward, effects, timing)
 
     def _run(self, forward: Forward, effects: Sequence[Effect], timing: Timing) -> Velocity:
         own = [effect.id for effect in effects if is_own(type(effect))]
@@ -190,7 +190,7 @@ class Comparison:
             raise MotionError("not_finite", what, where=", ".join(own), hint=hint)
         return velocity
 
-    def _complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:
+    def complete_timing(self, effects: Sequence[Effect], timing: Timing) -> Timing:
         """Timing with the part of the encoder delay that a body lag hides added to it.
 
         Initial states may use only values reported by the time of the pose that they start from.
@@ -435,7 +435,7 @@ def _reset_body(grid: Grid, first: Ints, known: tuple[Ints, Floats]) -> Resets:
     return Resets(number, first, position, start)
 
 
-def _forget(cache: dict[float, Cached]) -> None:
+def _forget(cache: dict[float, Any]) -> None:
     while len(cache) > 2:  # noqa: PLR2004 - the value in use and one beside it for derivatives
         cache.pop(next(iter(cache)))
 

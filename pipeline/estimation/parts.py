@@ -163,6 +163,7 @@ class Part(ABC):
         prior: prior of the parameters.
         is_restarted: see `restarted`.
         dates_poses: whether its fixed clocks are those of the poses.
+        is_delayed: whether the wheels that it predicts start from encoders with their delay.
         clocks: ids of effects that are a clock of each single run: of several runs if not all have a gyro
             that determines the delay of the poses.
     """
@@ -170,6 +171,7 @@ class Part(ABC):
     prior: Prior = NO_PRIOR
     is_restarted: bool = False
     dates_poses: bool = True
+    is_delayed: bool = True
     channels: tuple[int, ...] = (0, 1, 2)
     title: str
 
@@ -265,23 +267,44 @@ class Part(ABC):
                 alike from all starts.
         """
         columns = make_columns(residual.shape[0], len(free))
-        for index, number in enumerate(free):
+        ends = [_step_aside(state.get(number), number, both_sides=both_sides) for number in free]
+        self.drive_ahead(
+            [state.set(number, at) for number, steps in zip(free, ends, strict=True) for at in steps]
+        )
+        for index, (number, (at, *rest)) in enumerate(zip(free, ends, strict=True)):
             rows = slice(None) if number.run is None else self.run == number.run
-            value, (low, high) = state.get(number), number.bounds
-            above, below = value + _NARROW * number.step, value - _NARROW * number.step
-            if both_sides and low <= below and above <= high:
-                change = self._look(state, number, below) - self._look(state, number, above)
-                columns[rows, :, index] = change / (above - below)
-            else:
-                # At a bound, the influence of a parameter may grow with its square.
-                at = value + number.step if value + number.step <= high else value - number.step
-                columns[rows, :, index] = (residual[rows] - self._look(state, number, at)) / (at - value)
+            before, after = (state.get(number), at) if not rest else (at, rest[0])
+            start = residual[rows] if not rest else self._look(state, number, before)
+            columns[rows, :, index] = (start - self._look(state, number, after)) / (after - before)
         return columns
+
+    def drive_ahead(self, states: Sequence[State]) -> None:
+        """Compute the wheels of states that are looked at next, see `Forward.drive_ahead`.
+
+        Args:
+            states: all with the same effects and delays; others are computed when they are looked at.
+        """
+        for run, comparison in enumerate(self.comparisons) if states else ():
+            models = [
+                tuple(effect for effect in state.effects_of(run) if self.owns(effect)) for state in states
+            ]
+            timing = states[0].timing[run] if self.is_delayed else _NO_DELAY
+            comparison.forward.drive_ahead(models, comparison.complete_timing(models[0], timing))
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
         """Residuals with another value of a parameter, of one run if the parameter belongs to one."""
         moved, run = state.set(number, value), number.run
         return self.find_residuals(moved) if run is None else self.find_run_residuals(moved, run)
+
+
+def _step_aside(value: float, number: Free, *, both_sides: bool) -> tuple[float, ...]:
+    """Values of a parameter for its derivative: one step above or below, or two close to it."""
+    low, high = number.bounds
+    above, below = value + _NARROW * number.step, value - _NARROW * number.step
+    if both_sides and low <= below and above <= high:
+        return below, above
+    # At a bound, the influence of a parameter may grow with its square.
+    return (value + number.step if value + number.step <= high else value - number.step,)
 
 
 class BodyPart(Part):
@@ -333,6 +356,7 @@ class WheelPart(Part):
 
     title = "Drivetrain effects"
     dates_poses = False
+    is_delayed = False
 
     def __init__(
         self,

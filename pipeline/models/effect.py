@@ -8,6 +8,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from copy import copy
+from functools import cached_property
 from string import Formatter
 from typing import ClassVar, Self, TypeVar
 
@@ -164,7 +165,7 @@ class Effect(ABC):
         effect.open_numbers = frozenset(names)
         return effect
 
-    @property
+    @cached_property
     def key(self) -> tuple[object, ...]:
         """Id and values as a hashable key."""
         return (self.id, *(None if math.isnan(value) else value for value in self.values.values()))

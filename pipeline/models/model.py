@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import TypeVar, cast
+from typing import Self, TypeVar, cast
 
 import numpy as np
 
@@ -140,6 +141,44 @@ class Timing:
     wheel_delay_s: float = 0.0
 
 
+class JointDrive(DriveEffect):
+    """Acts in the drive, and is computed faster for several values and inputs at once."""
+
+    @classmethod
+    @abstractmethod
+    def drive_each(cls, pairs: Sequence[tuple[Self, Wheels]], context: RunContext) -> list[Wheels]:
+        """`drive_wheels` of each effect and its wheels; none of the effects is neutral."""
+
+
+@dataclass(frozen=True)
+class _Path:
+    """From the command to the wheels.
+
+    Attributes:
+        commanded, driven: effects on the command, and in the drive.
+        delay_s: delay of the measured wheels [s].
+        continues: whether each of `driven` comes before the last one with a state.
+        keys: of the wheels before the first of `driven` and after each.
+    """
+
+    commanded: tuple[Effect, ...]
+    driven: tuple[DriveEffect, ...]
+    delay_s: float
+    continues: tuple[bool, ...]
+    keys: tuple[tuple[object, ...], ...]
+
+
+def _follow(effects: Sequence[Effect], timing: Timing) -> _Path:
+    commanded = tuple(e for e in effects if e.place is Place.COMMAND)
+    driven = tuple(cast("DriveEffect", e) for e in effects if e.place is Place.DRIVE)
+    last = max((index for index, effect in enumerate(driven) if effect.python_state), default=-1)
+    continues = tuple(index < last for index in range(len(driven)))
+    keys: list[tuple[object, ...]] = [(timing.wheel_delay_s, *(e.key for e in commanded), "|")]
+    for effect, is_before in zip(driven, continues, strict=True):
+        keys.append((*keys[-1], effect.key, is_before))
+    return _Path(commanded, driven, timing.wheel_delay_s, continues, tuple(keys))
+
+
 class Forward:
     """Predicted velocities of one run for many models.
 
@@ -171,6 +210,7 @@ class Forward:
         self._most = _REMEMBERED_OF_SHORT if grid.times.size < _SHORT else _REMEMBERED
         self._cache: dict[Place, OrderedDict[object, object]] = {stage: OrderedDict() for stage in Place}
         self._known: OrderedDict[float, tuple[RunContext, RunContext]] = OrderedDict()
+        self._ahead: dict[object, Wheels] = {}
 
     @cached_property
     def _held(self) -> HeldDrive:
@@ -178,13 +218,30 @@ class Forward:
 
     def run_commands(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Reported body velocity, predicted from commands."""
-        commanded = [e for e in effects if e.place is Place.COMMAND]
-        driven = [e for e in effects if e.place is Place.DRIVE]
-        contexts = self._start_wheels(timing.wheel_delay_s)
-        key: tuple[object, ...] = (timing.wheel_delay_s, *(e.key for e in commanded))
-        wheels = self._keep(Place.COMMAND, key, lambda: self._hold(commanded, timing.wheel_delay_s))
-        wheels, key = self._drive(wheels, (*key, "|"), driven, contexts)
-        return self._move(wheels, key, effects)
+        path = _follow(effects, timing)
+        return self._move(self._drive(path, len(path.driven)), path.keys[-1], effects)
+
+    def drive_ahead(self, models: Sequence[Sequence[Effect]], timing: Timing) -> None:
+        """Compute the wheels of models that are predicted from commands next, if that is faster at once.
+
+        Args:
+            models: with the same effects, and different values.
+            timing: of the run.
+        """
+        paths = [_follow(effects, timing) for effects in models]
+        at = next((n for n, one in enumerate(paths[0].driven) if isinstance(one, JointDrive)), None)
+        if at is None or self._most == _REMEMBERED:
+            return
+        self._ahead = {}
+        new = {
+            key: one
+            for one in paths
+            if (key := one.keys[at + 1]) not in self._cache[Place.DRIVE] and not one.driven[at].is_neutral
+        }
+        if len(new) > 1:
+            pairs = [(cast("JointDrive", one.driven[at]), self._drive(one, at)) for one in new.values()]
+            context = self._start_wheels(timing.wheel_delay_s)[paths[0].continues[at]]
+            self._ahead = dict(zip(new, pairs[0][0].drive_each(pairs, context), strict=True))
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Reported body velocity, predicted from wheel encoders, without effects of the drivetrain."""
@@ -233,24 +290,25 @@ class Forward:
             commands = cast("CommandEffect", effect).change_commands(commands, self.context)
         return self._held.average_on_grid(commands)
 
-    def _drive(
-        self,
-        wheels: Wheels,
-        key: tuple[object, ...],
-        effects: Sequence[Effect],
-        contexts: tuple[RunContext, RunContext],
-    ) -> tuple[Wheels, tuple[object, ...]]:
-        """Wheel speeds after the drivetrain, and their key; cached per effect, as the next may vary alone.
+    def _drive(self, path: _Path, count: int) -> Wheels:
+        """Wheel speeds after some effects of the drive; cached per effect, as the next may vary alone.
 
         Measured wheels are the state of the last effect with a state. Those before it continue theirs.
         """
-        last = max((index for index, effect in enumerate(effects) if effect.python_state), default=-1)
-        for index, effect in enumerate(effects):
-            is_before = index < last
-            key = (*key, effect.key, is_before)
-            drive = partial(cast("DriveEffect", effect).drive_wheels, wheels, contexts[is_before])
-            wheels = self._keep(Place.DRIVE, key, drive)
-        return wheels, key
+        known = self._cache[Place.DRIVE]
+        done = next(
+            (n for n in range(count, 0, -1) if path.keys[n] in known or path.keys[n] in self._ahead), 0
+        )
+        if done:
+            wheels = self._keep(Place.DRIVE, path.keys[done], partial(self._ahead.pop, path.keys[done]))
+        else:
+            hold = partial(self._hold, path.commanded, path.delay_s)
+            wheels = self._keep(Place.COMMAND, path.keys[0], hold)
+        contexts = self._start_wheels(path.delay_s)
+        for n in range(done, count):
+            drive = partial(path.driven[n].drive_wheels, wheels, contexts[path.continues[n]])
+            wheels = self._keep(Place.DRIVE, path.keys[n + 1], drive)
+        return wheels
 
     def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:
         rolled = [e for e in effects if e.place is Place.KINEMATICS]

@@ -15,6 +15,7 @@ from motion_runs import simulate, vehicle_of
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.models.filters import lag_signal
+from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets, RunContext, Wheels
@@ -175,6 +176,26 @@ def test_it_agrees_with_motors_that_are_stepped_through(
 
 
 @pytest.mark.long
+@pytest.mark.parametrize("count", [2, 4, 7, 21])
+def test_servos_that_are_computed_at_once_move_as_each_does_alone(count: int) -> None:
+    size, kind = 3000, cast("type[JointDrive]", find_effect("wheel_servo"))
+    first = np.array([0, 1000, 2000])
+    resets = Resets(
+        np.arange(size) // 1000, first, first + 1, np.array([[3.0, 5.0, 0.0], [np.nan] * 3, [1.0] * 3])
+    )
+    inputs = [Wheels(draw_steps(k, 9.0), draw_steps(k + 9, 9.0), np.zeros(size)) for k in range(3)]
+    shares = np.random.default_rng(count).uniform(0.5, 1.5, (count, len(SERVO)))
+    pairs = [
+        (kind(**dict(zip(SERVO, (row * list(SERVO.values())).tolist(), strict=True))), inputs[k % 3])
+        for k, row in enumerate(shares)
+    ]
+    context = make_context(size, resets)
+    for (effect, wheels), found in zip(pairs, kind.drive_each(pairs, context), strict=True):
+        alone = effect.drive_wheels(wheels, context)
+        assert np.array_equal(found.left, alone.left)
+        assert np.array_equal(found.right, alone.right)
+
+
 def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -> None:
     """Turns below the scrub begin seconds late: no lag of a plausible size does that."""
     hidden = {"tau": 0.2, "reset": 0.35, "drag": 0.06, "bound": 1.1, "scrub": 1.2, "creep": 0.07}

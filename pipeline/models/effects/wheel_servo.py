@@ -27,23 +27,20 @@ slip angle, Pacejka, Tire and Vehicle Dynamics, chapter 3; measured on the DRIVE
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Self
 
 import numpy as np
 
 from pipeline.core.arrays import Floats
-from pipeline.core.machine_code import compiled
-from pipeline.models.effect import INF, DriveEffect, Excitation, Least, Parameter, Plausible, Search
+from pipeline.models.effect import INF, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
-from pipeline.models.filters import set_states
+from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Level, Quantity
+from pipeline.models.servo_walk import ROTATING, walk_each
 from pipeline.run.signals import RunContext, Wheels
 
-_ROTATING = 0.7
-"""Inertia of the rotating parts over that of the vehicle: the loss of nine Warthog runs on five grounds
-together changes by 3 % from 0.3 to 3."""
-_LENGTHWISE = 0.75
-"""Squared distance of the contacts lengthwise over that across: that of a track 1.75 times as wide."""
 _LEAST_TAU_S = 0.01
 """Smallest time constant [s]: a quarter of a cell at 25 Hz, within which the wheels follow at once."""
 _REST = 0.01
@@ -52,18 +49,13 @@ _LEAST_SCRUB = 0.03
 """Smallest friction to report [m/s]: a smaller one is within the tolerance of a data sheet."""
 _LEAST_DRAG = 0.01
 """Smallest resistance to report [m/s]: a smaller one is within the tolerance of a data sheet."""
-_SLOW = 0.05
-"""Speed [m/s] below which the rolling resistance fades: wheels that stop would chatter otherwise."""
-_OBSERVED = 0.5
-"""Share of a deviation of the wheels' difference at the start of a prediction that the integral part takes:
-with 0.4 to 0.8 the errors of nine Warthog runs over 2 s are smallest."""
 _TINY = 1e-6
 """Friction [m/s] that counts as none: a divisor."""
 _NO_COMMAND = 1e-6
 """Command [m/s] that counts as none: above the rounding of sums."""
 
 
-class WheelServo(DriveEffect):
+class WheelServo(JointDrive):
     """Wheel servo: the speed controller of each side works against ground friction."""
 
     id = "wheel_servo"
@@ -250,23 +242,44 @@ class WheelServo(DriveEffect):
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
-        if self.is_neutral:
-            return wheels
+        return wheels if self.is_neutral else self.drive_each([(self, wheels)], context)[0]
+
+    @classmethod
+    def drive_each(cls, pairs: Sequence[tuple[Self, Wheels]], context: RunContext) -> list[Wheels]:
+        """See `JointDrive`."""
         radius, resets = context.vehicle.wheel_radius_m, context.wheels
-        left, right = radius * wheels.left, radius * wheels.right
-        start = radius * resets.start
-        is_measured = np.zeros_like(left)
-        is_measured[resets.at] = np.isfinite(start[:, :2]).all(axis=1)
-        is_measured[context.spans.first] = 0.0
-        states = np.column_stack(
-            (set_states(left, resets, start[:, 0]), set_states(right, resets, start[:, 1]), is_measured)
-        )
-        idle = wheels.idle
-        if idle is None:
-            idle = (np.maximum(np.abs(left), np.abs(right)) < _NO_COMMAND).astype(np.float64)
+        inputs = list({id(wheels): wheels for _, wheels in pairs}.values())
+        places = {id(wheels): place for place, wheels in enumerate(inputs)}
+        asked = np.empty((len(inputs), 3, inputs[0].left.size))
+        for wheels, (left, right, idle) in zip(inputs, asked, strict=True):
+            np.multiply(radius, wheels.left, out=left)
+            np.multiply(radius, wheels.right, out=right)
+            if wheels.idle is None:
+                idle[:] = np.maximum(np.abs(left), np.abs(right)) < _NO_COMMAND
+            else:
+                idle[:] = wheels.idle
+        # Where speeds are set: those of the input, or those that are measured.
+        at = np.unique(np.concatenate((resets.first, resets.at)))
+        states = np.zeros((len(inputs), 3, at.size))
+        states[:, :2] = asked[:, :2, at]
+        known, start = np.searchsorted(at, resets.at), radius * resets.start[:, :2].T
+        states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
+        states[:, 2, known] = np.isfinite(start).all(axis=0)
+        states[:, 2, np.isin(at, context.spans.first)] = 0.0
+        numbers = [effect._list_numbers(context) for effect, _ in pairs]  # noqa: SLF001 - of its own kind
+        source = [places[id(wheels)] for _, wheels in pairs]
+        rolled = walk_each(numbers, source, asked, at, states, context.step_s)
+        rolled /= radius
+        return [
+            replace(wheels, left=left, right=right)
+            for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
+        ]
+
+    def _list_numbers(self, context: RunContext) -> Floats:
+        """The numbers of `walk_each`."""
         tau, scrub = max(self.values["tau"], _LEAST_TAU_S), self.values["scrub"]
-        gain = 0.5 * (1.0 + _ROTATING) / tau
-        numbers = np.array(
+        gain = 0.5 * (1.0 + ROTATING) / tau
+        return np.array(
             (
                 gain,
                 self.values["reset"] * gain,
@@ -279,154 +292,3 @@ class WheelServo(DriveEffect):
                 self._slope * gain,
             )
         )
-        rolled = np.empty((2, left.size))
-        _roll(left, right, states, idle, numbers, context.step_s, rolled)
-        rolled /= radius
-        return replace(wheels, left=rolled[0], right=rolled[1])
-
-
-@compiled("float64[:], float64[:], float64[:, :], float64[:], float64[:], float64, float64[:, :]")
-def _roll(
-    left: Floats,
-    right: Floats,
-    states: Floats,
-    idle: Floats,
-    numbers: Floats,
-    step_s: float,
-    rolled: Floats,
-) -> None:
-    """Cell means of the speeds of both sides by the implicit midpoint rule, with a grip that is extrapolated.
-
-    Args:
-        left: commanded speed of the left side [m/s], shape (n,).
-        right: that of the right side [m/s], shape (n,).
-        states: speeds of both sides set before a cell, NaN elsewhere, and whether they are those at the start
-            of a prediction; the first one is set, shape (n, 3).
-        idle: share of each cell without a command, shape (n,).
-        numbers: proportional gain [1/s], integral gain [1/s^2], drag [m/s^2], largest push at rest [m/s^2],
-            squared slip over acceleration of rolling wheels [s^4/m^2] and of those at rest [s^2], inverse
-            square of the largest acceleration [s^4/m^2], half the track width [m], and by how much the
-            largest push falls with speed [1/s].
-        step_s: width of a cell [s].
-        rolled: the result [m/s], shape (2, n).
-    """
-    gain, reset, drag, aside = numbers[0], numbers[1], numbers[2], numbers[7]
-    rate, inertia = 2.0 / step_s, _ROTATING / step_s
-    on_left, on_right, ahead, turn, push_left, push_right = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    step_left, step_right, step_v, step_w = 0.0, 0.0, 0.0, 0.0
-    for cell in range(left.size):
-        if not math.isnan(states[cell, 0]):
-            new_left, new_right = states[cell, 0] - on_left, states[cell, 1] - on_right
-            on_left, on_right = states[cell, 0], states[cell, 1]
-            # The body moves along: its slip is not measured.
-            ahead += 0.5 * (new_left + new_right)
-            turn += 0.5 * (new_right - new_left) / (aside * (1.0 + _LENGTHWISE))
-            # The integral part balances the friction at the measured difference of the wheels.
-            held = 0.5 * _OBSERVED * gain * (new_right - new_left) * states[cell, 2]
-            push_left, push_right = push_left - held, push_right + held
-        driven = 1.0 - idle[cell]
-        start_left, start_right = (push_left, push_right) if driven == 1.0 else (0.0, 0.0)
-        push_left, push_right = driven * push_left, driven * push_right
-        asked_left, asked_right = gain * left[cell] + push_left, gain * right[cell] + push_right
-        # The state at the middle of the cell, if it changes as in the last one.
-        near_left, near_right = on_left + step_left, on_right + step_right
-        near_v, near_w = ahead + step_v, turn + step_w
-        across = _LENGTHWISE * (aside * near_w) ** 2
-        grip_left = _grip(near_left, near_left - near_v + aside * near_w, across, numbers)
-        grip_right = _grip(near_right, near_right - near_v - aside * near_w, across, numbers)
-        held_left = inertia + drag / math.sqrt(near_left * near_left + _SLOW * _SLOW) + grip_left
-        held_right = inertia + drag / math.sqrt(near_right * near_right + _SLOW * _SLOW) + grip_right
-        is_free_left, is_free_right = True, True
-        for _ in range(3):
-            stiff_left = held_left + (gain if is_free_left else 0.0)
-            stiff_right = held_right + (gain if is_free_right else 0.0)
-            free_left = (inertia * on_left + asked_left) / stiff_left
-            free_right = (inertia * on_right + asked_right) / stiff_right
-            v, w = _move(
-                ahead, turn, free_left, free_right, grip_left, grip_right,
-                grip_left / stiff_left, grip_right / stiff_right, rate, aside,
-            )  # fmt: skip
-            mean_left = free_left + grip_left / stiff_left * (v - aside * w)
-            mean_right = free_right + grip_right / stiff_right * (v + aside * w)
-            pull_left = gain * (left[cell] - mean_left) + push_left
-            pull_right = gain * (right[cell] - mean_right) + push_right
-            was_left, was_right = is_free_left, is_free_right
-            most_left = _find_most(pull_left, near_left, numbers)
-            is_free_left = was_left and abs(pull_left) <= most_left
-            most_right = _find_most(pull_right, near_right, numbers)
-            is_free_right = was_right and abs(pull_right) <= most_right
-            if is_free_left == was_left and is_free_right == was_right:
-                break
-            asked_left = asked_left if is_free_left else math.copysign(most_left, pull_left)
-            asked_right = asked_right if is_free_right else math.copysign(most_right, pull_right)
-        rolled[0, cell], rolled[1, cell] = mean_left, mean_right
-        grown = reset * step_s * driven
-        push_left = start_left + _hold(grown * (left[cell] - mean_left), pull_left, most_left)
-        push_right = start_right + _hold(grown * (right[cell] - mean_right), pull_right, most_right)
-        step_left, step_right, step_v, step_w = (
-            mean_left - on_left,
-            mean_right - on_right,
-            v - ahead,
-            w - turn,
-        )
-        on_left, on_right = mean_left + step_left, mean_right + step_right
-        ahead, turn = v + step_v, w + step_w
-
-
-@compiled()
-def _grip(speed: float, slip: float, across: float, numbers: Floats) -> float:
-    """Force of a side over its slip [1/s], from its speed, its slip [m/s] and the squared slip sideways."""
-    rolling = numbers[4] * speed * speed + numbers[5]
-    return 0.5 / math.sqrt((slip * slip + across) * numbers[6] + rolling)
-
-
-@compiled()
-def _move(
-    ahead: float,
-    turn: float,
-    left: float,
-    right: float,
-    grip_left: float,
-    grip_right: float,
-    part_left: float,
-    part_right: float,
-    rate: float,
-    aside: float,
-) -> tuple[float, float]:
-    """Speed and yaw rate of the body at the middle of a cell, from those at its start.
-
-    Args:
-        ahead: speed of the body [m/s].
-        turn: its yaw rate [rad/s].
-        left: speed that the left side would have beside a body at rest [m/s].
-        right: that of the right side [m/s].
-        grip_left: force of the left side over its slip [1/s].
-        grip_right: that of the right side [1/s].
-        part_left: share of the body's speed that the left side takes over.
-        part_right: that of the right side.
-        rate: two over the width of a cell [1/s].
-        aside: half the track width [m].
-    """
-    firm_left, firm_right = grip_left * (1.0 - part_left), grip_right * (1.0 - part_right)
-    straight, mixed = rate + firm_left + firm_right, aside * (firm_right - firm_left)
-    turning = aside * aside * (straight + _LENGTHWISE * (grip_left + grip_right))
-    push = rate * ahead + grip_left * left + grip_right * right
-    twist = aside * (aside * rate * turn + grip_right * right - grip_left * left)
-    w = (twist * straight - mixed * push) / (straight * turning - mixed * mixed)
-    return (push - mixed * w) / straight, w
-
-
-@compiled()
-def _find_most(pull: float, speed: float, numbers: Floats) -> float:
-    """Largest push of a side [m/s^2] in the direction of a pull, at its speed [m/s]."""
-    most: float = max(numbers[3] - math.copysign(numbers[8] * speed, pull * speed), 0.0)
-    return most
-
-
-@compiled()
-def _hold(grown: float, pull: float, most: float) -> float:
-    """What an integral part grows by: not beyond the largest push."""
-    if grown * pull <= 0.0:
-        return grown
-    room = max(most - abs(pull), 0.0)
-    return min(max(grown, -room), room)
