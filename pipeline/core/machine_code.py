@@ -31,6 +31,8 @@ import numpy as np
 if TYPE_CHECKING:
     from types import ModuleType
 
+    from numpy.typing import NDArray
+
 Given = ParamSpec("Given")
 
 _TYPES: dict[str, tuple[np.dtype[Any], Any, str]] = {
@@ -47,6 +49,11 @@ _FOLDER = "NUMBA_CACHE_DIR"
 _KEPT_S = 30 * 86400.0
 """Age since the last use [s] after which machine code of no current loop is deleted: another version of the
 program may share the folder, and recompiles what is missing."""
+
+LANES = 16
+"""Most walks through a signal in one loop: the numbers of twice as many do not fit the fastest memory."""
+_PACK = 4
+"""Walks for which a step takes as long as for one: AVX2 computes with four numbers at a time."""
 
 _loops: list[Loop[Any]] = []
 
@@ -156,6 +163,23 @@ def compiled(signature: str = "") -> Callable[[Callable[Given, Any]], Callable[G
     return decorate
 
 
+def deal_lanes(count: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
+    """Walks through a signal dealt to loops that take some of them at once.
+
+    A walk waits for its own roots and divisions in each cell; the processor does those of several walks
+    meanwhile, if the loop has ``for k in range(lanes)`` around few statements, without a branch, on rows of
+    one array that are `LANES` apart. Each walk ends at the same numbers, to the last bit, as it does alone.
+
+    Yields:
+        The first walk of a loop; the walk of every lane, the last one repeated in a pack that is not full;
+        how many of the lanes are wanted.
+    """
+    for first in range(0, count, LANES):
+        wanted = min(count - first, LANES)
+        lanes = -(-wanted // _PACK) * _PACK if wanted > 1 else 1
+        yield first, first + np.minimum(np.arange(lanes), wanted - 1), wanted
+
+
 def compile_loops() -> Iterator[str]:
     """Compile the imported loops that have no machine code yet; yields the name of each compiled loop."""
     for loop in _loops:
@@ -181,7 +205,7 @@ def _hash_source(source: str, signature: str) -> str:
     binding = _load_compiler()
     features = binding.get_host_cpu_features().flatten()
     parts = [signature, version("numba"), version("llvmlite"), binding.get_host_cpu_name(), features]
-    parts.append(str(object.__basicsize__))
+    parts += [str(object.__basicsize__), str(LANES)]
     content = b"\0".join([*(part.encode() for part in parts), Path(source).read_bytes()])
     return hashlib.sha256(content).hexdigest()[:16]
 

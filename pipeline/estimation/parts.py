@@ -13,7 +13,7 @@ import numpy as np
 
 from pipeline.core import arrays
 from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, guarded_spread, robust_spread
-from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, Weights, make_columns
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Effect, Late, Place
@@ -268,7 +268,7 @@ class Part(ABC):
         """
         columns = make_columns(residual.shape[0], len(free))
         ends = [_step_aside(state.get(number), number, both_sides=both_sides) for number in free]
-        self.drive_ahead(
+        self.look_ahead(
             [state.set(number, at) for number, steps in zip(free, ends, strict=True) for at in steps]
         )
         for index, (number, (at, *rest)) in enumerate(zip(free, ends, strict=True)):
@@ -278,18 +278,20 @@ class Part(ABC):
             columns[rows, :, index] = (start - self._look(state, number, after)) / (after - before)
         return columns
 
-    def drive_ahead(self, states: Sequence[State]) -> None:
-        """Compute the wheels of states that are looked at next, see `Forward.drive_ahead`.
+    def look_ahead(self, states: Sequence[State]) -> None:
+        """Compute what is faster at once for states that are looked at next, see `Forward.look_ahead`.
 
         Args:
-            states: all with the same effects and delays; others are computed when they are looked at.
+            states: all with the same effects.
         """
         for run, comparison in enumerate(self.comparisons) if states else ():
-            models = [
-                tuple(effect for effect in state.effects_of(run) if self.owns(effect)) for state in states
-            ]
-            timing = states[0].timing[run] if self.is_delayed else _NO_DELAY
-            comparison.forward.drive_ahead(models, comparison.complete_timing(models[0], timing))
+            measured = comparison.source is Input.MEASURED
+            models = list[tuple[tuple[Effect, ...], Timing]]()
+            for state in states:
+                effects = tuple(effect for effect in state.effects_of(run) if self.owns(effect))
+                timing = state.timing[run] if self.is_delayed else _NO_DELAY
+                models.append((effects, timing if measured else comparison.complete_timing(effects, timing)))
+            comparison.forward.look_ahead(models, measured=measured)
 
     def _look(self, state: State, number: Free, value: float) -> Floats:
         """Residuals with another value of a parameter, of one run if the parameter belongs to one."""

@@ -100,27 +100,29 @@ def list_trials(part: Part, fit: PartFit, candidate: Candidate, largest: Largest
     if candidate.id in part.clocks:
         yield _start_clocks(part, fit, candidate, largest)
         return
-    for values in list_starts(candidate, largest):
-        start = candidate(**values)
-        direct = tuple(
-            p.name
+    starts = [candidate(**values) for values in list_starts(candidate, largest)]
+    changed = [
+        {
+            p.name: start.change(**{p.name: p.neutral + p.step})
             for p in start.parameters
             if p.search is Search.DIRECT and math.isfinite(p.neutral) and p.name not in start.fixed
-        )
-        state = fit.state.add(start)
+        }
+        for start in starts
+    ]
+    looked = [one for start, direct in zip(starts, changed, strict=True) for one in (start, *direct.values())]
+    part.look_ahead([fit.state.add(one) for one in looked if not one.is_neutral])
+    for start, direct in zip(starts, changed, strict=True):
+        is_same = direct and start.is_neutral
+        base = fit.residual if is_same else part.find_residuals(fit.state.add(start))
+        shift = fit.residual - base
         if not direct:
-            residual = part.find_residuals(state)
-            shift = fit.residual - residual
             yield Trial(start, (), shift[:, :, None], np.zeros_like(shift))
             continue
-        base = fit.residual if start.is_neutral else part.find_residuals(state)
-        columns = []
-        for name in direct:
-            parameter = start.parameter(name)
-            changed = start.change(**{name: parameter.neutral + parameter.step})
-            after = part.find_residuals(fit.state.add(changed))
-            columns.append((base - after) / parameter.step)
-        yield Trial(start, direct, stack_columns(columns), fit.residual - base)
+        columns = [
+            (base - part.find_residuals(fit.state.add(one))) / start.parameter(name).step
+            for name, one in direct.items()
+        ]
+        yield Trial(start, tuple(direct), stack_columns(columns), shift)
 
 
 def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Largest) -> Trial:

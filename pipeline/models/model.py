@@ -150,6 +150,15 @@ class JointDrive(DriveEffect):
         """`drive_wheels` of each effect and its wheels; none of the effects is neutral."""
 
 
+class JointBody(BodyEffect):
+    """Computes the body velocity faster for several values and rolling velocities at once."""
+
+    @classmethod
+    @abstractmethod
+    def move_each(cls, pairs: Sequence[tuple[Self, Rolling]], context: RunContext) -> list[Velocity]:
+        """`move_body` of each effect and its rolling velocity; none of the effects is neutral."""
+
+
 @dataclass(frozen=True)
 class _Path:
     """From the command to the wheels.
@@ -211,6 +220,7 @@ class Forward:
         self._cache: dict[Place, OrderedDict[object, object]] = {stage: OrderedDict() for stage in Place}
         self._known: OrderedDict[float, tuple[RunContext, RunContext]] = OrderedDict()
         self._ahead: dict[object, Wheels] = {}
+        self._moved: dict[object, Velocity] = {}
 
     @cached_property
     def _held(self) -> HeldDrive:
@@ -221,35 +231,62 @@ class Forward:
         path = _follow(effects, timing)
         return self._move(self._drive(path, len(path.driven)), path.keys[-1], effects)
 
-    def drive_ahead(self, models: Sequence[Sequence[Effect]], timing: Timing) -> None:
-        """Compute the wheels of models that are predicted from commands next, if that is faster at once.
+    def look_ahead(self, models: Sequence[tuple[Sequence[Effect], Timing]], *, measured: bool) -> None:
+        """Compute what is faster at once for models that are predicted next.
 
         Args:
-            models: with the same effects, and different values.
-            timing: of the run.
+            models: with the same effects, and their delays.
+            measured: whether from wheel encoders in place of commands.
         """
-        paths = [_follow(effects, timing) for effects in models]
-        at = next((n for n, one in enumerate(paths[0].driven) if isinstance(one, JointDrive)), None)
-        if at is None or self._most == _REMEMBERED:
+        self._ahead, self._moved = {}, {}
+        if self._most == _REMEMBERED:
             return
-        self._ahead = {}
+        if measured:
+            self._move_ahead(models)
+        else:
+            self._drive_ahead([_follow(effects, timing) for effects, timing in models])
+
+    def _drive_ahead(self, paths: Sequence[_Path]) -> None:
+        """Wheels after an effect of the drive, for paths with the delay of the first one."""
+        at = next((n for n, one in enumerate(paths[0].driven) if isinstance(one, JointDrive)), None)
+        if at is None:
+            return
+        delay_s, continues, known = paths[0].delay_s, paths[0].continues[at], self._cache[Place.DRIVE]
         new = {
             key: one
             for one in paths
-            if (key := one.keys[at + 1]) not in self._cache[Place.DRIVE] and not one.driven[at].is_neutral
+            if (key := one.keys[at + 1]) not in known
+            and one.delay_s == delay_s
+            and not one.driven[at].is_neutral
         }
         if len(new) > 1:
             pairs = [(cast("JointDrive", one.driven[at]), self._drive(one, at)) for one in new.values()]
-            context = self._start_wheels(timing.wheel_delay_s)[paths[0].continues[at]]
+            context = self._start_wheels(delay_s)[continues]
             self._ahead = dict(zip(new, pairs[0][0].drive_each(pairs, context), strict=True))
+
+    def _move_ahead(self, models: Sequence[tuple[Sequence[Effect], Timing]]) -> None:
+        """Motion of the body on measured wheels, for models in which one effect gives it."""
+        new = dict[object, tuple[JointBody, Rolling]]()
+        for effects, timing in models:
+            body = [effect for effect in effects if effect.place is Place.BODY]
+            if len(body) == 1 and isinstance(body[0], JointBody) and not body[0].is_neutral:
+                rolling, key = self._find_rolling(*self._measure_wheels(timing), effects)
+                key = (*key, "|", body[0].key)
+                if key not in self._cache[Place.BODY]:
+                    new[key] = (body[0], rolling)
+        if len(new) > 1:
+            pairs = list(new.values())
+            self._moved = dict(zip(new, pairs[0][0].move_each(pairs, self.context), strict=True))
 
     def run_wheels(self, effects: Sequence[Effect], timing: Timing) -> Velocity:
         """Reported body velocity, predicted from wheel encoders, without effects of the drivetrain."""
+        return self._move(*self._measure_wheels(timing), effects)
+
+    def _measure_wheels(self, timing: Timing) -> tuple[Wheels, tuple[object, ...]]:
+        """Measured wheel speeds, and their key."""
         key = (timing.wheel_delay_s,)
-        wheels = self._keep(
-            Place.DRIVE, key, lambda: self._measured.interpolate(self.context.times, timing.wheel_delay_s)
-        )
-        return self._move(wheels, key, effects)
+        measure = partial(self._measured.interpolate, self.context.times, timing.wheel_delay_s)
+        return self._keep(Place.DRIVE, key, measure), key
 
     def _start_wheels(self, delay_s: float) -> tuple[RunContext, RunContext]:
         """The run with wheel speeds from the encoders where states are reset, and where spans begin only."""
@@ -311,12 +348,10 @@ class Forward:
         return wheels
 
     def _move(self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]) -> Velocity:
-        rolled = [e for e in effects if e.place is Place.KINEMATICS]
-        key = (*key, "|", *(e.key for e in rolled))
-        rolling = self._keep(Place.KINEMATICS, key, lambda: self._roll(wheels, rolled))
+        rolling, key = self._find_rolling(wheels, key, effects)
         body = [e for e in effects if e.place is Place.BODY]
         key = (*key, "|", *(e.key for e in body))
-        moved, rolling = self._keep(Place.BODY, key, lambda: self._move_body(rolling, body))
+        moved, rolling = self._keep(Place.BODY, key, partial(self._move_body, rolling, body, key))
         velocity = moved
         for effect in effects:
             if effect.place is Place.GROUND:
@@ -338,17 +373,28 @@ class Forward:
                     velocity = cast("ReportEffect", effect).report(velocity, self.context)
         return velocity
 
+    def _find_rolling(
+        self, wheels: Wheels, key: tuple[object, ...], effects: Sequence[Effect]
+    ) -> tuple[Rolling, tuple[object, ...]]:
+        """Rolling velocity of wheels, and its key."""
+        rolled = [e for e in effects if e.place is Place.KINEMATICS]
+        key = (*key, "|", *(e.key for e in rolled))
+        return self._keep(Place.KINEMATICS, key, partial(self._roll, wheels, rolled)), key
+
     def _roll(self, wheels: Wheels, effects: Sequence[Effect]) -> Rolling:
         rolling = roll_ideally(wheels, self.context)
         for effect in effects:
             rolling = cast("KinematicEffect", effect).roll(rolling, self.context)
         return rolling
 
-    def _move_body(self, rolling: Rolling, effects: Sequence[Effect]) -> tuple[Velocity, Rolling]:
+    def _move_body(
+        self, rolling: Rolling, effects: Sequence[Effect], key: object
+    ) -> tuple[Velocity, Rolling]:
         """Body velocity, and v0, w0 that effects of the ground act on."""
         ground = rolling
         for effect in cast("Sequence[BodyEffect]", effects):
-            moved = effect.move_body(rolling, self.context)
+            known = self._moved.pop(key, None)
+            moved = effect.move_body(rolling, self.context) if known is None else known
             rolling = replace(rolling, v0=moved.x, s0=moved.y, w0=moved.w)
             if effect.is_kinematic:
                 ground = replace(ground, v0=moved.x, w0=moved.w)

@@ -1,8 +1,6 @@
 """Walks of the wheel servo through the cells of a run, several of them at once.
 
-The formula is that of the effect. Each cell waits for the one before, through a chain of roots and divisions;
-walks beside each other share that wait, as the processor computes each step for a pack of them. Every walk
-gives the same numbers, to the last bit, as it does alone.
+The formula is that of the effect; walks at once are those of `machine_code.deal_lanes`.
 """
 
 import math
@@ -11,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.machine_code import compiled
+from pipeline.core.machine_code import LANES, compiled, deal_lanes
 
 ROTATING = 0.7
 """Inertia of the rotating parts over that of the vehicle: the loss of nine Warthog runs on five grounds
@@ -24,10 +22,6 @@ _OBSERVED = 0.5
 """Share of a deviation of the wheels' difference at the start of a prediction that the integral part takes:
 with 0.4 to 0.8 the errors of nine Warthog runs over 2 s are smallest."""
 
-_LANES = 16
-"""Most walks at once: with twice as many their numbers would not fit the processor's fastest memory."""
-_PACK = 4
-"""Walks for which a step takes as long as for one: AVX2 computes with four numbers at a time."""
 # Rows of what belongs to each walk: state, numbers in the order of `walk_each`, and what it has in a cell.
 (
     _ON_LEFT, _ON_RIGHT, _AHEAD, _TURN, _PUSH_LEFT, _PUSH_RIGHT, _STEP_LEFT, _STEP_RIGHT, _STEP_V, _STEP_W,
@@ -35,7 +29,7 @@ _PACK = 4
     _LEFT, _RIGHT, _IDLE, _NEAR_LEFT, _NEAR_RIGHT, _GRIP_LEFT, _GRIP_RIGHT, _HELD_LEFT, _HELD_RIGHT,
     _GIVEN_LEFT, _GIVEN_RIGHT, _ASKED_LEFT, _ASKED_RIGHT, _FREE_LEFT, _FREE_RIGHT,
     _MEAN_LEFT, _MEAN_RIGHT, _MEAN_V, _MEAN_W, _PULL_LEFT, _PULL_RIGHT, _MOST_LEFT, _MOST_RIGHT,
-) = (_LANES * row for row in range(42))  # fmt: skip
+) = (LANES * row for row in range(42))  # fmt: skip
 
 
 def walk_each(
@@ -57,16 +51,12 @@ def walk_each(
         step_s: width of a cell [s].
     """
     rolled = np.empty((len(numbers), 2, asked.shape[2]))
-    for first in range(0, len(numbers), _LANES):
-        count = min(len(numbers) - first, _LANES)
-        # A pack that is not full walks its last servo again.
-        places = np.arange(-(-count // _PACK) * _PACK if count > 1 else 1)
-        lanes = first + np.minimum(places, count - 1)
+    for first, lanes, count in deal_lanes(len(numbers)):
         inputs = np.array(source, dtype=np.int64)[lanes]
-        rows = np.zeros(_MOST_RIGHT + _LANES)
-        rows.reshape(-1, _LANES)[_GAIN // _LANES : _LEFT // _LANES, places] = np.transpose(numbers)[:, lanes]
+        rows = np.zeros((_MOST_RIGHT // LANES + 1, LANES))
+        rows[_GAIN // LANES : _LEFT // LANES, : lanes.size] = np.transpose(numbers)[:, lanes]
         given = np.ascontiguousarray(states[inputs].transpose(2, 1, 0))
-        _walk(asked, inputs, at, given, step_s, rows, count, rolled[first:])
+        _walk(asked, inputs, at, given, step_s, rows.ravel(), count, rolled[first:])
     return rolled
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -13,9 +13,11 @@ from scipy.integrate import solve_ivp
 
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
+from pipeline.estimation.parts import Part
 from pipeline.export import export_model
 from pipeline.export.twin_body import build_twin_body
 from pipeline.models import Model, ModelFile, Timing, find_effect
+from pipeline.models.model import JointBody
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.signals import Resets, Rolling, RunContext, Velocity, Wheels
 from pipeline.simulate import Disturbance
@@ -101,6 +103,42 @@ def test_finer_cells_give_the_same_motion() -> None:
     one, other = _move(ICE, coarse), _move(ICE, fine)
     seen = np.stack([np.interp(coarse.grid.times, fine.grid.times, row) for row in other])
     assert np.sqrt(np.mean((one - seen) ** 2, axis=1)) == pytest.approx(0.0, abs=0.006)
+
+
+@pytest.mark.parametrize("count", [3, 9, 18])
+def test_bodies_that_are_computed_at_once_move_as_each_does_alone(count: int) -> None:
+    context, kind = _compare().context, cast("type[JointBody]", find_effect("contact_friction"))
+    draws = np.random.default_rng(count)
+    cells = context.times.size
+    rollings = [Rolling(*draws.normal(size=(2, cells)), Wheels(*np.zeros((3, cells)))) for _ in range(2)]
+    effects = [
+        kind(**{name: share * value for name, value in ICE.items()})
+        for share in draws.uniform(0.8, 3.0, count)
+    ]
+    pairs = [(effect, rollings[index % 2]) for index, effect in enumerate(effects)]
+    for (effect, rolling), found in zip(pairs, kind.move_each(pairs, context), strict=True):
+        alone = effect.move_body(rolling, context)
+        assert all(np.array_equal(getattr(found, name), getattr(alone, name)) for name in ("x", "y", "w"))
+
+
+@pytest.mark.parametrize(
+    "effects", [("wheel_servo", "body_acceleration_limit"), ("contact_friction", "wheel_radius")]
+)
+@pytest.mark.parametrize("both_sides", [False, True])
+def test_derivatives_are_the_same_as_of_one_state_after_the_other(
+    effects: tuple[str, ...], *, both_sides: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    run = simulate({}, duration_s=60.0, pose=QUIET)
+    columns = list[np.ndarray]()
+    for look_ahead in (Part.look_ahead, lambda *_: None):
+        monkeypatch.setattr(Part, "look_ahead", look_ahead)
+        problem = Problem([run], HUSKY, Input.COMMAND)
+        (part,) = [part for part in problem.parts if part.owns(find_effect(effects[0])())]
+        state = problem.start_state([find_effect(name)().make_usual(problem.largest) for name in effects])
+        free, residual = part.list_free(state), part.find_residuals(state)
+        columns.append(part.differentiate(state, residual, free, both_sides=both_sides))
+    assert np.abs(columns[0]).max() > 0.0
+    assert np.array_equal(*columns)
 
 
 @pytest.mark.parametrize(

@@ -175,7 +175,6 @@ def test_it_agrees_with_motors_that_are_stepped_through(
         assert float(np.sqrt(np.mean((ours - theirs) ** 2))) < 0.03
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("count", [2, 4, 7, 21])
 def test_servos_that_are_computed_at_once_move_as_each_does_alone(count: int) -> None:
     size, kind = 3000, cast("type[JointDrive]", find_effect("wheel_servo"))
@@ -196,6 +195,7 @@ def test_servos_that_are_computed_at_once_move_as_each_does_alone(count: int) ->
         assert np.array_equal(found.right, alone.right)
 
 
+@pytest.mark.long
 def test_a_gentle_drive_tells_the_friction_and_the_integral_part_of_its_loop() -> None:
     """Turns below the scrub begin seconds late: no lag of a plausible size does that."""
     hidden = {"tau": 0.2, "reset": 0.35, "drag": 0.06, "bound": 1.1, "scrub": 1.2, "creep": 0.07}

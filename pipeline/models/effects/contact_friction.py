@@ -20,15 +20,18 @@ measured on the DRIVE recordings.
 """
 
 import math
+from collections.abc import Sequence
+from typing import Self
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.core.machine_code import compiled
+from pipeline.core.arrays import Floats, Ints
+from pipeline.core.machine_code import LANES, compiled, deal_lanes
 from pipeline.core.rigid import GRAVITY_MPS2
-from pipeline.models.effect import INF, BodyEffect, Effect, Excitation, Parameter, Plausible, Search
+from pipeline.models.effect import INF, Effect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.body_inertia import LEAST_LAG_S
 from pipeline.models.effects.effective_track import EffectiveTrack
+from pipeline.models.model import JointBody
 from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
@@ -41,7 +44,7 @@ _STEP_S = 0.02
 """Longest integration step [s]: half of it changes velocities by less than 2 mm/s."""
 
 
-class ContactFriction(BodyEffect):
+class ContactFriction(JointBody):
     """Contact friction: sliding wheels push the body with a bounded force."""
 
     id = "contact_friction"
@@ -146,91 +149,143 @@ class ContactFriction(BodyEffect):
         """See the formula above."""
         if self.is_neutral:
             return rolling.velocity
-        half, resets = 0.5 * context.track_m, context.body
-        begin = resets.first
-        states = np.full((rolling.v0.size, 3), np.nan)
-        states[begin] = np.column_stack((rolling.v0[begin], np.zeros(begin.size), rolling.w0[begin]))
+        return self.move_each([(self, rolling)], context)[0]
+
+    @classmethod
+    def move_each(cls, pairs: Sequence[tuple[Self, Rolling]], context: RunContext) -> list[Velocity]:
+        """See `JointBody`."""
+        resets = context.body
+        inputs = list({id(rolling): rolling for _, rolling in pairs}.values())
+        places = {id(rolling): place for place, rolling in enumerate(inputs)}
+        rolled = np.array([(rolling.v0, rolling.w0) for rolling in inputs])
+        # Where velocities are set: those of the wheels, or those that are measured.
         known = np.isfinite(resets.start).all(axis=1)
-        states[resets.at[known]] = resets.start[known]
-        numbers = np.array(
-            (
-                (max(self.values["creep"], _LEAST_CREEP) / GRAVITY_MPS2) ** 2,
-                (self.values["friction"] * GRAVITY_MPS2) ** -2,
-                half * math.sqrt(self.values["k"] - 1.0),
-                half,
-                (half * self.values["gyration"]) ** 2,
-            )
-        )
-        moved = np.empty((3, rolling.v0.size))
+        at = np.unique(np.concatenate((resets.first, resets.at[known])))
+        states = np.zeros((len(inputs), 3, at.size))
+        states[:, ::2] = rolled[:, :, at]
+        states[:, :, np.searchsorted(at, resets.at[known])] = resets.start[known].T
+        moved = np.empty((len(pairs), 3, rolled.shape[2]))
         steps = max(1, math.ceil(context.step_s / _STEP_S - 1e-6))
-        _slide(rolling.v0, rolling.w0, states, numbers, context.step_s, steps, moved)
-        return Velocity(*moved)
+        numbers = np.transpose([effect.list_numbers(context) for effect, _ in pairs])
+        source = np.array([places[id(rolling)] for _, rolling in pairs], dtype=np.int64)
+        for first, lanes, count in deal_lanes(len(pairs)):
+            rows = np.zeros((_MEAN_W // LANES + 1, LANES))
+            rows[: _X // LANES, : lanes.size] = numbers[:, lanes]
+            given = np.ascontiguousarray(states[source[lanes]].transpose(2, 1, 0))
+            _slide(
+                rolled, source[lanes], at, given, context.step_s, steps, rows.ravel(), count, moved[first:]
+            )
+        return [Velocity(*one) for one in moved]
+
+    def list_numbers(self, context: RunContext) -> tuple[float, ...]:
+        """The numbers of `_slide`."""
+        half = 0.5 * context.track_m
+        return (
+            (max(self.values["creep"], _LEAST_CREEP) / GRAVITY_MPS2) ** 2,
+            (self.values["friction"] * GRAVITY_MPS2) ** -2,
+            half * math.sqrt(self.values["k"] - 1.0),
+            half,
+            (half * self.values["gyration"]) ** 2,
+        )
 
 
-@compiled("float64[:], float64[:], float64[:, :], float64[:], float64, int64, float64[:, :]")
+# Rows of what belongs to each body: numbers in the order of `list_numbers`, state, and what it has in a cell.
+(
+    _CREEP, _BOUND, _AHEAD, _ASIDE, _INERTIA, _X, _Y, _W,
+    _LEFT, _RIGHT, _ROLLING_LEFT, _ROLLING_RIGHT, _MEAN_X, _MEAN_Y, _MEAN_W,
+) = (LANES * row for row in range(15))  # fmt: skip
+
+
+@compiled(
+    "float64[:, :, :], int64[:], int64[:], float64[:, :, :], float64, int64, float64[:], int64, "
+    "float64[:, :, :]"
+)
 def _slide(
-    v0: Floats, w0: Floats, states: Floats, numbers: Floats, step_s: float, steps: int, moved: Floats
+    rolled: Floats,
+    source: Ints,
+    at: Ints,
+    states: Floats,
+    step_s: float,
+    steps: int,
+    rows: Floats,
+    count: int,
+    moved: Floats,
 ) -> None:
     """Cell means of the body velocity by the implicit midpoint rule, with the friction of each step's start.
 
     Args:
-        v0: rolling speed [m/s], shape (n,).
-        w0: rolling yaw rate [rad/s], shape (n,).
-        states: velocities set before a cell, NaN elsewhere; the first one is set, shape (n, 3).
-        numbers: squared slip ratio over acceleration of rolling wheels and inverse square of the largest
-            acceleration [s^4/m^2], half the distance of the contacts lengthwise and across [m], and the
-            squared radius of gyration [m^2].
+        rolled: rolling speeds [m/s] and yaw rates [rad/s], shape (k, 2, n).
+        source: index of these for each body, shape (lanes,).
+        at: cells before which velocities are set, shape (e,); the first one is among them.
+        states: these velocities, shape (e, 3, lanes).
         step_s: width of a cell [s].
         steps: number of integration steps per cell.
-        moved: the result [m/s, m/s, rad/s], shape (3, n).
+        rows: all that belongs to each body: its numbers, and zeros.
+        count: number of bodies that are wanted.
+        moved: the result [m/s, m/s, rad/s], shape (`count` or more, 3, n).
     """
-    creep, bound, ahead, aside, inertia = numbers[0], numbers[1], numbers[2], numbers[3], numbers[4]
-    step = step_s / steps
-    half = 0.5 * step
-    x, y, w = states[0, 0], states[0, 1], states[0, 2]
-    for cell in range(v0.size):
-        if not math.isnan(states[cell, 0]):
-            x, y, w = states[cell, 0], states[cell, 1], states[cell, 2]
-        left, right = v0[cell] - aside * w0[cell], v0[cell] + aside * w0[cell]
-        rolling_left = creep * (left * left + _REST_MPS * _REST_MPS)
-        rolling_right = creep * (right * right + _REST_MPS * _REST_MPS)
-        mean_x, mean_y, mean_w = 0.0, 0.0, 0.0
+    event, lanes = 0, source.size
+    for cell in range(rolled.shape[2]):
+        if event < at.size and at[event] == cell:
+            for k in range(lanes):
+                rows[_X + k], rows[_Y + k] = states[event, 0, k], states[event, 1, k]
+                rows[_W + k] = states[event, 2, k]
+            event += 1
+        for k in range(lanes):
+            v0, w0, creep = rolled[source[k], 0, cell], rolled[source[k], 1, cell], rows[_CREEP + k]
+            left, right = v0 - rows[_ASIDE + k] * w0, v0 + rows[_ASIDE + k] * w0
+            rows[_LEFT + k], rows[_RIGHT + k] = left, right
+            rows[_ROLLING_LEFT + k] = creep * (left * left + _REST_MPS * _REST_MPS)
+            rows[_ROLLING_RIGHT + k] = creep * (right * right + _REST_MPS * _REST_MPS)
+            rows[_MEAN_X + k], rows[_MEAN_Y + k], rows[_MEAN_W + k] = 0.0, 0.0, 0.0
         for _ in range(steps):
-            # The body frame rotates relative to the velocity, half before the forces act and half after.
-            before_x, before_y, turn = x, y, half * w
-            shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
-            x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
-            left_x, right_x = left - x + aside * w, right - x - aside * w
-            front_y, rear_y = -y - ahead * w, -y + ahead * w
-            front_left = 0.25 / math.sqrt((left_x * left_x + front_y * front_y) * bound + rolling_left)
-            rear_left = 0.25 / math.sqrt((left_x * left_x + rear_y * rear_y) * bound + rolling_left)
-            front_right = 0.25 / math.sqrt((right_x * right_x + front_y * front_y) * bound + rolling_right)
-            rear_right = 0.25 / math.sqrt((right_x * right_x + rear_y * rear_y) * bound + rolling_right)
-            on_left, on_right = front_left + rear_left, front_right + rear_right
-            front, rear = front_left + front_right, rear_left + rear_right
-            total = on_left + on_right
-            # Coefficients of the forces in the yaw rate, and of the torque in the speeds.
-            along, across = aside * (on_left - on_right), ahead * (front - rear)
-            turning = (aside * aside + ahead * ahead) * total
-            force_x = on_left * left_x + on_right * right_x
-            force_y = front * front_y + rear * rear_y
-            torque = ahead * (front * front_y - rear * rear_y) - aside * (
-                on_left * left_x - on_right * right_x
-            )
-            # Solution of the linear midpoint equations for the change of each speed.
-            stiff = 1.0 + half * total
-            crossed = half / stiff
-            change_w = (
-                step
-                * (torque + crossed * (along * force_x - across * force_y))
-                / (inertia + half * (turning - crossed * (along * along + across * across)))
-            )
-            change_x = (step * force_x + half * along * change_w) / stiff
-            change_y = (step * force_y - half * across * change_w) / stiff
-            x, y, turn = x + change_x, y + change_y, half * (w + change_w)
-            shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
-            x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
-            mean_x, mean_y = mean_x + 0.5 * (before_x + x), mean_y + 0.5 * (before_y + y)
-            mean_w += w + 0.5 * change_w
-            w += change_w
-        moved[0, cell], moved[1, cell], moved[2, cell] = mean_x / steps, mean_y / steps, mean_w / steps
+            _step(rows, lanes, step_s / steps)
+        for k in range(count):
+            moved[k, 0, cell], moved[k, 1, cell] = rows[_MEAN_X + k] / steps, rows[_MEAN_Y + k] / steps
+            moved[k, 2, cell] = rows[_MEAN_W + k] / steps
+
+
+@compiled()
+def _step(rows: Floats, lanes: int, step: float) -> None:
+    """One step of every body, added to its means."""
+    half = 0.5 * step
+    for k in range(lanes):
+        bound, ahead, aside = rows[_BOUND + k], rows[_AHEAD + k], rows[_ASIDE + k]
+        rolling_left, rolling_right = rows[_ROLLING_LEFT + k], rows[_ROLLING_RIGHT + k]
+        before_x, before_y, w = rows[_X + k], rows[_Y + k], rows[_W + k]
+        # The body frame rotates relative to the velocity, half before the forces act and half after.
+        turn = half * w
+        shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
+        x, y = (before_x + before_y * turn) * shrunk, (before_y - before_x * turn) * shrunk
+        left_x, right_x = rows[_LEFT + k] - x + aside * w, rows[_RIGHT + k] - x - aside * w
+        front_y, rear_y = -y - ahead * w, -y + ahead * w
+        front_left = 0.25 / math.sqrt((left_x * left_x + front_y * front_y) * bound + rolling_left)
+        rear_left = 0.25 / math.sqrt((left_x * left_x + rear_y * rear_y) * bound + rolling_left)
+        front_right = 0.25 / math.sqrt((right_x * right_x + front_y * front_y) * bound + rolling_right)
+        rear_right = 0.25 / math.sqrt((right_x * right_x + rear_y * rear_y) * bound + rolling_right)
+        on_left, on_right = front_left + rear_left, front_right + rear_right
+        front, rear = front_left + front_right, rear_left + rear_right
+        total = on_left + on_right
+        # Coefficients of the forces in the yaw rate, and of the torque in the speeds.
+        along, across = aside * (on_left - on_right), ahead * (front - rear)
+        turning = (aside * aside + ahead * ahead) * total
+        force_x = on_left * left_x + on_right * right_x
+        force_y = front * front_y + rear * rear_y
+        torque = ahead * (front * front_y - rear * rear_y) - aside * (on_left * left_x - on_right * right_x)
+        # Solution of the linear midpoint equations for the change of each speed.
+        stiff = 1.0 + half * total
+        crossed = half / stiff
+        change_w = (
+            step
+            * (torque + crossed * (along * force_x - across * force_y))
+            / (rows[_INERTIA + k] + half * (turning - crossed * (along * along + across * across)))
+        )
+        change_x = (step * force_x + half * along * change_w) / stiff
+        change_y = (step * force_y - half * across * change_w) / stiff
+        x, y, turn = x + change_x, y + change_y, half * (w + change_w)
+        shrunk = 1.0 / math.sqrt(1.0 + turn * turn)
+        x, y = (x + y * turn) * shrunk, (y - x * turn) * shrunk
+        rows[_MEAN_X + k] += 0.5 * (before_x + x)
+        rows[_MEAN_Y + k] += 0.5 * (before_y + y)
+        rows[_MEAN_W + k] += w + 0.5 * change_w
+        rows[_X + k], rows[_Y + k], rows[_W + k] = x, y, w + change_w

@@ -266,7 +266,7 @@ class WheelServo(JointDrive):
         states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
         states[:, 2, known] = np.isfinite(start).all(axis=0)
         states[:, 2, np.isin(at, context.spans.first)] = 0.0
-        numbers = [effect._list_numbers(context) for effect, _ in pairs]  # noqa: SLF001 - of its own kind
+        numbers = [effect.list_numbers(context) for effect, _ in pairs]
         source = [places[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
         rolled /= radius
@@ -275,7 +275,7 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def _list_numbers(self, context: RunContext) -> Floats:
+    def list_numbers(self, context: RunContext) -> Floats:
         """The numbers of `walk_each`."""
         tau, scrub = max(self.values["tau"], _LEAST_TAU_S), self.values["scrub"]
         gain = 0.5 * (1.0 + ROTATING) / tau
