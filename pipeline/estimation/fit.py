@@ -330,8 +330,8 @@ def fit_part(
 
 def _enter(part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: Until) -> PartFit:
     """An unchanged state with its residuals and derivatives."""
-    residual, both = part.find_residuals(state), until.enough < _ENOUGH
-    jacobian = part.differentiate(state, residual, free, both_sides=both)
+    both = until.enough < _ENOUGH
+    residual, jacobian = part.linearize(state, free, both_sides=both)
     return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
 
 
@@ -344,14 +344,14 @@ def try_part(part: Part, weights: Weights, state: State, base: PartFit) -> PartF
         state: state to start from.
         base: fit of a state with most of its parameters.
     """
-    free, residual = part.list_free(state), part.find_residuals(state)
+    free = part.list_free(state)
     known = {number.key: index for index, number in enumerate(base.free)}
-    jacobian = make_columns(residual.shape[0], len(free))
-    for index, number in enumerate(free):
-        if number.key in known:
-            jacobian[:, :, index] = base.jacobian[:, :, known[number.key]]
     new = [index for index, number in enumerate(free) if number.key not in known]
-    jacobian = _renew(part, free, new, state, residual, jacobian, both_sides=False)
+    residual, columns = part.linearize(state, [free[index] for index in new])
+    jacobian = make_columns(residual.shape[0], len(free))
+    jacobian[:, :, new] = columns
+    old = [index for index in range(len(free)) if index not in new]
+    jacobian[:, :, old] = base.jacobian[:, :, [known[free[index].key] for index in old]]
     start = PartFit(state, free, residual, jacobian, weights, math.nan)
     return replace(_descend(part, start, Until(_TRIES), new), is_fresh=False)
 

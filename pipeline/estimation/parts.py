@@ -131,9 +131,6 @@ def _make_features(part: Part) -> Floats:
 
 
 _NO_DELAY = Timing()
-_NARROW = 0.1
-"""Share of a derivative's step for central differences: with whole steps, two fits of one model to ice differ
-by 1 % in the heading error; with a tenth or a thirtieth, both end at the same values."""
 _LEAST_SPREAD = 2e-4
 """Least spread of a displacement [m, rad] over half a second: weights remain finite for a model without
 noise."""
@@ -257,26 +254,40 @@ class Part(ABC):
     def differentiate(
         self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
     ) -> Floats:
-        """Derivative of the prediction by each free parameter, shape (n, 3, p).
+        """Derivative of the prediction by each free parameter, see `linearize`."""
+        return self.linearize(state, free, residual, both_sides=both_sides)[1]
+
+    def linearize(
+        self, state: State, free: Sequence[Free], residual: Floats | None = None, *, both_sides: bool = False
+    ) -> tuple[Floats, Floats]:
+        """Residuals of a state, shape (n, 3), and derivatives of its prediction, shape (n, 3, p).
 
         Args:
             state: state at which to differentiate.
-            residual: residuals at this state, shape (n, 3).
             free: the parameters.
+            residual: residuals at this state, if they are known.
             both_sides: use central differences of a tenth of the step within the bounds: the fit then ends
                 alike from all starts.
         """
-        columns = make_columns(residual.shape[0], len(free))
-        ends = [_step_aside(state.get(number), number, both_sides=both_sides) for number in free]
+        ends = [number.step_aside(state.get(number), both_sides=both_sides) for number in free]
+        moved = [[state.set(number, at) for at in steps] for number, steps in zip(free, ends, strict=True)]
         self.look_ahead(
-            [state.set(number, at) for number, steps in zip(free, ends, strict=True) for at in steps]
+            [*([state] if residual is None else []), *(one for states in moved for one in states)]
         )
-        for index, (number, (at, *rest)) in enumerate(zip(free, ends, strict=True)):
-            rows = slice(None) if number.run is None else self.run == number.run
-            before, after = (state.get(number), at) if not rest else (at, rest[0])
-            start = residual[rows] if not rest else self._look(state, number, before)
-            columns[rows, :, index] = (start - self._look(state, number, after)) / (after - before)
-        return columns
+        residual = self.find_residuals(state) if residual is None else residual
+        columns = make_columns(residual.shape[0], len(free))
+        for index, (number, steps, states) in enumerate(zip(free, ends, moved, strict=True)):
+            run = number.run
+            looks = [
+                self.find_residuals(one) if run is None else self.find_run_residuals(one, run)
+                for one in states
+            ]
+            rows = slice(None) if run is None else self.run == run
+            if len(steps) > 1:
+                columns[rows, :, index] = (looks[0] - looks[1]) / (steps[1] - steps[0])
+            else:
+                columns[rows, :, index] = (residual[rows] - looks[0]) / (steps[0] - state.get(number))
+        return residual, columns
 
     def look_ahead(self, states: Sequence[State]) -> None:
         """Compute what is faster at once for states that are looked at next, see `Forward.look_ahead`.
@@ -292,21 +303,6 @@ class Part(ABC):
                 timing = state.timing[run] if self.is_delayed else _NO_DELAY
                 models.append((effects, timing if measured else comparison.complete_timing(effects, timing)))
             comparison.forward.look_ahead(models, measured=measured)
-
-    def _look(self, state: State, number: Free, value: float) -> Floats:
-        """Residuals with another value of a parameter, of one run if the parameter belongs to one."""
-        moved, run = state.set(number, value), number.run
-        return self.find_residuals(moved) if run is None else self.find_run_residuals(moved, run)
-
-
-def _step_aside(value: float, number: Free, *, both_sides: bool) -> tuple[float, ...]:
-    """Values of a parameter for its derivative: one step above or below, or two close to it."""
-    low, high = number.bounds
-    above, below = value + _NARROW * number.step, value - _NARROW * number.step
-    if both_sides and low <= below and above <= high:
-        return below, above
-    # At a bound, the influence of a parameter may grow with its square.
-    return (value + number.step if value + number.step <= high else value - number.step,)
 
 
 class BodyPart(Part):

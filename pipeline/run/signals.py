@@ -175,7 +175,10 @@ class Rolling:
     @property
     def velocity(self) -> Velocity:
         """The rolling velocity as a velocity of the body."""
-        return Velocity(self.v0, np.zeros_like(self.v0) + self.s0, self.w0)
+        aside = np.zeros_like(self.v0)
+        if not isinstance(self.s0, float) or self.s0 != 0.0:
+            aside += self.s0
+        return Velocity(self.v0, aside, self.w0)
 
     def scale(self, along: Floats | float, turning: Floats | float) -> Rolling:
         """Rolling with the speed in every direction and the yaw rate multiplied."""

@@ -265,7 +265,7 @@ class WheelServo(JointDrive):
         known, start = np.searchsorted(at, resets.at), radius * resets.start[:, :2].T
         states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
         states[:, 2, known] = np.isfinite(start).all(axis=0)
-        states[:, 2, np.isin(at, context.spans.first)] = 0.0
+        states[:, 2, np.searchsorted(at, context.spans.first)] = 0.0
         numbers = [effect.list_numbers(context) for effect, _ in pairs]
         source = [places[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
