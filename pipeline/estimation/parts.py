@@ -216,7 +216,8 @@ class Part(ABC):
 
     def find_residuals(self, state: State) -> Floats:
         """Measured less predicted velocities of all runs, shape (n, 3)."""
-        return np.concatenate([self.find_run_residuals(state, run) for run in range(len(self.comparisons))])
+        residuals = [self.find_run_residuals(state, run) for run in range(len(self.comparisons))]
+        return residuals[0] if len(residuals) == 1 else np.concatenate(residuals)
 
     @property
     def restarted(self) -> Self:

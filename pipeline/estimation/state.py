@@ -76,8 +76,11 @@ class Weights:
 
     def factors(self, residual: Floats) -> Floats:
         """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
-        size = np.abs(residual / self.scale)
-        return np.sqrt(self.clip / np.maximum(size, self.clip)) / self.scale
+        factors = residual / self.scale
+        np.maximum(np.abs(factors, out=factors), self.clip, out=factors)
+        np.sqrt(np.divide(self.clip, factors, out=factors), out=factors)
+        factors /= self.scale
+        return factors
 
     def cost(self, residual: Floats) -> Floats:
         """Huber cost of every window, shape (n,)."""

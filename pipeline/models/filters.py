@@ -27,10 +27,11 @@ def lag_signal(signal: Signal, tau: float, step_s: float, resets: Resets, start:
     """
     if tau <= 0.0:
         return signal
-    lagged, part = np.empty_like(signal), np.empty(signal.size)
+    lagged, is_complex = np.empty_like(signal), np.iscomplexobj(signal)
+    part = np.empty(signal.size) if is_complex else lagged.real
     _lag(np.ascontiguousarray(signal.real), set_states(signal.real, resets, start.real), tau, step_s, part)
-    lagged.real = part
-    if np.iscomplexobj(signal):
+    if is_complex:
+        lagged.real = part
         states = set_states(signal.imag, resets, start.imag)
         _lag(np.ascontiguousarray(signal.imag), states, tau, step_s, part)
         lagged.imag = part

@@ -126,7 +126,7 @@ class Differential(Kinematics):
         forward *= 0.5 * radius
         turning *= radius
         turning /= width_m
-        return forward, np.zeros_like(forward), turning
+        return forward, np.broadcast_to(0.0, np.shape(forward)), turning
 
 
 _SLOW_MPS = 1e-3

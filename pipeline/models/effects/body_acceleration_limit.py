@@ -57,7 +57,8 @@ class BodyAccelerationLimit(DriveEffect):
         limit, resets = self.values["limit"] / context.vehicle.wheel_radius_m, context.wheels
         asked = 0.5 * (wheels.left + wheels.right)
         start = 0.5 * (resets.start[:, 0] + resets.start[:, 1])
-        added = limit_rate(asked, limit, context.step_s, resets, start) - asked
+        added = limit_rate(asked, limit, context.step_s, resets, start)
+        added -= asked
         return replace(wheels, left=wheels.left + added, right=wheels.right + added, idle=None)
 
     def is_degenerate(self, conditions: Conditions) -> bool:
