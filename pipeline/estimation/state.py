@@ -155,6 +155,10 @@ class Free:
         """Whether derivatives find it; else a grid does."""
         return self.search is not Search.GRID
 
+    def hold(self, value: float) -> float:
+        """A value held to the bounds."""
+        return min(max(value, self.bounds[0]), self.bounds[1])
+
     def step_aside(self, value: float, *, both_sides: bool) -> tuple[float, ...]:
         """Values beside one for its derivative: one step above or below, or two close to it if both fit."""
         low, high = self.bounds
@@ -290,7 +294,7 @@ class State:
 
     def set(self, free: Free, value: float) -> State:
         """The state with another value of a free number, held to its bounds."""
-        value = min(max(value, free.bounds[0]), free.bounds[1])
+        value = free.hold(value)
         if not free.effect:
             timing = list(self.timing)
             timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})
@@ -319,10 +323,16 @@ class State:
 
     def move(self, free: Sequence[Free], step: Sequence[float]) -> State:
         """The state with free numbers changed by a step."""
-        state = self
+        state, shared = self, dict[str, dict[str, float]]()
         for number, change in zip(free, step, strict=True):
-            state = state.set(number, state.get(number) + change)
-        return state
+            value = self.get(number) + change
+            if number.effect and number.run is None:
+                shared.setdefault(number.effect, {})[number.name] = number.hold(value)
+            else:
+                state = state.set(number, value)
+        # Each effect is made once: a fit moves all of its numbers thousands of times.
+        changed = (one.change(**shared[one.id]) if one.id in shared else one for one in state.effects)
+        return replace(state, effects=tuple(changed))
 
 
 # What is known of a model's numbers before a run is seen: observations of the numbers themselves.
