@@ -111,7 +111,9 @@ class Noise:
                     continue
                 fresh = signal[rows]
                 for lag, coefficient in enumerate(coefficients.tolist(), start=1):
-                    fresh = fresh - coefficient * signal[rows - lag]
+                    past = signal[rows - lag]
+                    past *= coefficient
+                    fresh -= past
                 white[rows, index] = fresh / self.scale[index, order]
         return white
 
