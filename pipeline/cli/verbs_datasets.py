@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
-from pipeline.core import INPUT_WORDS, SlipError, format_share
+from pipeline.core import INPUT_WORDS, SlipError, format_part
 from pipeline.job import FigureFormat
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ def _compare_causes(
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
         parts = ", ".join(
-            f"{causes.names.get(one.name, one.name)} {format_share(one.share, 1)}" for one in budget.parts
+            f"{causes.names.get(one.name, one.name)} {format_part(one.share)}" for one in budget.parts
         )
         runs = f"{budget.runs} run{'s' * (budget.runs != 1)}"
         lines += [

@@ -97,6 +97,8 @@ def naming_os_errors(
 
 
 _MINUTE, _HOUR = 60.0, 3600.0  # seconds
+_LEAST_PART = 0.001
+"""Part of a whole below which its digits say nothing: intervals of budgets are wider."""
 _NEARLY_ALL = 0.95
 """Share of the recording below which the compared duration is shown as well."""
 
@@ -135,6 +137,11 @@ def format_share(share: float, digits: int = 2) -> str:
         digits: see `format_digits`.
     """
     return f"{format_digits(100.0 * share, digits)} %"
+
+
+def format_part(share: float) -> str:
+    """A part of a whole in percent: `56 %`, `0.4 %`, `-2 %`, and `< 0.1 %` of either sign below that."""
+    return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
 
 
 def format_length(metres: float) -> str:

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from typing import cast
 
-from pipeline.core import INPUT_WORDS, format_angle, format_length, format_share, mark_finding
+from pipeline.core import INPUT_WORDS, format_angle, format_length, format_part, format_share, mark_finding
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import Undecided
@@ -339,7 +339,7 @@ def _format_budget(run: RunDiagnosis) -> str:
     for budget in run.budgets if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [
-                f"{CAUSE_NAMES.get(one.name, one.name)} {format_share(one.share, 1)}" for one in budget.shares
+                f"{CAUSE_NAMES.get(one.name, one.name)} {format_part(one.share)}" for one in budget.shares
             ]
             signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"

@@ -27,7 +27,7 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core import SlipError, format_share, naming_os_errors, shorten, suffix_unit
+from pipeline.core import SlipError, format_part, format_share, naming_os_errors, shorten, suffix_unit
 from pipeline.core.untrusted import mapping_in
 from pipeline.store import LOG_NOTES, Manifest, Store
 from pipeline.store.names import date_runs
@@ -107,7 +107,7 @@ def format_number(value: float | None, *, digits: int = 3) -> str:
 
 def format_known_share(value: float | None) -> str:
     """Share as a percentage, a dash if missing."""
-    return MISSING if value is None else format_share(value, 1).replace("-", "\u2212").replace(" ", "\u202f")
+    return MISSING if value is None else format_part(value).replace("-", "\u2212").replace(" ", "\u202f")
 
 
 def format_split(drivetrain: float, ground: float, cross: float) -> str:

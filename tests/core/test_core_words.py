@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import format_angle, format_length, format_share
+from pipeline.core import format_angle, format_length, format_part, format_share
 
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 
@@ -33,6 +33,11 @@ PIPELINE = Path(__file__).parents[2] / "pipeline"
 )
 def test_a_share_is_percent_with_a_space(share: float, digits: int, text: str) -> None:
     assert format_share(share, digits) == text
+
+
+def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
+    parts = {0.56: "56 %", 0.004: "0.4 %", -0.02: "-2 %", 3e-6: "< 0.1 %", -1e-4: "< 0.1 %", 0.0: "0 %"}
+    assert {part: format_part(part) for part in parts} == parts
 
 
 def test_lengths_and_angles_are_plain_digits_in_the_unit_of_their_size() -> None:
