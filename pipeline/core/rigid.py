@@ -156,6 +156,10 @@ two recordings."""
 _REPEATED_SHARE = 0.2
 """Share of repeated poses above which the period of the stamps is an uncertainty of their time: the
 recordings have none, or 0.49 to 0.80."""
+_FEWEST_CORRECTIONS = 10
+"""Minimum number of corrections of a localization for a period."""
+_RARE_S = 10.0
+"""Time between corrections [s] above which they are events, as loop closures, and no noise."""
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
@@ -367,9 +371,11 @@ def measure_repeats(poses: pl.DataFrame) -> float:
     return float(np.median(np.diff(poses["t"].to_numpy()))) if repeated else 0.0
 
 
-def measure_corrections(poses: pl.DataFrame) -> float:
-    """Median time between corrections in table `poses` [s]; zero if there are none."""
-    if "corrected" not in poses.columns:
-        return 0.0
-    times = poses.filter("corrected")["t"].to_numpy()
-    return float(np.median(np.diff(times))) if times.size > 1 else 0.0
+def measure_period(times: Floats) -> float:
+    """Median time between the corrections of a localization [s]; zero if they are few, or rare.
+
+    Args:
+        times: of the corrections [s], shape (n,).
+    """
+    period = float(np.median(np.diff(times))) if times.size >= _FEWEST_CORRECTIONS else 0.0
+    return period if period < _RARE_S else 0.0

@@ -237,8 +237,9 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
     rows = [text.removeprefix("remaining error ")]
     turn, least = (one.get("r_mrmse_rad") for one in (run.ladder[-1], run.noise_floor))
-    if text and isinstance(turn, float) and isinstance(least, float) and turn >= ABOVE_FLOOR * least > 0.0:
-        rows.append(f"{format_angle(turn)} in heading, noise floor {format_angle(least)}")
+    if len(run.ladder) > 1 and isinstance(turn, float) and isinstance(least, float):
+        row = f"{format_angle(turn)} in heading, noise floor {format_angle(least)}"
+        rows += [row] if turn >= ABOVE_FLOOR * least > 0.0 else []
     if run.learned.get("kept"):
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
@@ -279,7 +280,10 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
         return []
     noted = {one.get("id") for one in run.findings}
     if CHANGE in noted:
-        return ["next steps: find out what changed at that time: load, tyres, battery, controller or terrain"]
+        causes = "load, tyres, battery, controller or terrain"
+        return [
+            f"next steps: find out what changed then ({causes}); cut the log there, and diagnose both parts"
+        ]
     if SEARCH_CUT in noted:
         return ["next steps: diagnose the run again with a larger --budget"]
     if BREVITY in noted:

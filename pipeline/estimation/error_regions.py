@@ -359,18 +359,18 @@ def format_enough(effects: Sequence[Named], findings: Sequence[Mapping[str, obje
 
 
 def format_remaining_error(error_m: object, floor_m: object, explained: float | None) -> str:
-    """Sentence on the remaining error relative to the noise floor; empty where one of the three is unknown.
+    """Sentence on the remaining error relative to the noise floor; empty where one of them is unknown.
 
     Args:
         error_m: held-out position error over 2 s with the model [m].
         floor_m: the noise floor of that error [m].
-        explained: share of the error above the floor that the model removes.
+        explained: share of the error above the floor that the model removes; unknown where none was above.
     """
     if not isinstance(error_m, int | float) or not isinstance(floor_m, int | float):
         return ""
-    if explained is None or not math.isfinite(explained):
-        return ""
     text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
+    if explained is None or not math.isfinite(explained):
+        return f"{text}, noise floor {floor}"
     if explained > _WHOLE:
         return f"{text}, below the estimated noise floor of {floor}"
     if error_m < ABOVE_FLOOR * floor_m:

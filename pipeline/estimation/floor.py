@@ -41,6 +41,8 @@ _RESOLVED = 0.02
 _REPEATED = 0.18
 # For differences: number of lags after which noise is uncorrelated, and the threshold for structure.
 _FORGOTTEN = 3
+_LONGEST_S = 2.5
+"""Longest correlation time of noise [s]: as long as the time that paired windows are apart."""
 _GROWN = 0.85
 """Share of the last square by which structure must have grown to be distinguished from noise."""
 _FEWEST_LASTING = 600
@@ -199,8 +201,8 @@ def split_differences(squares: Floats, windows: int, corrected_s: float = 0.0) -
     """
     passing, lasting = _PASSING_S, _LASTING_S
     if corrected_s > 0.0:
-        passing = (*passing, 0.5 * corrected_s)
-        lasting = tuple(time for time in lasting if time > 2.0 * corrected_s)
+        passing = (*passing, min(0.5 * corrected_s, _LONGEST_S))
+        lasting = tuple(time for time in lasting if time > 2.0 * corrected_s) or lasting[-1:]
     jitter = np.ones(squares.size)
     jitter[0] = 1.5
     grown = (1.0 - _repeat(time)[1 : squares.size + 1] for time in (*passing, *lasting))

@@ -237,10 +237,7 @@ def _score_fold(
         Residuals of tested windows, shape (k, 3); for each run a mask of the tested predictions, and their
         errors of position and yaw, shape (2, m).
     """
-    whole, fold, state = problem.whole, problem.folds[number], fitted.state
-    for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
-        begin = (part, fit.state.effects, fit.state.timing, repr(fit.state.own), train.tobytes())
-        state = state.take_over(problem.refits.recall(begin, partial(refit, part, fit, train)), fit.free)
+    whole, fold, state = problem.whole, problem.folds[number], refit_fold(problem, fitted, number)
     if learn is not None:
         # The learned term was trained on all stretches, these included: it is retrained.
         state = state.drop([LEARNED])
@@ -259,6 +256,15 @@ def _score_fold(
             errors = np.array((horizon.position[near], horizon.yaw[near]))
         reached.append((near, errors))
     return residuals, reached
+
+
+def refit_fold(problem: Problem, fitted: Fitted, number: int) -> State:
+    """State of a fit repeated without the tested stretches of a fold."""
+    state = fitted.state
+    for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
+        begin = (part, fit.state.effects, fit.state.timing, repr(fit.state.own), train.tobytes())
+        state = state.take_over(problem.refits.recall(begin, partial(refit, part, fit, train)), fit.free)
+    return state
 
 
 def find_in_test(comparison: Comparison, times: Floats, test: Flags) -> Flags:

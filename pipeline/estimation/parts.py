@@ -296,7 +296,9 @@ class Part(ABC):
         Args:
             states: all with the same effects.
         """
-        for run, comparison in enumerate(self.comparisons) if states else ():
+        if self.is_restarted or not states:
+            return
+        for run, comparison in enumerate(self.comparisons):
             measured = comparison.source is Input.MEASURED
             models = list[tuple[tuple[Effect, ...], Timing]]()
             for state in states:

@@ -83,17 +83,17 @@ def format_verdict(diagnosis: Content) -> str:
     return verdict
 
 
-def _list_open_ends(diagnosis: Content) -> tuple[str, str]:
-    """What the log does not decide, and why error remains, as clauses; empty without."""
+def _list_open_ends(diagnosis: Content) -> tuple[str, str, str]:
+    """What the log does not decide, what changes during it, and why error remains, as clauses."""
     noted = {one.get("id"): str(one.get("text")) for one in objects_in(diagnosis, "findings")}
-    why = noted.get(CHANGE, "")
-    if not why and BREVITY in noted:
+    why = ""
+    if BREVITY in noted:
         why = "the run is too short for certainty"
-    elif not why and SEARCH_CUT in noted:
+    elif SEARCH_CUT in noted:
         why = "the budget ended the search for effects early"
-    elif not why and measure_excess(diagnosis) >= ABOVE_FLOOR:
+    elif CHANGE not in noted and measure_excess(diagnosis) >= ABOVE_FLOOR:
         why = f"{_name_small(diagnosis)}no known effect explains the rest"
-    return _describe_choice(diagnosis), why
+    return _describe_choice(diagnosis), noted.get(CHANGE, ""), why
 
 
 def rank_effects(ladder: Sequence[Content]) -> dict[str, float]:

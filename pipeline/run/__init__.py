@@ -316,7 +316,7 @@ def make_run(
         duration_s=float(streams[-1] - streams[0]),
         alignment=alignment,
         repeats_s=rigid.measure_repeats(tables["poses"]),
-        corrected_s=rigid.measure_corrections(tables["poses"]),
+        corrected_s=rigid.measure_period(_list_corrections(tables["poses"])),
         is_on_course=_is_on_course(tables.get("findings")),
     )
 
@@ -324,6 +324,11 @@ def make_run(
 def _is_on_course(findings: pl.DataFrame | None) -> bool:
     """See `MotionRun.is_on_course`."""
     return findings is not None and not findings.is_empty() and "heading_from_course" in findings["id"]
+
+
+def _list_corrections(poses: pl.DataFrame) -> Floats:
+    """Times at which a localization corrected the odometry that it continues [s]."""
+    return poses.filter("corrected")["t"].to_numpy() if "corrected" in poses.columns else np.zeros(0)
 
 
 _ALIGNED = (

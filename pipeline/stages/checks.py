@@ -11,7 +11,7 @@ from pipeline.core import arrays, format_share
 from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.run.signals import LIVE_SHARE, STILL_MPS
+from pipeline.run.signals import LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.sources import DriveSource, Vehicle, list_factors
 from pipeline.stages import SURE, Finding
 from pipeline.stages.trust import (
@@ -277,6 +277,8 @@ _HALF: Final = 0.5
 """Part of the turning's power that steering angles leave, relative to that which yaw rates leave, below which
 they were commanded. On simulated cars with lags or understeer at most 0.49 where they were, and at least 1
 where not: half of it would miss some, and double would report chance."""
+_LARGEST: Final = 0.95
+"""Quantile of the driven steering angles that is the largest one: beyond it are poses that jumped."""
 
 
 def check_turn(
@@ -294,11 +296,21 @@ def check_turn(
     if source is None or asked is None or not samples.body_commanded or vehicle.kind != "ackermann":
         return []
     angles = commands["body_w"].to_numpy()[arrays.hold_indices(samples.times, commands["t"].to_numpy())]
-    steered = vehicle.kinematics.forward({"speed": asked[:, 0], "steering": angles}, vehicle)[2]
-    known = np.isfinite(asked).all(axis=1) & np.isfinite(turned)
+    speeds, wheelbase = asked[:, 0], vehicle.wheelbase_m or 1.0
+    steered = vehicle.kinematics.forward({"speed": speeds, "steering": angles}, vehicle)[2]
+    known = np.isfinite(asked).all(axis=1) & np.isfinite(turned) & np.isfinite(steered)
     if known.sum() < FEWEST_SAMPLES:
         return []
-    by_rate, by_angle = (_correlate(turned[known], ideal[known]) for ideal in (asked[:, 2], steered))
+    # A yaw rate beyond the largest steering comes out as that steering, and grows with the speed as well.
+    moved = known & (np.abs(samples.velocity[:, 0]) > MOVING_MPS)
+    driven = np.abs(np.arctan(wheelbase * turned[moved] / samples.velocity[moved, 0]))
+    most = float(np.quantile(driven, _LARGEST)) if driven.size else 0.0
+    limit = np.abs(speeds) * np.tan(most) / wheelbase
+    held = np.clip(asked[:, 2], -limit, limit)
+    by_rate, by_held, by_angle = (
+        _correlate(turned[known], ideal[known]) for ideal in (asked[:, 2], held, steered)
+    )
+    by_rate = max(by_rate, by_held)
     unexplained = 1.0 - by_rate * abs(by_rate)
     if unexplained < ONE_SCALE**2 or by_angle < 0.0 or 1.0 - by_angle**2 > _HALF * min(unexplained, 1.0):
         return []

@@ -386,8 +386,7 @@ def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
             "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"
         )
         findings.append(Finding("pose_is_odometry", "warning", text, where=topic))
-    period = np.diff(series.time[series.corrected]) * 1e-9
-    if period.size and (often := float(np.median(period))) > _SPARSE_S:
+    if (often := rigid.measure_period(1e-9 * series.time[series.corrected].astype(np.float64))) > _SPARSE_S:
         text = (
             f"the localization corrects the odometry every {often:.2g} s (median): the poses between are the "
             "odometry, with each correction spread along the path before it"

@@ -39,8 +39,8 @@ from pipeline.sources import find_preset
             "remaining error 1.31 m, noise floor 19 cm: the effects remove 86 % of the error above it",
         ),
         (0.3, None, 0.9, ""),
-        (0.3, 0.1, None, ""),
-        (0.3, 0.1, math.nan, ""),
+        (0.3, 0.1, None, "remaining error 30 cm, noise floor 10 cm"),
+        (0.3, 0.1, math.nan, "remaining error 30 cm, noise floor 10 cm"),
     ],
 )
 def test_the_remaining_error_is_compared_with_the_noise_floor(

@@ -5,7 +5,10 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
+import polars as pl
 import pytest
 
 from pipeline.core.untrusted import number_in
@@ -23,6 +26,8 @@ from pipeline.simulate import (
 )
 from pipeline.simulate.facts import CommandTopic
 from pipeline.simulate.programs import Commands
+from pipeline.sources import find_preset
+from pipeline.stages.checks import check_turn
 from pipeline.store import Manifest
 
 _LAYOUT = replace(LAYOUTS["ackermann"], commands=(CommandTopic("twist_stamped", ("/cmd_vel",)),), wheels=())
@@ -92,3 +97,26 @@ def test_steering_angles_in_place_of_yaw_rates_are_told_with_the_lines_that_mend
     medians = [read_median(one) for one in (made, mended, true_rates)]
     assert medians[1] == pytest.approx(medians[2], rel=0.02)
     assert medians[0] > medians[1]
+
+
+@pytest.mark.parametrize(("holds_angles", "is_told"), [(False, False), (True, True)])
+def test_yaw_rates_beyond_the_largest_steering_are_no_angles(*, holds_angles: bool, is_told: bool) -> None:
+    """A turn at full lock is proportional to the speed, too, where the stick asks for a tighter one."""
+    car, draw = find_preset("ackermann_car"), np.random.default_rng(5)
+    assert car is not None
+    times = np.arange(0.0, 240.0, 0.1)
+    speed = np.repeat(draw.uniform(0.5, 5.0, 60), 40)
+    asked = np.repeat(draw.uniform(-0.8, 0.8, 60), 40) * (0.4 if holds_angles else 1.0)
+    wheelbase = car.wheelbase_m or 1.0
+    angle = asked if holds_angles else np.arctan(wheelbase * asked / speed)
+    turned = speed * np.tan(np.clip(angle, -0.33, 0.33)) / wheelbase + draw.normal(0.0, 0.01, times.size)
+    samples = SimpleNamespace(
+        times=times,
+        command=np.column_stack((speed, np.zeros_like(speed), asked)),
+        velocity=np.column_stack((speed, np.zeros_like(speed), turned)),
+        body_commanded=True,
+    )
+    commands = pl.DataFrame({"t": times, "body_w": asked})
+    source = SimpleNamespace(signals=("/cmd_vel.linear.x", "/cmd_vel.angular.z"))
+    found = check_turn(samples, commands, car, source)  # type: ignore[arg-type]
+    assert bool(found) is is_told
