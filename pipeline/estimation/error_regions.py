@@ -369,15 +369,14 @@ def format_remaining_error(error_m: object, floor_m: object, explained: float | 
     if not isinstance(error_m, int | float) or not isinstance(floor_m, int | float):
         return ""
     text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
-    if explained is None or not math.isfinite(explained):
-        return f"{text}, noise floor {floor}"
-    if explained > _WHOLE:
+    share = math.nan if explained is None else explained
+    if error_m < floor_m if math.isnan(share) else share > _WHOLE:
         return f"{text}, below the estimated noise floor of {floor}"
     if error_m < ABOVE_FLOOR * floor_m:
         beside = "" if floor == format_length(error_m) else f" ({floor})"
         return f"{text}, {format_excess(error_m / floor_m)} the noise floor{beside}"
-    removed = format_share(max(explained, 0.0), 0)
-    return f"{text}, noise floor {floor}: the effects remove {removed} of the error above it"
+    removed = f": the effects remove {format_share(max(share, 0.0), 0)} of the error above it"
+    return f"{text}, noise floor {floor}{'' if math.isnan(share) else removed}"
 
 
 def format_excess(ratio: float) -> str:

@@ -164,7 +164,7 @@ class _Path:
     """From the command to the wheels.
 
     Attributes:
-        commanded, driven: effects on the command, and in the drive.
+        commanded, driven: effects that act on commands, and in the drive.
         delay_s: delay of the measured wheels [s].
         continues: whether each of `driven` comes before the last one with a state.
         keys: of the wheels before the first of `driven` and after each.
@@ -265,7 +265,7 @@ class Forward:
             self._ahead = dict(zip(new, pairs[0][0].drive_each(pairs, context), strict=True))
 
     def _move_ahead(self, models: Sequence[tuple[Sequence[Effect], Timing]]) -> None:
-        """Motion of the body on measured wheels, for models in which one effect gives it."""
+        """Motion of the body with the measured wheel speeds, for models in which one effect gives it."""
         new = dict[object, tuple[JointBody, Rolling]]()
         for effects, timing in models:
             body = [effect for effect in effects if effect.place is Place.BODY]

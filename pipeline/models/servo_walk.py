@@ -231,6 +231,6 @@ def _find_most(pull: float, speed: float, bound: float, slope: float) -> float:
 @compiled()
 def _hold(grown: float, pull: float, most: float) -> float:
     """What an integral part grows by: not beyond the largest push."""
-    left = most - abs(pull)
-    room = max(left, 0.0)
+    room = most - abs(pull)
+    room = max(room, 0.0)
     return math.copysign(room, grown) if (grown * pull > 0.0) & (abs(grown) > room) else grown

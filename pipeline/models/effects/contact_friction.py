@@ -156,7 +156,7 @@ class ContactFriction(JointBody):
         """See `JointBody`."""
         resets = context.body
         inputs = list({id(rolling): rolling for _, rolling in pairs}.values())
-        places = {id(rolling): place for place, rolling in enumerate(inputs)}
+        index_of = {id(rolling): index for index, rolling in enumerate(inputs)}
         rolled = np.array([(rolling.v0, rolling.w0) for rolling in inputs])
         # Where velocities are set: those of the wheels, or those that are measured.
         known = np.isfinite(resets.start).all(axis=1)
@@ -167,7 +167,7 @@ class ContactFriction(JointBody):
         moved = np.empty((len(pairs), 3, rolled.shape[2]))
         steps = max(1, math.ceil(context.step_s / _STEP_S - 1e-6))
         numbers = np.transpose([effect.list_numbers(context) for effect, _ in pairs])
-        source = np.array([places[id(rolling)] for _, rolling in pairs], dtype=np.int64)
+        source = np.array([index_of[id(rolling)] for _, rolling in pairs], dtype=np.int64)
         for first, lanes, count in deal_lanes(len(pairs)):
             rows = np.zeros((_MEAN_W // LANES + 1, LANES))
             rows[: _X // LANES, : lanes.size] = numbers[:, lanes]

@@ -249,7 +249,7 @@ class WheelServo(JointDrive):
         """See `JointDrive`."""
         radius, resets = context.vehicle.wheel_radius_m, context.wheels
         inputs = list({id(wheels): wheels for _, wheels in pairs}.values())
-        places = {id(wheels): place for place, wheels in enumerate(inputs)}
+        index_of = {id(wheels): index for index, wheels in enumerate(inputs)}
         asked = np.empty((len(inputs), 3, inputs[0].left.size))
         for wheels, (left, right, idle) in zip(inputs, asked, strict=True):
             np.multiply(radius, wheels.left, out=left)
@@ -267,7 +267,7 @@ class WheelServo(JointDrive):
         states[:, 2, known] = np.isfinite(start).all(axis=0)
         states[:, 2, np.searchsorted(at, context.spans.first)] = 0.0
         numbers = [effect.list_numbers(context) for effect, _ in pairs]
-        source = [places[id(wheels)] for _, wheels in pairs]
+        source = [index_of[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
         rolled /= radius
         return [
