@@ -185,8 +185,7 @@ class Effect(ABC):
     def of_delay(cls, seconds: float) -> Self:
         """A delaying effect with this delay [s], clipped to its bounds."""
         (parameter,) = cls.parameters
-        low, high = parameter.bounds
-        return cls().change(**{parameter.name: min(max(seconds, low), high)})
+        return cls().change_within(**{parameter.name: seconds})
 
     @property
     def ground_labels(self) -> tuple[str, ...]:
@@ -303,11 +302,14 @@ class Effect(ABC):
 
     def make_usual(self, largest: Largest) -> Self:
         """The same effect with typical values, clipped to its bounds."""
-        values = self._list_usual(largest)
-        bounds = {p.name: p.bounds for p in self.parameters}
-        return self.change(
-            **{name: min(max(value, bounds[name][0]), bounds[name][1]) for name, value in values.items()}
-        )
+        return self.change_within(**self._list_usual(largest))
+
+    def change_within(self, **values: float) -> Self:
+        """The effect with other values, finite ones clipped to their bounds: those of another are wider."""
+        for name, value in values.items():
+            low, high = self.parameter(name).bounds
+            values[name] = min(max(value, low), high) if math.isfinite(value) else value
+        return self.change(**values)
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         """Typical values: a limit below the largest command, a change point in the middle of the run."""

@@ -143,7 +143,7 @@ class ContactFriction(JointBody):
 
     def collapse(self) -> Effect | None:
         """An effective track of the same ratio."""
-        return EffectiveTrack(k=self.values["k"])
+        return EffectiveTrack().change_within(k=self.values["k"])
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""

@@ -103,7 +103,7 @@ class TwoLags(DriveEffect):
 
     def collapse(self) -> Effect | None:
         """A drive lag with the mean time constant."""
-        return DriveLag(tau=0.5 * sum(self.taus))
+        return DriveLag().change_within(tau=0.5 * sum(self.taus))
 
 
 def time_constant(name: str, about: str, typical: float, starts: tuple[float, ...]) -> Parameter:

@@ -83,7 +83,9 @@ class TorqueLimit(DriveEffect):
     def collapse(self) -> Effect | None:
         """The lag, or the ramp."""
         tau, limit = self.values.values()
-        return DriveLag(tau=tau) if tau > LEAST_RAMP_S else AccelerationLimit(limit=limit)
+        if tau > LEAST_RAMP_S:
+            return DriveLag().change_within(tau=tau)
+        return AccelerationLimit().change_within(limit=limit)
 
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         return {"tau": self.parameters[0].typical, "limit": largest.wheel}
