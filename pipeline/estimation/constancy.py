@@ -29,12 +29,12 @@ from pipeline.estimation.verdict import CHANGE, name_effect
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
+    from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.diagnosis import Json
     from pipeline.estimation.fit import PartFit
     from pipeline.estimation.folds import HeldOut
     from pipeline.estimation.ladder import Judgement
     from pipeline.estimation.parts import Part
-    from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import Free, State
 
 _MARGIN = 2
@@ -74,13 +74,20 @@ class _Change:
         early: Flags = self.part.times[:, 1] <= self.time
         return early, ~early
 
-    def fit_sides(self) -> list[PartFit]:
-        """Fits to the windows on either side, with residuals and derivatives of all windows."""
+    def fit_sides(self, starts: Sequence[PartFit], rounds: int) -> list[PartFit]:
+        """Fits to the windows on either side, with residuals and derivatives of all windows.
+
+        Args:
+            starts: fits to start from.
+            rounds: most fits of a side, each with the derivatives at the end of the one before.
+        """
         fits = []
-        for side in self.sides:
-            fit = self.fit
-            for _ in range(_ROUNDS):
+        for start, side in zip(starts, self.sides, strict=True):
+            fit = start
+            for _ in range(rounds):
                 state = refit(self.part, fit, side)
+                if state is fit.state:
+                    break
                 residual, jacobian = self.part.linearize(state, fit.free)
                 fit = replace(fit, state=state, residual=residual, jacobian=jacobian)
             fits.append(fit)
@@ -103,21 +110,30 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
         return []
     parts = enumerate(zip(problem.parts, fitted.fits, strict=True))
     changes = [one for index, (part, fit) in parts if fit.free for one in _list_changes(index, part, fit)]
+    if not changes:
+        return []
     changes.sort(key=lambda one: -abs(one.t))
+    one_value = score(problem, fitted.state)
+    (comparison,), examined = problem.comparisons, set[tuple[int, float]]()
+    everywhere = np.ones(comparison.horizons.number.size, dtype=np.bool_)
     for rough in changes:
-        change = rough.locate(rough.fit_sides())
-        fits = change.fit_sides()
+        nearly = rough.fit_sides([rough.fit] * 2, 1)
+        change = rough.locate(nearly)
+        # All numbers of a part are fitted: of two that change at one time the second is the same question.
+        if (change.index, change.time) in examined:
+            continue
+        examined.add((change.index, change.time))
+        fits = change.fit_sides(nearly, _ROUNDS)
         whole = [fitted.state.take_over(fit.state, fit.free) for fit in fits]
-        if not _is_lower(_predict(problem, change, [whole]), score(problem, fitted.state)):
+        if not _is_lower(_predict(comparison, change, [(whole, everywhere)]), one_value):
             continue
         folds = []
-        for number, training in enumerate(problem.training):
+        for number, (fold, training) in enumerate(zip(problem.folds, problem.training, strict=True)):
             state, rows = refit_fold(problem, fitted, number), training[change.index]
             sides = zip(fits, change.sides, strict=True)
-            folds.append(
-                [state.take_over(refit(change.part, fit, rows & side), fit.free) for fit, side in sides]
-            )
-        errors = _predict(problem, change, folds)
+            models = [state.take_over(refit(change.part, fit, rows & side), fit.free) for fit, side in sides]
+            folds.append((models, find_in_test(comparison, problem.whole.times, fold.test)))
+        errors = _predict(comparison, change, folds)
         if _is_lower(errors, judgement.whole.held_out):
             others = [one.number.effect for one in changes if one.number.effect != change.number.effect]
             since = change.time - problem.comparisons[0].run.start_s
@@ -168,22 +184,20 @@ def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:
     return math.sqrt(math.prod(ratios)) < 1.0 - _FALLS
 
 
-def _predict(problem: Problem, change: _Change, fitted: Sequence[Sequence[State]]) -> dict[str, float]:
+def _predict(
+    comparison: Comparison, change: _Change, judged: Sequence[tuple[Sequence[State], Flags]]
+) -> dict[str, float]:
     """Errors over 2 s with the models before and after a change, by their names in `Errors`.
 
     Args:
-        problem: the run.
+        comparison: the run.
         change: the change.
-        fitted: both models; of every fold, fitted without its stretches, or one pair for the whole run.
+        judged: pairs of both models and a mask of the predictions that judge them.
     """
-    (comparison,) = problem.comparisons
     early = comparison.horizons.times.mean(axis=1) < change.time
     squares = np.full((2, early.size), np.nan)
-    near_folds = [find_in_test(comparison, problem.whole.times, fold.test) for fold in problem.folds]
-    if len(fitted) == 1:
-        near_folds = [np.ones_like(early)]
-    for sides, near in zip(fitted, near_folds, strict=True):
-        for state, rows in zip(sides, (near & early, near & ~early), strict=True):
+    for models, near in judged:
+        for state, rows in zip(models, (near & early, near & ~early), strict=True):
             errors = comparison.find_horizon_errors(state.effects_of(0), state.timing[0])
             squares[:, rows] = np.array((errors.position, errors.yaw))[:, rows] ** 2
     return dict(zip(ERRORS_OVER_2S, np.sqrt(np.nanmean(squares, axis=1)).tolist(), strict=True))
