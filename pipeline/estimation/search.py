@@ -82,7 +82,7 @@ def find_unobservable(
     loss = selection.weights.cost(final.fit.residual).sum()
     innovations, spread = find_innovations(noise, final.fit.residual)
     unobservable, seen = [], []
-    for candidate in selection.candidates:
+    for candidate in selection.list_acting(final.ids):
         if final.state.find(candidate.id) is not None:
             continue
         with_it = final.state.add(candidate().make_usual(selection.largest))

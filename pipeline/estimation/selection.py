@@ -335,6 +335,10 @@ class Selection:
         self.budget.report(self.part.title, model.ids)
         return self.enter(model.fit)
 
+    def list_acting(self, ids: Iterable[str]) -> list[Candidate]:
+        """Candidates that act in a model of these effects."""
+        return [one for one in self.candidates if not one().acts_with or set(one().acts_with) & {*ids}]
+
     def take_evidence(
         self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
     ) -> Evidence:
@@ -346,7 +350,7 @@ class Selection:
         cases = [{*effect.contains} for effect in base.state.effects]
         forms = (one.id for one in self.candidates if any(set() < {*one().contains} < own for own in cases))
         excluded = {*without, *forms}.union(*cases)
-        candidates = [candidate for candidate in self.candidates if candidate.id not in excluded]
+        candidates = [one for one in self.list_acting(base.ids) if one.id not in excluded]
         return Evidence(self.part, base.fit, candidates, self.largest, noise)
 
     def fit_hypotheses(

@@ -99,6 +99,7 @@ class Effect(ABC):
             `is_equivalent` checks in recordings.
         same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
         contains: effects that are special cases of it: it explains whatever they explain.
+        acts_with: effects of which a model must have one for it to act; empty if it acts alone.
         companions: effects that usually act beside it, with which a search begins at once.
         parts: parameters of other effects as which it is searched; identified together, they are this effect.
         late: what it delays, if a delay is its only parameter.
@@ -131,6 +132,7 @@ class Effect(ABC):
     equivalent_when: str = ""
     same_in_one_motion: tuple[str, ...] = ()
     contains: tuple[str, ...] = ()
+    acts_with: tuple[str, ...] = ()
     companions: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
     late: Late | None = None

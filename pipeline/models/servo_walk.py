@@ -25,11 +25,11 @@ with 0.4 to 0.8 the errors of nine Warthog runs over 2 s are smallest."""
 # Rows of what belongs to each walk: state, numbers in the order of `walk_each`, and what it has in a cell.
 (
     _ON_LEFT, _ON_RIGHT, _AHEAD, _TURN, _PUSH_LEFT, _PUSH_RIGHT, _STEP_LEFT, _STEP_RIGHT, _STEP_V, _STEP_W,
-    _GAIN, _RESET, _DRAG, _BOUND, _ROLLING, _REST, _SCRUB, _ASIDE, _SLOPE,
+    _GAIN, _RESET, _DRAG, _BOUND_LEFT, _BOUND_RIGHT, _ROLLING, _REST, _SCRUB, _ASIDE, _SLOPE,
     _LEFT, _RIGHT, _IDLE, _NEAR_LEFT, _NEAR_RIGHT, _GRIP_LEFT, _GRIP_RIGHT, _HELD_LEFT, _HELD_RIGHT,
     _GIVEN_LEFT, _GIVEN_RIGHT, _ASKED_LEFT, _ASKED_RIGHT, _FREE_LEFT, _FREE_RIGHT,
     _MEAN_LEFT, _MEAN_RIGHT, _MEAN_V, _MEAN_W, _PULL_LEFT, _PULL_RIGHT, _MOST_LEFT, _MOST_RIGHT,
-) = (LANES * row for row in range(42))  # fmt: skip
+) = (LANES * row for row in range(43))  # fmt: skip
 
 
 def walk_each(
@@ -39,9 +39,9 @@ def walk_each(
 
     Args:
         numbers: of each servo: proportional gain [1/s], integral gain [1/s^2], drag [m/s^2], largest push at
-            rest [m/s^2], squared slip over acceleration of rolling wheels [s^4/m^2] and of those at rest
-            [s^2], inverse square of the largest acceleration [s^4/m^2], half the track width [m], and by how
-            much the largest push falls with speed [1/s].
+            rest of the left and the right side [m/s^2], squared slip over acceleration of rolling wheels
+            [s^4/m^2] and of those at rest [s^2], inverse square of the largest acceleration [s^4/m^2], half
+            the track width [m], and by how much the largest push falls with speed [1/s].
         source: index of the input of each servo.
         asked: inputs: commanded speeds of the left and right side [m/s], and the share of each cell without a
             command, shape (k, 3, n).
@@ -171,8 +171,8 @@ def _solve(rows: Floats, lanes: int, step_s: float) -> int:
         mean_right = free_right + part_right * (v + aside * w)
         pull_left = gain * (rows[_LEFT + k] - mean_left) + rows[_GIVEN_LEFT + k]
         pull_right = gain * (rows[_RIGHT + k] - mean_right) + rows[_GIVEN_RIGHT + k]
-        most_left = _find_most(pull_left, rows[_NEAR_LEFT + k], rows[_BOUND + k], slope)
-        most_right = _find_most(pull_right, rows[_NEAR_RIGHT + k], rows[_BOUND + k], slope)
+        most_left = _find_most(pull_left, rows[_NEAR_LEFT + k], rows[_BOUND_LEFT + k], slope)
+        most_right = _find_most(pull_right, rows[_NEAR_RIGHT + k], rows[_BOUND_RIGHT + k], slope)
         is_free_left = rows[_FREE_LEFT + k] if abs(pull_left) <= most_left else 0.0
         is_free_right = rows[_FREE_RIGHT + k] if abs(pull_right) <= most_right else 0.0
         # A pull beyond the largest push becomes that; a lane without such a change stays as it is.

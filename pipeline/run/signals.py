@@ -96,6 +96,7 @@ class Wheels:
             cannot move sideways.
         idle: share of each cell in which no motion is commanded, shape (n,); None if the commands
             are not known by their stamps.
+        imbalance: voltage of the right motor minus that of the left one, over their mean.
     """
 
     left: Floats
@@ -103,6 +104,7 @@ class Wheels:
     steering: Floats
     sideways: Floats | None = None
     idle: Floats | None = None
+    imbalance: float = 0.0
 
     def stack(self) -> Floats:
         """Columns left, right and sideways [rad/s], and steering [rad], shape (n, 4)."""

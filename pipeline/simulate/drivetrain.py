@@ -397,6 +397,8 @@ class _Motors:
         self._reset, self._drag, self._bound, self._no_load, self._scrub, self._creep = (
             effects.value("wheel_servo", name) for name in names
         )
+        apart = effects.value("motor_imbalance", "e")
+        self._left_supply, self._right_supply = 1.0 - apart / 2.0, 1.0 + apart / 2.0
 
     def step(self, on_left: float, on_right: float) -> None:
         """One step under the commanded speeds of the rims [m/s]."""
@@ -406,8 +408,12 @@ class _Motors:
         else:
             reset = self._step_s * self._reset
         ahead, turned, load = self._ahead, self._turning, self._load
-        left_resistance, left_pull, left_error = self._drive(self.left, on_left, self._left_memory)
-        right_resistance, right_pull, right_error = self._drive(self.right, on_right, self._right_memory)
+        left_resistance, left_pull, left_error = self._drive(
+            self.left, on_left, self._left_memory, self._left_supply
+        )
+        right_resistance, right_pull, right_error = self._drive(
+            self.right, on_right, self._right_memory, self._right_supply
+        )
         left_grip = self._grip(self.left, self.left - ahead + turned)
         right_grip = self._grip(self.right, self.right - ahead - turned)
         left_all, right_all = left_resistance + 2.0 * left_grip, right_resistance + 2.0 * right_grip
@@ -426,7 +432,7 @@ class _Motors:
         self._left_memory += reset * left_error
         self._right_memory += reset * right_error
 
-    def _drive(self, rim: float, asked: float, memory: float) -> tuple[float, float, float]:
+    def _drive(self, rim: float, asked: float, memory: float, supply: float) -> tuple[float, float, float]:
         """Resistance and pull of a side, and the error that its controller integrates [m/s].
 
         At the end of the step, speed times resistance is the pull less twice the force of the ground.
@@ -437,7 +443,7 @@ class _Motors:
         braking = 0.5 * _ALL * self._drag / math.hypot(rim, _SIGN_MPS)
         resistance, pull = inertia + braking, (inertia - braking) * rim
         # A motor turns against its supply with what its own speed leaves of the voltage.
-        left_over = 1.0 - math.copysign(1.0, push) * rim / self._no_load
+        left_over = supply - math.copysign(1.0, push) * rim / self._no_load
         most = math.inf if math.isinf(self._bound) else self._bound * max(left_over, 0.0)
         if abs(push) < most:
             return resistance + 0.5 * _ALL, pull + _ALL * (push + 0.5 * rim), error

@@ -1,7 +1,8 @@
 """Wheel servo: the speed controller of each side works against ground friction.
 
     each side at u = r Omega [m/s], commanded u_c, e = u_c - u; the body at v and w, a = b/2
-    0.7 tau du/dt = 1.7 (p - drag sign(u)) - 2 F,  p = clip(e + z, +-bound - bound u / no_load),
+    0.7 tau du/dt = 1.7 (p - drag sign(u)) - 2 F,  p = clip(e + z, +-m - bound u / no_load),
+    m = bound (1 -+ e_m / 2),
     dz/dt = reset e while p is not clipped,  z = 0 while no side is commanded,
     s_x = u - (v -+ a w),  s_y = 0.87 a w,  (F, S) = (s_x, s_y) / 2 / sqrt((creep u)^2 + (abs(s) / scrub)^2),
     tau dv/dt = F_l + F_r,  a tau dw/dt = F_r - F_l - 0.87 (S_l + S_r)
@@ -11,13 +12,14 @@ gain. Over the proportional gain, bound [m/s] is the largest force of the drive 
 rolling resistance of a side, and scrub [m/s] the friction of the ground: scrub / tau is the largest
 acceleration that the ground gives, the friction coefficient times that of gravity. As the torque of a DC
 motor, the largest force falls linearly with speed, to zero at no_load [m/s], so that wheels turn less fast
-against the friction of a turn than straight ahead. creep [s/m] is the slip of a rolling wheel over the force
-that it gives while it is small; at rest wheels slip by 0.01 of it. A slow turn begins only when the integral
-part has grown enough to overcome the friction, so that it seems to have a lag of many seconds; driving fast
-there is less of it, and on ice hardly any. The inertia of rotating parts is 0.7 of that of the vehicle (the
-error of the wheels hardly depends on it between 0.3 and 1.5), the contacts are 0.87 b apart lengthwise, and
-the radius of gyration is a. On a Warthog tau 0.1 to 0.2 s, reset 0.2 to 0.4 1/s, bound 1.1 to 1.7 m/s,
-no_load 5 m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s elsewhere, and creep 0.06 s/m.
+against the friction of a turn than straight ahead; e_m is the motor imbalance. creep [s/m] is the slip of a
+rolling wheel over the force that it gives while it is small; at rest wheels slip by 0.01 of it. A slow turn
+begins only when the integral part has grown enough to overcome the friction, so that it seems to have a lag
+of many seconds; driving fast there is less of it, and on ice hardly any. The inertia of rotating parts is
+0.7 of that of the vehicle (the error of the wheels hardly depends on it between 0.3 and 1.5), the contacts
+are 0.87 b apart lengthwise, and the radius of gyration is a. On a Warthog tau 0.1 to 0.2 s, reset 0.2 to 0.4
+1/s, bound 1.1 to 1.7 m/s, no_load 5 m/s, drag 0.03 to 0.1 m/s, scrub 0.1 m/s on ice and 0.8 to 1.9 m/s
+elsewhere, and creep 0.06 s/m.
 Drive and turn slowly and quickly, on the spot and while driving.
 
 Source: speed controllers as in ros2_control; anti-windup of Astrom and Murray, Feedback Systems, chapter 10;
@@ -169,7 +171,7 @@ class WheelServo(JointDrive):
     )
     python_state = (
         *("rolled_left", "rolled_right", "load_v", "load_w", "push_left", "push_right"),
-        *("more_left", "more_right", "more_v", "more_w"),
+        *("more_left", "more_right", "more_v", "more_w", "apart"),
     )
     python = """
         rate, aside, tau = 2.0 / step_s, B / 2.0, max({tau}, 0.01)
@@ -179,7 +181,10 @@ class WheelServo(JointDrive):
         pushes = (push_left, push_right) if is_driven else (0.0, 0.0)
         near = (rolled_left + more_left, rolled_right + more_right)
         near_v, near_w = load_v + more_v, load_w + more_w
-        most = [[gain * max({bound} - way * slope * u, 0.0) for way in (1.0, -1.0)] for u in near]
+        most = [
+            [gain * max({bound} * (1.0 + side * apart) - way * slope * u, 0.0) for way in (1.0, -1.0)]
+            for u, side in zip(near, (-0.5, 0.5))
+        ]
         grip = [
             0.5 * ({scrub} > 0.0) / math.hypot(
                 {creep} * tau * u, 0.01 * tau,
@@ -266,7 +271,7 @@ class WheelServo(JointDrive):
         states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
         states[:, 2, known] = np.isfinite(start).all(axis=0)
         states[:, 2, np.searchsorted(at, context.spans.first)] = 0.0
-        numbers = [effect.list_numbers(context) for effect, _ in pairs]
+        numbers = [effect.list_numbers(context, 0.5 * wheels.imbalance) for effect, wheels in pairs]
         source = [index_of[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
         rolled /= radius
@@ -275,8 +280,8 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def list_numbers(self, context: RunContext) -> Floats:
-        """The numbers of `walk_each`."""
+    def list_numbers(self, context: RunContext, apart: float) -> Floats:
+        """The numbers of `walk_each`; the voltage of the right side is ``apart`` more than their mean."""
         tau, scrub = max(self.values["tau"], _LEAST_TAU_S), self.values["scrub"]
         gain = 0.5 * (1.0 + ROTATING) / tau
         return np.array(
@@ -284,7 +289,8 @@ class WheelServo(JointDrive):
                 gain,
                 self.values["reset"] * gain,
                 self.values["drag"] * gain,
-                self.values["bound"] * gain,
+                (1.0 - apart) * self.values["bound"] * gain,
+                (1.0 + apart) * self.values["bound"] * gain,
                 (self.values["creep"] * tau) ** 2,
                 (_REST * tau) ** 2 if scrub > 0.0 else math.inf,
                 (tau / max(scrub, _TINY)) ** 2,
