@@ -63,6 +63,7 @@ MORE = (
     "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
     "effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play",
+    "motor_imbalance",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -240,7 +241,9 @@ def _draw_single(
 ) -> Riddle:
     chosen = effect or str(draw.choice(DIFFERENTIAL + CAR))
     scene = _excite(_draw_scene(draw, seed, chosen), chosen, draw)
-    asked = {chosen: draw_size(chosen, scene, share, draw)}
+    # Motors differ where a servo drives them.
+    names = (chosen, "wheel_servo") if chosen == "motor_imbalance" else (chosen,)
+    asked = {name: draw_size(name, scene, share, draw) for name in names}
     return Riddle(replace(scene, effects=asked), Answer(category, asked, program=scene.program.name))
 
 

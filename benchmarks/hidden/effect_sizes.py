@@ -79,6 +79,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "gain_drift": {"k": 0.15 * size},
         "difference_gain": {"g": 1.0 - 0.4 * size},
         "side_gain": {"e": sign * 0.06 * size},
+        "motor_imbalance": {"e": sign * 0.2 * size},
         "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
     }
     return sizes[effect]

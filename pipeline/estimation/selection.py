@@ -337,7 +337,7 @@ class Selection:
 
     def list_acting(self, ids: Iterable[str]) -> list[Candidate]:
         """Candidates that act in a model of these effects."""
-        return [one for one in self.candidates if not one().acts_with or set(one().acts_with) & {*ids}]
+        return [one for one in self.candidates if not one().acts_with or {*one().acts_with} & {*ids}]
 
     def take_evidence(
         self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None
@@ -375,13 +375,13 @@ class Selection:
         """
         singles = [one for one in evidence.rank_singles(PRICE) if one.chi_square >= least]
         models, best = dict[tuple[str, ...], CandidateModel](), 0.0
-        while singles and not best and _surplus(singles[0]) > 0.0:
+        while singles and not best and singles[0].chi_square > PRICE * singles[0].numbers:
             enough = _COMPARABLE * singles[0].chi_square
             batch = [one for one in singles[:_BATCH] if one.chi_square >= enough]
             singles = singles[len(batch) :]
             for hypothesis, model in zip(batch, self._fit_each(base, batch, useful, beyond), strict=True):
                 if self._keep(model, base, models) and self.judge(base, model).is_significant:
-                    best = max(best, _surplus(hypothesis))
+                    best = max(best, hypothesis.chi_square - PRICE * hypothesis.numbers)
         together = [one for one in evidence.rank_pairs(PRICE) if one.chi_square >= max(least, best + PRICE)]
         for model in self._fit_each(base, together[:_PAIRS], useful):
             self._keep(model, base, models)
@@ -395,8 +395,8 @@ class Selection:
         self, base: CandidateModel, models: list[CandidateModel], beyond: Iterable[CandidateModel]
     ) -> list[CandidateModel]:
         """Extensions with those beyond the observed range that halve the loss of all that are plausible."""
-        least = min(self.loss(one) for one in (base, *models))
-        admitted = [one for one in beyond if self.loss(one) < HALVES * least]
+        least = HALVES * min(self.loss(one) for one in (base, *models))
+        admitted = [one for one in beyond if self.loss(one) < least]
         self.as_if.update(name for one in admitted for name in one.ids if name not in base.ids)
         return self.sort([*models, *admitted])
 
@@ -433,8 +433,7 @@ class Selection:
         """Add a model, of several with the same effects the better one; whether it may be named."""
         if set(model.ids) <= set(base.ids) or not self.is_sound(model):
             return False
-        rival = models.get(model.ids)
-        models[model.ids] = model if rival is None else min(rival, model, key=self.loss)
+        models[model.ids] = min(models.get(model.ids, model), model, key=self.loss)
         return True
 
     def _simplify(self, model: CandidateModel, base: CandidateModel, useful: float) -> CandidateModel:
@@ -452,7 +451,7 @@ class Selection:
         """The state with the simpler forms of effects that may not be named; None if all may be."""
         gone = [effect for effect in state.effects if not self.may_stay(effect, state)]
         reduced = state.drop([effect.id for effect in gone])
-        known = {candidate.id for candidate in self.candidates} - set(reduced.ids)
+        known = {one.id for one in self.candidates} - set(reduced.ids)
         simpler = (effect.collapse() for effect in gone)
         return reduced.add(*(one for one in simpler if one and one.id in known)) if gone else None
 
@@ -477,10 +476,6 @@ class Selection:
             acting.append(effect.of_delay(min(delays) - max(delays)))
         as_if = as_if or effect.id in self.as_if
         return any(is_nameable(one, self.conditions, as_if=as_if) for one in acting)
-
-
-def _surplus(hypothesis: Hypothesis) -> float:
-    return hypothesis.chi_square - PRICE * hypothesis.numbers
 
 
 def open_selection(

@@ -222,6 +222,14 @@ def test_the_servo_of_the_warthog_explains_its_turning(asked: Asked) -> None:
     assert run.ladder[-1]["r_mrmse_rad"] < 0.12 * run.ladder[0]["r_mrmse_rad"]  # type: ignore[operator]
 
 
+def test_the_left_motor_of_the_warthog_is_weaker(asked: Asked) -> None:
+    """As the outer ones of a turn its wheels turn less fast than the right ones do, forward and backward."""
+    run = asked.diagnose("warthog_wheels_asphalt", "command")
+    named = {effect.id: effect for effect in run.effects}
+    assert 0.07 < named["motor_imbalance"].parameters["e"].value < 0.13
+    assert run.ladder[-1]["r_mrmse_rad"] < 0.08  # type: ignore[operator] # .111 without it
+
+
 @pytest.mark.parametrize("source", ["command", "measured"])
 def test_an_inertia_that_halves_a_skid_is_named_or_told_with_it(asked: Asked, source: str) -> None:
     named = {effect.id: effect for effect in asked.diagnose("warthog_gravel_1", source).effects}

@@ -32,6 +32,11 @@ MOST_IN_SENTENCE = 3
             {"k": 0.2},
             "Gain drift: the wheels turn 20 % less of their command at the end of the run than at its start",
         ),
+        (
+            "motor_imbalance",
+            {"e": 0.1},
+            "Motor imbalance: the motor on the left is weaker, as with 9.5 % less voltage",
+        ),
         ("slope_drift", {"k": 0.6}, "Slope drift: 0.1 m/s downhill on a slope of 10 degrees"),
         (
             "terrain_change",

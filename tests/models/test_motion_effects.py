@@ -179,8 +179,13 @@ DRIVETRAIN = {effect.id for effect in EFFECTS if effect.place in {Place.COMMAND,
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
 def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) -> None:
-    spec = SIMULATED[effect.id]
-    truth = {p.name: p.typical for p in spec.parameters if not math.isnan(p.typical)}
+    names = (effect.id, *effect.acts_with)
+    usual = {name: {p.name: p.typical for p in SIMULATED[name].parameters} for name in names}
+    hidden = {
+        name: {key: value for key, value in values.items() if not math.isnan(value)}
+        for name, values in usual.items()
+    }
+    truth = hidden[effect.id]
     more = vehicle_and_program(effect.kinds[0])
     if Excitation.SLOPE in effect.needs:
         from pipeline.simulate import Ground  # noqa: PLC0415 - two effects need it
@@ -193,15 +198,16 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
         # Encoders of 20 Hz that keep step with commands of 20 Hz seem 20 ms late, which the lag then lacks.
         more |= {"encoders": Encoders(rate_hz=50.0)}
     vehicle = KIND_OF[effect.kinds[0]]
-    if effect.id == "wheel_servo":
+    if "wheel_servo" in names:
         # A force that falls with speed shows on wheels that turn at metres a second.
         more, vehicle = more | {"vehicle": VEHICLES["warthog"]}, "warthog"
     # What only shows where fast turns stand beside slow ones takes longer.
     duration_s = 240.0 if effect.id in {"speed_track", "understeer"} else 150.0
-    run = simulate({effect.id: truth}, duration_s=duration_s, **more)
+    run = simulate(hidden, duration_s=duration_s, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(vehicle), source)
-    fitted = fit_model(problem, Model(problem.vehicle, (effect(),)))
+    searched = tuple(kind() for kind in EFFECTS if kind.id in names)
+    fitted = fit_model(problem, Model(problem.vehicle, searched))
     estimates = estimate_intervals(problem, fitted)
     for name, value in truth.items():
         item = estimates.find(f"{effect.id}.{name}")

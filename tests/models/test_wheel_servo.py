@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import cast
@@ -38,11 +39,15 @@ def make_context(size: int, resets: Resets | None = None) -> RunContext:
 
 
 def drive(
-    speed: np.ndarray, turn: np.ndarray, context: RunContext | None = None, **numbers: float
+    speed: np.ndarray,
+    turn: np.ndarray,
+    context: RunContext | None = None,
+    imbalance: float = 0.0,
+    **numbers: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Speed [m/s] and yaw rate [rad/s] of the wheels under commanded ones."""
     left, right = (speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS
-    wheels = Wheels(left, right, np.zeros(speed.size))
+    wheels = Wheels(left, right, np.zeros(speed.size), imbalance=imbalance)
     driven = find_effect("wheel_servo")(**numbers).drive_wheels(wheels, context or make_context(speed.size))
     return 0.5 * RADIUS * (driven.left + driven.right), RADIUS * (driven.right - driven.left) / WIDTH
 
@@ -72,6 +77,18 @@ def test_its_force_is_bounded() -> None:
     speed = np.full(300, 2.0)
     found, _ = drive(speed, np.zeros(300), tau=0.2, bound=0.3, scrub=20.0)
     assert np.diff(found)[20:50] == pytest.approx(0.3 / 0.2 * STEP, rel=0.02)
+
+
+def test_the_weaker_motor_is_slower_where_its_force_is_the_largest() -> None:
+    """As with a tenth less voltage; below its bound it follows as the other one does."""
+    numbers = {"tau": 0.2, "bound": 0.3, "no_load": 3.0}
+    wheels = Wheels(*np.full((2, 2000), 9.0 / RADIUS), np.zeros(2000))
+    weaker = find_effect("motor_imbalance")(e=0.2 / 1.9).drive_wheels(wheels, make_context(2000))
+    driven = find_effect("wheel_servo")(**numbers).drive_wheels(weaker, make_context(2000))
+    assert driven.left[-1] == pytest.approx(0.9 * driven.right[-1], rel=0.01)
+    gentle = replace(weaker, left=weaker.left / 90.0, right=weaker.right / 90.0)
+    driven = find_effect("wheel_servo")(**numbers).drive_wheels(gentle, make_context(2000))
+    assert np.allclose(driven.left, driven.right, rtol=1e-9)
 
 
 def test_at_the_no_load_speed_no_force_is_left() -> None:
@@ -156,18 +173,28 @@ def test_a_prediction_begins_with_the_measured_wheels_and_holds_part_of_their_di
     no_load=st.floats(1.0, 10.0) | st.just(np.inf),
     scrub=st.floats(0.0, 1.5),
     creep=st.floats(0.02, 0.3),
+    imbalance=st.floats(-0.4, 0.4),
 )
 @settings(max_examples=20, deadline=None)
 def test_it_agrees_with_motors_that_are_stepped_through(
-    seed: int, tau: float, reset: float, drag: float, bound: float, no_load: float, scrub: float, creep: float
+    seed: int,
+    tau: float,
+    reset: float,
+    drag: float,
+    bound: float,
+    no_load: float,
+    scrub: float,
+    creep: float,
+    imbalance: float,
 ) -> None:
     """The generator's motors, written on their own and integrated by short steps."""
     numbers = {"tau": tau, "reset": reset, "drag": drag, "bound": bound}
     numbers |= {"no_load": no_load, "scrub": scrub, "creep": creep}
     speed, turn = draw_steps(seed), draw_steps(seed + 1)
     left, right = (speed - 0.5 * WIDTH * turn) / RADIUS, (speed + 0.5 * WIDTH * turn) / RADIUS
-    on_left, on_right = turn_by_motors(HUSKY, left, right, Effects({"wheel_servo": numbers}), STEP)
-    found, turned = drive(speed, turn, **numbers)
+    effects = Effects({"wheel_servo": numbers, "motor_imbalance": {"e": imbalance}})
+    on_left, on_right = turn_by_motors(HUSKY, left, right, effects, STEP)
+    found, turned = drive(speed, turn, imbalance=imbalance, **numbers)
     for ours, theirs in (
         (found, 0.5 * RADIUS * (on_left + on_right)),
         (turned, RADIUS * (on_right - on_left) / WIDTH),
@@ -182,7 +209,10 @@ def test_servos_that_are_computed_at_once_move_as_each_does_alone(count: int) ->
     resets = Resets(
         np.arange(size) // 1000, first, first + 1, np.array([[3.0, 5.0, 0.0], [np.nan] * 3, [1.0] * 3])
     )
-    inputs = [Wheels(draw_steps(k, 9.0), draw_steps(k + 9, 9.0), np.zeros(size)) for k in range(3)]
+    inputs = [
+        Wheels(draw_steps(k, 9.0), draw_steps(k + 9, 9.0), np.zeros(size), imbalance=0.1 * k)
+        for k in range(3)
+    ]
     shares = np.random.default_rng(count).uniform(0.5, 1.5, (count, len(SERVO)))
     pairs = [
         (kind(**dict(zip(SERVO, (row * list(SERVO.values())).tolist(), strict=True))), inputs[k % 3])

@@ -2,13 +2,13 @@
 
     largest force at rest of wheel_servo: bound (1 - e/2) on the left, bound (1 + e/2) on the right
 
-e is the voltage of the right motor minus that of the left one, over their mean: with the voltage of a DC motor
-grow the force at rest and the speed without load. The weaker side is slower where the force is at its largest,
-above all as the outer one of a turn on ground of high friction; turns to one side are slower than to the other.
-Drive at large speeds and turn quickly both ways.
+e is the voltage of the right motor minus that of the left one, over their mean: the force of a DC motor at
+rest and its speed without load grow with the voltage. The weaker side is slower where the force is the
+largest one, above all as the outer side of a turn on ground of high friction: turns to one side are slower
+than to the other. Drive at large speeds and turn quickly both ways.
 
-Source: DC motors of Franklin, Powell and Emami-Naeini, Feedback Control of Dynamic Systems, chapter 2; measured
-on six of nine recordings of a Warthog, whose left motor is weaker by 9 to 18 %.
+Source: DC motors of Franklin, Powell and Emami-Naeini, Feedback Control of Dynamic Systems, chapter 2;
+measured on five of nine recordings of a Warthog, whose left motor is weaker by 8 to 15 %.
 """
 
 from collections.abc import Iterable
