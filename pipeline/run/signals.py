@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +140,7 @@ def split_wheels(drive: Drive) -> list[Floats]:
     return [left - sideways, right + sideways, left + sideways, right - sideways]
 
 
-def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Floats]:
+def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Any]:
     """Inverse of `split_wheels`, by name; the combination of four wheels without motion is dropped."""
     if len(wheels) == 2:  # noqa: PLR2004 - one a side
         return {"left": wheels[0], "right": wheels[1]}
