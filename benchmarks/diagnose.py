@@ -40,7 +40,7 @@ STAGES = {
     "search: rough fits": ("pipeline.estimation.selection.Selection.approach_each",),
     "search: effects dropped": ("pipeline.estimation.selection.Selection.drop_each",),
     "search: weights anew": ("pipeline.estimation.selection.Selection.reweight",),
-    "what could not be seen": ("pipeline.estimation.search.find_unobservable",),
+    "what could not be seen": ("pipeline.estimation.ambiguity.find_unobservable",),
     "formulas": ("pipeline.estimation.unexplained.search_formula",),
     "what can still be predicted": (
         "pipeline.estimation.unexplained.list_window_signals",

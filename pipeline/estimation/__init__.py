@@ -17,7 +17,15 @@ import numpy as np
 from pipeline.core.compute import Budget, both_cores, usual_budget
 from pipeline.estimation import conclude
 from pipeline.estimation.acceptance import NEARLY, NotSignificant
-from pipeline.estimation.ambiguity import Clocks, Undecided, find_undecided, read_clocks
+from pipeline.estimation.ambiguity import (
+    Clocks,
+    Detectable,
+    Undecided,
+    Unobservable,
+    find_undecided,
+    find_unobservable,
+    read_clocks,
+)
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
 from pipeline.estimation.fit import Fitted, fit_model
@@ -32,14 +40,7 @@ from pipeline.estimation.problem import (
     predict_at_from,
     predict_from,
 )
-from pipeline.estimation.search import (
-    Detectable,
-    SearchResult,
-    Unobservable,
-    find_unobservable,
-    search_body,
-    search_wheels,
-)
+from pipeline.estimation.search import SearchResult, search_body, search_wheels
 from pipeline.estimation.selection import Context, DiagnosisError, prepare
 from pipeline.estimation.state import Free, State
 from pipeline.estimation.unexplained import (

@@ -1,16 +1,28 @@
-"""Explanations that fit as well as the chosen one, and the choice among them."""
+"""What a log does not decide: explanations that fit as well as the chosen one, and unobservable effects."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
-from pipeline.estimation.acceptance import DECIDED_T, compare_rivals
+from pipeline.core.arrays import Floats
+from pipeline.estimation.acceptance import (
+    DECIDED_T,
+    LEAST_GAIN,
+    LEAST_T,
+    STABLE_T,
+    compare_rivals,
+    find_innovations,
+    project_out,
+    scale_evidence,
+)
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
+from pipeline.estimation.evidence import Noise
 from pipeline.estimation.fit import Fitted, PartFit, fit_model
 from pipeline.estimation.folds import hold_out
 from pipeline.estimation.intervals import estimate_part
@@ -20,7 +32,7 @@ from pipeline.estimation.search import SearchResult, list_rivals
 from pipeline.estimation.selection import CandidateModel, Context, Selection
 from pipeline.models import Model, find_effect
 from pipeline.models.catalogue import find_late_effect, list_effects, suggest_manoeuvre
-from pipeline.models.effect import Effect, Late, find_late
+from pipeline.models.effect import Effect, Late, Search, find_late
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle
@@ -34,6 +46,10 @@ _FAR_WORSE = 1.5
 (`make hidden-effect CATEGORY=cars,natural SEED=985000-985050`)."""
 _ALIKE = 0.7
 """Correlation between the prediction changes of two effects above which they are alternatives."""
+DETECTED = LEAST_T + 1.3
+"""Size of an effect [standard errors] that is named in nine of ten logs."""
+DETECTED_SHARE = 90
+"""Share of logs with an effect of that size in which it is named [percent]."""
 
 
 @dataclass(frozen=True)
@@ -303,3 +319,93 @@ def join_classes(effects: Sequence[Effect], vehicle: Vehicle) -> list[Effect]:
 def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
     """Effects equivalent to this one under the conditions of the recordings."""
     return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()
+
+
+@dataclass(frozen=True)
+class Unobservable:
+    """An effect that is not observable in this log.
+
+    Attributes:
+        id: id of the effect.
+        reason: the run does not excite it, or it is collinear with a named effect.
+        manoeuvre: manoeuvre that makes it observable.
+    """
+
+    id: str
+    reason: Literal["no excitation", "collinear with what was named"]
+    manoeuvre: str
+
+
+@dataclass(frozen=True)
+class Detectable:
+    """Detection threshold of an effect that was not named in this log.
+
+    Attributes:
+        id: id of the effect.
+        parameter, unit: its parameter.
+        size: threshold, as a distance from the neutral value of the parameter.
+    """
+
+    id: str
+    parameter: str
+    unit: str
+    size: float
+
+
+def find_unobservable(
+    selection: Selection, final: CandidateModel
+) -> tuple[list[Unobservable], list[Detectable]]:
+    """Candidates that would not be named in this log at their typical size, nor if they show only once.
+
+    Returns:
+        These, and the detection thresholds of the other effects that are linear in one parameter.
+    """
+    noise = selection.noise or selection.take_evidence(final).noise
+    rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
+    own = noise.whiten(final.fit.jacobian[rows])
+    loss = selection.weights.cost(final.fit.residual).sum()
+    innovations, spread = find_innovations(noise, final.fit.residual)
+    unobservable, seen = [], []
+    for candidate in selection.list_acting(final.ids):
+        if final.state.find(candidate.id) is not None:
+            continue
+        with_it = final.state.add(candidate().make_usual(selection.largest))
+        shift = final.fit.residual - selection.part.find_residuals(with_it)
+        column = noise.whiten(shift[rows, :, None])[:, :, 0]
+        separate = project_out(own, column)
+        independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
+        column, separate = (scale_evidence(innovations, spread, one) for one in (column, separate))
+        alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
+        if beside >= LEAST_T and _is_spread(noise, separate):
+            share = float(((shift * factor) ** 2).sum() / loss) * independent
+            seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
+            continue
+        is_shown = alone >= LEAST_T and _is_spread(noise, column)
+        reason: Literal["no excitation", "collinear with what was named"] = (
+            "collinear with what was named" if is_shown else "no excitation"
+        )
+        unobservable.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
+    return unobservable, seen
+
+
+def _is_spread(noise: Noise, column: Floats) -> bool:
+    """Whether a column of innovations is significant without its strongest ten seconds."""
+    power = np.bincount(noise.tiles.unit, (column**2).sum(axis=1))
+    return math.sqrt(float(power.sum() - power.max())) >= STABLE_T
+
+
+def _find_detectable(usual: Effect, standard_errors: float, share: float) -> list[Detectable]:
+    """Detection threshold of an effect of one parameter; its motion is proportional to it.
+
+    Args:
+        usual: the effect at a typical size.
+        standard_errors: that size in standard errors.
+        share: share of the model's loss that it then removes; below the minimum it is not named.
+    """
+    (parameter, *others) = usual.parameters
+    distance = abs(usual.values[parameter.name] - parameter.neutral)
+    if others or parameter.search is not Search.DIRECT or not math.isfinite(distance):
+        return []
+    size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
+    least = 0.0 if parameter.least is None else parameter.least.size
+    return [Detectable(usual.id, parameter.name, parameter.unit, max(size, least))]

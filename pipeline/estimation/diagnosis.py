@@ -19,10 +19,9 @@ from pipeline.run.windows import HORIZON_S
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.estimation.ambiguity import Undecided
+    from pipeline.estimation.ambiguity import Detectable, Undecided, Unobservable
     from pipeline.estimation.apportion import Moments, SlipBudget
     from pipeline.estimation.estimates import Unless
-    from pipeline.estimation.search import Detectable, Unobservable
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]

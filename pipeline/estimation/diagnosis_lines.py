@@ -12,7 +12,7 @@ from typing import cast
 from pipeline.core import INPUT_WORDS, format_angle, format_length, format_part, format_share, mark_finding
 from pipeline.core.untrusted import number_in
 from pipeline.estimation.acceptance import format_threshold
-from pipeline.estimation.ambiguity import Undecided
+from pipeline.estimation.ambiguity import DETECTED_SHARE, Undecided
 from pipeline.estimation.diagnosis import (
     CAUSE,
     Diagnosis,
@@ -30,7 +30,6 @@ from pipeline.estimation.error_regions import (
     format_remaining_error,
 )
 from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
-from pipeline.estimation.search import DETECTED_SHARE
 from pipeline.estimation.verdict import (
     CAUSE_NAMES,
     CHANGE,

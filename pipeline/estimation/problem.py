@@ -284,7 +284,8 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         wheel = max(wheel, float(find_fastest_wheel(series).max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments, turns = _find_tenths(runs, vehicle)
-    return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns)
+    rim = vehicle.wheel_radius_m * wheel
+    return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns, rim=rim)
 
 
 def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:

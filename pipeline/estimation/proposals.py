@@ -146,8 +146,8 @@ def _start_clocks(part: Part, fit: PartFit, candidate: Candidate, largest: Large
 
 def list_starts(candidate: Candidate, largest: Largest) -> list[dict[str, float]]:
     """Start values of an effect; parameters with a linear influence stay neutral."""
-    if given := candidate().starts:
-        return [dict(values) for values in given]
+    if given := candidate().list_starts(largest):
+        return given
     searched = [p for p in candidate.parameters if p.search is not Search.DIRECT]
     if not searched:
         return [{}]

@@ -1,4 +1,4 @@
-"""The search for missing effects: their observability in a log, and steps that pass the acceptance test."""
+"""The search for missing effects: steps that pass the acceptance test."""
 
 from __future__ import annotations
 
@@ -9,123 +9,14 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
-import numpy as np
-
-from pipeline.core.arrays import Floats
 from pipeline.core.compute import Budget
-from pipeline.estimation.acceptance import (
-    LEAST_GAIN,
-    LEAST_T,
-    STABLE_T,
-    find_innovations,
-    is_large_enough,
-    project_out,
-    scale_evidence,
-)
+from pipeline.estimation.acceptance import LEAST_GAIN, is_large_enough
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.evidence import Noise
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import USEFUL, CandidateModel, Context, Rivals, Selection, open_selection
 from pipeline.estimation.state import State
-from pipeline.models.catalogue import suggest_manoeuvre
 from pipeline.models.effect import Effect, Place, Search
 from pipeline.models.parameter import Conditions, Quantity
-
-DETECTED = LEAST_T + 1.3
-"""Size of an effect [standard errors] that is named in nine of ten logs."""
-DETECTED_SHARE = 90
-"""Share of logs with an effect of that size in which it is named [percent]."""
-
-
-@dataclass(frozen=True)
-class Unobservable:
-    """An effect that is not observable in this log.
-
-    Attributes:
-        id: id of the effect.
-        reason: the run does not excite it, or it is collinear with a named effect.
-        manoeuvre: manoeuvre that makes it observable.
-    """
-
-    id: str
-    reason: Literal["no excitation", "collinear with what was named"]
-    manoeuvre: str
-
-
-@dataclass(frozen=True)
-class Detectable:
-    """Detection threshold of an effect that was not named in this log.
-
-    Attributes:
-        id: id of the effect.
-        parameter, unit: its parameter.
-        size: threshold, as a distance from the neutral value of the parameter.
-    """
-
-    id: str
-    parameter: str
-    unit: str
-    size: float
-
-
-def find_unobservable(
-    selection: Selection, final: CandidateModel
-) -> tuple[list[Unobservable], list[Detectable]]:
-    """Candidates that would not be named in this log at their typical size, nor if they show only once.
-
-    Returns:
-        These, and the detection thresholds of the other effects that are linear in one parameter.
-    """
-    noise = selection.noise or selection.take_evidence(final).noise
-    rows, factor = noise.tiles.rows, selection.weights.factors(final.fit.residual)
-    own = noise.whiten(final.fit.jacobian[rows])
-    loss = selection.weights.cost(final.fit.residual).sum()
-    innovations, spread = find_innovations(noise, final.fit.residual)
-    unobservable, seen = [], []
-    for candidate in selection.list_acting(final.ids):
-        if final.state.find(candidate.id) is not None:
-            continue
-        with_it = final.state.add(candidate().make_usual(selection.largest))
-        shift = final.fit.residual - selection.part.find_residuals(with_it)
-        column = noise.whiten(shift[rows, :, None])[:, :, 0]
-        separate = project_out(own, column)
-        independent = float((separate**2).sum()) / max(float((column**2).sum()), 1e-300)
-        column, separate = (scale_evidence(innovations, spread, one) for one in (column, separate))
-        alone, beside = (math.sqrt(float((one**2).sum())) for one in (column, separate))
-        if beside >= LEAST_T and _is_spread(noise, separate):
-            share = float(((shift * factor) ** 2).sum() / loss) * independent
-            seen += _find_detectable(candidate().make_usual(selection.largest), beside, share)
-            continue
-        is_shown = alone >= LEAST_T and _is_spread(noise, column)
-        reason: Literal["no excitation", "collinear with what was named"] = (
-            "collinear with what was named" if is_shown else "no excitation"
-        )
-        unobservable.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
-    return unobservable, seen
-
-
-def _is_spread(noise: Noise, column: Floats) -> bool:
-    """Whether a column of innovations is significant without its strongest ten seconds."""
-    power = np.bincount(noise.tiles.unit, (column**2).sum(axis=1))
-    return math.sqrt(float(power.sum() - power.max())) >= STABLE_T
-
-
-def _find_detectable(usual: Effect, standard_errors: float, share: float) -> list[Detectable]:
-    """Detection threshold of an effect of one parameter; its motion is proportional to it.
-
-    Args:
-        usual: the effect at a typical size.
-        standard_errors: that size in standard errors.
-        share: share of the model's loss that it then removes; below the minimum it is not named.
-    """
-    (parameter, *others) = usual.parameters
-    distance = abs(usual.values[parameter.name] - parameter.neutral)
-    if others or parameter.search is not Search.DIRECT or not math.isfinite(distance):
-        return []
-    size = distance * max(DETECTED / standard_errors, math.sqrt(LEAST_GAIN / share))
-    least = 0.0 if parameter.least is None else parameter.least.size
-    return [Detectable(usual.id, parameter.name, parameter.unit, max(size, least))]
-
 
 _MOST_EFFECTS = 8
 """Maximum number of effects that a search adds on one path: a longer list explains nothing."""
@@ -157,24 +48,12 @@ def search_effects(
     seen, excluded, refusals = {current.ids}, set[str](), Counter[str]()
     restarted = set[tuple[str, ...]]()
     while not selection.budget.is_spent():
-        evidence = selection.take_evidence(current, excluded)
-        selection.noise = evidence.noise
-        extensions = []
-        if len(current.ids) - len(selection.given) < _MOST_EFFECTS:
-            beyond: list[CandidateModel] = []
-            extensions = selection.fit_hypotheses(current, evidence, beyond=beyond)
-            extensions = selection.admit(current, extensions, beyond)
-        chosen = choose(selection, current, extensions)
+        chosen, extensions = _find_step(selection, current, excluded, restarted)
         if chosen is current:
-            chosen = exchange(selection, current, excluded)
-        if chosen is current and current.ids not in restarted:
-            restarted.add(current.ids)
-            chosen = restart(selection, current)
-        if chosen is current:
-            chosen = simplify(selection, current, excluded)
-        if chosen is current:
-            return current, tuple(extensions)
+            return current, extensions
         adapted = selection.reweight(chosen)
+        if any(one.starts for one in adapted.state.effects if one.id not in current.ids):
+            adapted = restart(selection, adapted)
         new = set(adapted.ids) - set(current.ids)
         unsound = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
         if unsound:
@@ -187,13 +66,47 @@ def search_effects(
         if pruned.ids in seen and chosen.ids != current.ids:
             # An effect that a step adds and the next one drops is not tried again.
             if pruned.ids != current.ids or not new - excluded:
-                return pruned, tuple(extensions)
+                again = _restart_once(selection, pruned, restarted)
+                if again is pruned:
+                    return pruned, extensions
+                pruned = again
             excluded |= new
         seen.add(pruned.ids)
         # An effect refused with one model may be sound with another: it is tried once more.
         excluded = {name for name in excluded if refusals[name] != 1}
         current = pruned
     return current, ()
+
+
+def _find_step(
+    selection: Selection, current: CandidateModel, excluded: set[str], restarted: set[tuple[str, ...]]
+) -> tuple[CandidateModel, tuple[CandidateModel, ...]]:
+    """A better model, the model itself where no step improves it, and its extensions."""
+    evidence = selection.take_evidence(current, excluded)
+    selection.noise = evidence.noise
+    extensions = []
+    if len(current.ids) - len(selection.given) < _MOST_EFFECTS:
+        beyond: list[CandidateModel] = []
+        extensions = selection.fit_hypotheses(current, evidence, beyond=beyond)
+        extensions = selection.admit(current, extensions, beyond)
+    chosen = choose(selection, current, extensions)
+    if chosen is current:
+        chosen = exchange(selection, current, excluded)
+    if chosen is current:
+        chosen = _restart_once(selection, current, restarted)
+    if chosen is current:
+        chosen = simplify(selection, current, excluded)
+    return chosen, tuple(extensions)
+
+
+def _restart_once(
+    selection: Selection, current: CandidateModel, restarted: set[tuple[str, ...]]
+) -> CandidateModel:
+    """`restart`, once for each set of effects."""
+    if current.ids in restarted:
+        return current
+    restarted.add(current.ids)
+    return restart(selection, current)
 
 
 def choose(selection: Selection, current: CandidateModel, models: list[CandidateModel]) -> CandidateModel:
@@ -240,7 +153,8 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
     """The model refitted from values near its own and from the starts of effects, while that is better.
 
     A delay is correlated with lags and limits: a fit from the delay before these were added may end in a
-    local minimum, and so may that of a speed loop that was started as a first-order lag.
+    local minimum, and so may that of a speed loop that was started as a first-order lag, or beside effects
+    that imitate it: it is started alone, too.
     """
     while not selection.budget.is_spent():
         beside = [
@@ -249,11 +163,12 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             if number.search is Search.STARTS and number.effect not in selection.given
             for share in _BESIDE
         ]
+        free = [effect for effect in current.state.effects if effect.id not in selection.given]
         starts = [
-            current.state.add(effect.change(**start))
-            for effect in current.state.effects
-            if effect.id not in selection.given
-            for start in effect.starts
+            current.state.drop(others).add(effect.change(**start))
+            for effect in free
+            for start in effect.list_starts(selection.largest)
+            for others in {(), tuple(one.id for one in free if one is not effect)}
         ]
         before = selection.loss(current)
         fitted = selection.approach_each(current, beside, before) + selection.enter_each(starts, before)
@@ -376,10 +291,8 @@ def _lacks_sampling(selection: Selection, simpler: CandidateModel, most: float) 
     return False
 
 
-# Search for missing effects on each path that the recording observes.
-#
-# With measured wheels there are two: from command to wheels, which is the drivetrain alone, and from wheels
-# to body, which is the ground alone. Without them, the path from the command to the body includes both.
+# With measured wheels there are two paths: from command to wheels, the drivetrain alone, and from wheels to
+# body, the ground alone. Without them, the path from the command to the body includes both.
 
 InputPath = Literal["command", "measured", "wheels"]
 
@@ -467,7 +380,7 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> tuple[Candidate
     for one in (one for one in usual.values() if one.companions and one.id not in first.ids):
         loaded = first.state.add(*(usual[name] for name in one.companions if name in usual))
         cases = [usual[name] for name in one.contains if name in usual]
-        starts = [loaded.add(one.change(**values)) for values in one.starts]
+        starts = [loaded.add(one.change(**values)) for values in one.list_starts(selection.largest)]
         tried, simpler = selection.enter_each([starts[0], loaded.add(*cases)])
         if selection.budget.is_spent() or selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue

@@ -95,8 +95,7 @@ class Effect(ABC):
         kinds: kinds of vehicles it exists on.
         needs: excitation that a run must contain to identify it.
         confused_with: effects with nearly the same response at first order or under poor excitation.
-        equivalent_to: effects that no recording distinguishes from it under `equivalent_when`, which
-            `is_equivalent` checks in recordings.
+        equivalent_to: effects that no recording in which `is_equivalent` holds distinguishes from it.
         same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
         contains: effects that are special cases of it: it explains whatever they explain.
         acts_with: effects of which a model must have one for it to act; empty if it acts alone.
@@ -313,6 +312,10 @@ class Effect(ABC):
             values[name] = min(max(value, low), high) if math.isfinite(value) else value
         return self.change(**values)
 
+    def list_starts(self, largest: Largest) -> list[dict[str, float]]:
+        """Start values of all parameters together."""
+        return [dict(values) for values in self.starts]
+
     def _list_usual(self, largest: Largest) -> dict[str, float]:
         """Typical values: a limit below the largest command, a change point in the middle of the run."""
         shares = {"": None, "duration": _USUAL_MOMENT}
@@ -456,13 +459,7 @@ class LinearEffect(AddedEffect):
 
     @abstractmethod
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
-        """Contribution of one unit of each parameter to v_x, v_y, v_w.
-
-        Args:
-            rolling: v0, w0 of the model.
-            velocity: input of this stage; ground effects, which act in parallel, must not use it.
-            context: the run.
-        """
+        """Contribution of one unit of each parameter to v_x, v_y, v_w; arguments as of `add_to`."""
 
     def add_to(self, total: Velocity, rolling: Rolling, velocity: Velocity, context: RunContext) -> Velocity:
         """Add all columns, each times its parameter."""

@@ -134,6 +134,7 @@ class Largest:
         moments: times [s] at the tenths of the distance of the fastest wheel, shape (11,).
         sideways: speed to the left or right [m/s].
         turns: times [s] at the tenths of the turning; None for `moments`.
+        rim: speed of the rim of a wheel [m/s]; 0 if not known.
     """
 
     speed: float
@@ -143,6 +144,7 @@ class Largest:
     moments: Floats
     sideways: float = 0.0
     turns: Floats | None = None
+    rim: float = 0.0
 
     @property
     def fastest(self) -> float:

@@ -15,8 +15,8 @@ from pipeline.estimation.acceptance import (
     measure_evidence,
     scale_evidence,
 )
+from pipeline.estimation.ambiguity import DETECTED, DETECTED_SHARE, _find_detectable
 from pipeline.estimation.evidence import Noise, Tiles
-from pipeline.estimation.search import DETECTED, DETECTED_SHARE, _find_detectable
 from pipeline.models import find_effect
 
 

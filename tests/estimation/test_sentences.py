@@ -7,6 +7,7 @@ import math
 import pytest
 
 from pipeline.cli.conventions import format_vehicle_source
+from pipeline.estimation.ambiguity import Detectable
 from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
 from pipeline.estimation.diagnosis_lines import (
     choose_lines,
@@ -16,7 +17,6 @@ from pipeline.estimation.diagnosis_lines import (
 )
 from pipeline.estimation.error_regions import format_dependence, format_remaining_error
 from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
-from pipeline.estimation.search import Detectable
 from pipeline.estimation.verdict import FORMULA
 from pipeline.models import find_effect
 from pipeline.models.formula import parse_expression

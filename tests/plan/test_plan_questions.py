@@ -16,8 +16,7 @@ from scipy.special import stdtrit
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
 from pipeline.estimation import Named, RunDiagnosis, Value, load_recording
-from pipeline.estimation.ambiguity import Undecided
-from pipeline.estimation.search import Unobservable
+from pipeline.estimation.ambiguity import Undecided, Unobservable
 from pipeline.models import find_effect
 from pipeline.plan.plan import ExpectedGain
 from pipeline.plan.plan_files import Promised, check_plan

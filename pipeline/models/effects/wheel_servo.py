@@ -39,7 +39,7 @@ from pipeline.core.arrays import Floats
 from pipeline.models.effect import INF, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.model import JointDrive
-from pipeline.models.parameter import Conditions, Level, Quantity
+from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
 from pipeline.run.signals import RunContext, Wheels
 
@@ -51,6 +51,10 @@ _LEAST_SCRUB = 0.03
 """Smallest friction to report [m/s]: a smaller one is within the tolerance of a data sheet."""
 _LEAST_DRAG = 0.01
 """Smallest resistance to report [m/s]: a smaller one is within the tolerance of a data sheet."""
+_RIM_OF_STARTS = 5.0
+"""Speed of the rim [m/s] of the Warthogs that have the values of the starts."""
+_OTHER_RIM = 1.5
+"""Ratio of speeds of rims from which starts are scaled: a bound that never acts has no derivative."""
 _TINY = 1e-6
 """Friction [m/s] that counts as none: a divisor."""
 _NO_COMMAND = 1e-6
@@ -229,6 +233,15 @@ class WheelServo(JointDrive):
         rolled_left, rolled_right = reached[0] + more_left, reached[1] + more_right
         load_v, load_w = ahead + more_v, turn + more_w
         left, right = reached[0] / R, reached[1] / R"""
+
+    def list_starts(self, largest: Largest) -> list[dict[str, float]]:
+        """The starts, and the same with speeds in proportion to the fastest rim where it is another one."""
+        starts = super().list_starts(largest)
+        share = largest.rim / _RIM_OF_STARTS or 1.0
+        if max(share, 1.0 / share) < _OTHER_RIM:
+            return starts
+        factors = {p.name: {"m/s": share, "s/m": 1.0 / share}.get(p.unit, 1.0) for p in self.parameters}
+        return starts + [{name: factors[name] * start[name] for name in start} for start in starts]
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a lag: neither ground nor resistance loads it, and its force is never bounded."""
