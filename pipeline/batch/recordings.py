@@ -18,7 +18,7 @@ from pipeline.batch import BatchError
 from pipeline.core.untrusted import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING
-from pipeline.logs.text_folders import recognize_text_folder
+from pipeline.logs.other_formats import recognize_text_folder
 
 # Reading of arbitrary folders: link cycles, dead mounts, folders without permission.
 #

@@ -1,4 +1,4 @@
-"""Parallel work on two cores, its budget, a cache of recent results, and release of freed memory."""
+"""Parallel work on cores and threads, its budget, a cache of recent results, and release of freed memory."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ import struct
 import sys
 import threading
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
@@ -287,3 +288,56 @@ class Budget:
 def usual_budget(driven_s: float) -> float:
     """CPU time [s] for a run of so much driving [s]: a minute for ten minutes, and never less."""
     return max(_USUAL_S, _USUAL_S * driven_s / _FOR_S)
+
+
+def usable_threads() -> int:
+    """Number of threads that this process may use.
+
+    This is the number of cores it may run on, or ``POLARS_MAX_THREADS`` if that is less: a caller that runs
+    many processes at once sets it to limit each of them.
+    """
+    affinity = getattr(os, "sched_getaffinity", None)
+    cores = len(affinity(0)) if affinity else os.cpu_count() or 1
+    limit = os.environ.get("POLARS_MAX_THREADS", "")
+    return max(1, min(cores, int(limit))) if limit.isdigit() else cores
+
+
+def map_in_order(
+    function: Callable[[Item], Result],
+    items: Iterable[Item],
+    threads: int,
+    *,
+    weigh: Callable[[Item], int] = lambda _item: 0,
+    limit: int = 0,
+) -> Iterator[Result]:
+    """Apply ``function`` to every item; yields results in order, about two per thread waiting at most.
+
+    Args:
+        function: called on other threads; with one thread it is called on this one.
+        items: its arguments.
+        threads: number of calls that run at once.
+        weigh: weight of an item, from the start of its processing until its result has been used.
+        limit: maximum total weight at once; an item that exceeds it is processed alone.
+    """
+    if threads <= 1:
+        for item in items:
+            yield function(item)
+        return
+    with ThreadPoolExecutor(threads, thread_name_prefix="log") as pool:
+        waiting: deque[tuple[Future[Result], int]] = deque()
+        held = 0
+        try:
+            for item in items:
+                weight = weigh(item)
+                while waiting and (len(waiting) > 2 * threads or held + weight > limit):
+                    # The caller uses a yielded result until it asks for the next one.
+                    future, freed = waiting.popleft()
+                    yield future.result()
+                    held -= freed
+                waiting.append((pool.submit(function, item), weight))
+                held += weight
+            while waiting:
+                yield waiting.popleft()[0].result()
+        finally:
+            for future, _ in waiting:
+                future.cancel()

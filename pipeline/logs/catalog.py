@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Final
 from mcap.records import Channel, Schema
 
 from pipeline.logs.chunks import largest_plausible
-from pipeline.logs.records import Loss
-from pipeline.logs.source import ByteSource, is_fetched
+from pipeline.logs.records import ByteSource, Loss
+from pipeline.logs.remote import RemoteSource
 from pipeline.logs.spans import Span, SpanKind, checksum_holds
 
 if TYPE_CHECKING:
@@ -300,7 +300,7 @@ class DataSection:
         self._beside = beside
         self._check: Future[bool] | None = None
         # The check fetches a whole object, so it is started only if no other checksum covers its messages.
-        if not is_fetched(source):
+        if not isinstance(source, RemoteSource):
             self._begin()
 
     def _begin(self) -> None:

@@ -1,10 +1,12 @@
-"""Chunks of an MCAP file: inflating them within size limits, and locating the messages in them."""
+"""Chunks of an MCAP file or a bag: inflating them within size limits, and locating the messages in them."""
 
+import bz2
 import threading
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
+from functools import cache
 from typing import IO, Final
 
 import numpy as np
@@ -418,3 +420,51 @@ def _resume(chunk: Buffer, before: int | None, position: int, end: int, located:
         again = find_record(chunk, position + 1, end, CHUNK_RECORDS, located.effort)
     located.damage.append((position, again))
     return again
+
+
+@cache
+def list_decompressors() -> dict[str, Callable[[], bz2.BZ2Decompressor]]:
+    """Factories of decompressors by the name of the compression."""
+    from lz4.frame import LZ4FrameDecompressor  # noqa: PLC0415 - few logs need it
+
+    return {"bz2": bz2.BZ2Decompressor, "lz4": LZ4FrameDecompressor}
+
+
+class BudgetError(Exception):
+    """The inflated size exceeds the limit of the file."""
+
+
+@dataclass(slots=True)
+class Allowance:
+    """Remaining bytes that a bag may inflate to, out of ``most``."""
+
+    most: int
+    remaining: int
+
+    def take(self, size: int) -> None:
+        """Charge inflated bytes.
+
+        Raises:
+            BudgetError: they exceed the limit.
+        """
+        self.remaining -= size
+        if self.remaining < 0:
+            raise BudgetError(
+                f"it decompresses to more than {self.most / 1e6:,.1f} MB, and no more is read; "
+                "a larger --max-inflated reads more"
+            )
+
+    def inflate_chunk(self, name: str, stored: bytes) -> bytes:
+        """Inflate a chunk with the given compression, up to a plausible size.
+
+        Raises:
+            InflateError: it is cut, or larger.
+            BudgetError: it exceeds the limit.
+        """
+        decompressor = list_decompressors()[name]()
+        most = min(largest_plausible(len(stored)), self.remaining + 1)
+        inflated: bytes = decompressor.decompress(stored, max_length=most)
+        self.take(len(inflated))
+        if not decompressor.eof:
+            raise InflateError(f"{len(stored)} bytes of a chunk are cut, or hold more than is plausible")
+        return inflated

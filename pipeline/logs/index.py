@@ -3,21 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
+from pipeline.core.compute import usable_threads
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
-from pipeline.logs.part import catalog_file, examine_spans, is_finished
+from pipeline.logs.part import (
+    catalog_file,
+    count_fetched,
+    examine_spans,
+    hash_sources,
+    is_finished,
+    open_source,
+    version_of,
+)
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import to_location
 from pipeline.logs.scan import Scanner
-from pipeline.logs.source import count_fetched, hash_sources, open_source, usable_threads, version_of
-from pipeline.logs.text_folders import list_tables
 
 if TYPE_CHECKING:
     import os
@@ -241,7 +248,11 @@ def list_files(folder: Path) -> list[Path]:
     If there are none, the text tables of a known data set.
     """
     named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number))
-    return [file for file in named if not file.is_dir()] or list_tables(folder)
+    if files := [file for file in named if not file.is_dir()]:
+        return files
+    from pipeline.logs.other_formats import list_tables  # noqa: PLC0415 - few logs need it
+
+    return list_tables(folder)
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:
@@ -316,25 +327,6 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
         parts=tuple(parts),
         fetched_bytes=fetched,
     )
-
-
-def count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[Loss]) -> list[Loss]:
-    """Losses of messages that the summary counts but that were not found, if no other loss explains them.
-
-    Args:
-        counted: channels with the number of their messages that were found.
-        losses: known losses.
-    """
-    if losses:
-        return []
-    return [
-        Loss(
-            "missing_messages",
-            f"the summary counts {info.message_count} messages of {info.topic}, {counted_here} were found",
-        )
-        for info, counted_here in counted
-        if counted_here < info.message_count
-    ]
 
 
 @dataclass

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.core.arrays import Ints
-from pipeline.logs.bags import BagMessages, read_bag
+from pipeline.core.compute import map_in_order, usable_threads
 from pipeline.logs.catalog import Cover, Coverage, DataSection, limit_inflated
 from pipeline.logs.cdr import MAX_TEXT
 from pipeline.logs.channel import ChannelBuffer, Recipe, decoder_for
@@ -31,21 +31,15 @@ from pipeline.logs.columns import (
     join_stamp,
     share_times,
 )
-from pipeline.logs.index import ChannelInfo, LogIndex, Part, count_missing, open_log
-from pipeline.logs.records import LogError, Loss
-from pipeline.logs.source import (
-    ByteSource,
-    count_fetched,
-    hash_sources,
-    map_in_order,
-    open_source,
-    usable_threads,
-)
+from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
+from pipeline.logs.part import count_fetched, hash_sources, open_source
+from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
-from pipeline.logs.text_folders import TEXT_TABLE, find_table, read_table
 
 if TYPE_CHECKING:
     import os
+
+    from pipeline.logs.other_formats import BagMessages
 
 _LISTED: Final = 12
 """Maximum number of topics listed in an error."""
@@ -124,6 +118,25 @@ class LogData:
         return [columns for columns in self.topics if columns.topic == topic]
 
 
+def _count_missing(counted: Iterable[tuple[ChannelInfo, int]], losses: Sequence[Loss]) -> list[Loss]:
+    """Losses of messages that the summary counts but that were not found, if no other loss explains them.
+
+    Args:
+        counted: channels with the number of their messages that were found.
+        losses: known losses.
+    """
+    if losses:
+        return []
+    return [
+        Loss(
+            "missing_messages",
+            f"the summary counts {info.message_count} messages of {info.topic}, {counted_here} were found",
+        )
+        for info, counted_here in counted
+        if counted_here < info.message_count
+    ]
+
+
 def read_topics(
     path: str | os.PathLike[str] | LogIndex,
     wanted: Iterable[Wanted],
@@ -178,7 +191,7 @@ def read_topics(
     if walked:
         notes.append(f"the message indexes of {walked} chunks are damaged; their records were read instead")
     counted = [(job.info, job.buffer.count) for job in jobs.values()]
-    losses.update(dict.fromkeys(count_missing(counted, tuple(losses))))
+    losses.update(dict.fromkeys(_count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []
     for columns, lost in map_in_order(lambda job: _finish(job, repeated), jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
@@ -293,15 +306,11 @@ def _read_part(
     source: ByteSource, part: Part, wanted: set[int], threads: int, section: DataSection
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
-    described = find_table(part.path) if part.catalog.container == TEXT_TABLE else None
-    if described is not None:
-        rows = read_table(source, described[1])
-        held = {} if rows is None else dict.fromkeys(own, rows)
-        return iter([_gather_bag(part, BagMessages(held))] if own else [])
     if container := part.catalog.container:
+        from pipeline.logs.other_formats import read_other  # noqa: PLC0415 - few logs need it
+
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
-        messages_of = read_bag(part.path, container, own, most)
-        return (_gather_bag(part, messages) for messages in messages_of)
+        return (_gather_bag(part, held) for held in read_other(source, part.path, container, own, most))
 
     def gather(span: Span, loaded: Loaded) -> _Gathered:
         payloads = gather_payloads(loaded.chunk, loaded.messages, own)

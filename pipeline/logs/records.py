@@ -1,12 +1,16 @@
-"""Records of an MCAP file, the search for the next record after damage, and the errors of a log."""
+"""What logs are made of: kinds of files by their first bytes, records of an MCAP file, losses and errors.
+
+After damage, the next record is searched for here.
+"""
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
-from typing import Any, Final, Self, cast
+from typing import Any, Final, Protocol, Self, cast
 
 import numpy as np
 from mcap import records
@@ -51,6 +55,52 @@ class Loss:
     chunks: int = 0
     start_ns: int | None = None
     end_ns: int | None = None
+
+
+class ByteSource(Protocol):
+    """Bytes with random access, readable from several threads at once."""
+
+    size: int
+    """Count of bytes."""
+    name: str
+    """Name used in messages."""
+
+    def read_at(self, offset: int, length: int) -> bytes:
+        """The bytes from ``offset``; fewer than ``length`` only at the end."""
+
+
+ROS1_BAG: Final = "ROS 1 bag"
+SQLITE_BAG: Final = "rosbag2 SQLite file"
+TEXT_TABLE: Final = "text table"
+_MAGICS: Final = {b"#ROSBAG V": ROS1_BAG, b"SQLite format 3\0": SQLITE_BAG}
+
+LONGEST_MAGIC: Final = max(map(len, _MAGICS))
+LONGEST_HEAD: Final = 1 << 12
+"""Number of bytes at the start of a bag that state its kind and its length."""
+
+_INDEX_PLACE: Final = re.compile(rb"index_pos=(.{8})", re.DOTALL)
+
+
+def detect_container(head: bytes) -> str:
+    """Kind of bag of a file that starts with ``head``; empty for other files."""
+    return next((kind for magic, kind in _MAGICS.items() if head.startswith(magic)), "")
+
+
+def is_whole(head: bytes, size: int) -> bool:
+    """Whether a bag is at least as long as its head states.
+
+    Args:
+        head: its first `LONGEST_HEAD` bytes.
+        size: size of the file [bytes].
+    """
+    if detect_container(head) == ROS1_BAG:
+        # The recorder states the position of the index once it has written it.
+        match = _INDEX_PLACE.search(head)
+        return match is not None and 0 < int.from_bytes(match[1], "little") <= size
+    page = int.from_bytes(head[16:18], "big")
+    pages = int.from_bytes(head[28:32], "big")
+    # A page size of 64 KiB is stored as 1.
+    return size >= max(pages, 1) * (page if page > 1 else 1 << 16)
 
 
 # The records of an MCAP file: opcodes, and mcap's own records parsed from bodies with untrusted lengths.

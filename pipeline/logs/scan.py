@@ -12,8 +12,7 @@ from pipeline.core.arrays import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.chunks import FIRST_PRIVATE
-from pipeline.logs.records import FIRST_BLOCK, LAST_BLOCK, Loss, possible_places
-from pipeline.logs.source import ByteSource
+from pipeline.logs.records import FIRST_BLOCK, LAST_BLOCK, ByteSource, Loss, possible_places
 from pipeline.logs.spans import Loaded, Span, SpanKind
 
 _FIRST_WINDOW: Final = 1 << 12

@@ -12,11 +12,11 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.core.compute import map_in_order
 from pipeline.logs import chunks
 from pipeline.logs import records as rec
 from pipeline.logs.chunks import Messages, locate_messages
-from pipeline.logs.records import Buffer, Loss
-from pipeline.logs.source import ByteSource, map_in_order
+from pipeline.logs.records import Buffer, ByteSource, Loss
 
 # Spans of a log, and reading one of them.
 #

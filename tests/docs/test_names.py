@@ -39,7 +39,7 @@ WHOLE = frozenset({"more", "cells", "larger", "smaller", "tested", "left_out"})
 
 PUBLIC = {
     "pipeline/cli/verbs_drives.py": {"kept"},  # a key of the JSON of `slip plan --check`
-    "pipeline/logs/bags.py": {"tell"},  # the method of Python's files
+    "pipeline/logs/other_formats.py": {"tell"},  # the method of Python's files
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"kept"},

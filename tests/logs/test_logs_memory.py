@@ -15,10 +15,10 @@ import pytest
 import zstandard
 from mcap_files import FLOAT, START, TEXT
 
+from pipeline.core.compute import map_in_order
 from pipeline.logs import LogError, Strings, Wanted, open_log, read_topics
 from pipeline.logs import cdr as cdr_module
 from pipeline.logs.chunks import InflateError, inflate, inflate_start
-from pipeline.logs.source import map_in_order
 from pipeline.logs.writer import LogWriter
 
 MIB = 1 << 20

@@ -10,7 +10,7 @@ import pytest
 from fomo_session import START_US, write_session
 
 from pipeline.batch.recordings import find_recordings
-from pipeline.logs import LogData, LogError, Wanted, hash_log, open_log, read_topics, text_folders
+from pipeline.logs import LogData, LogError, Wanted, hash_log, open_log, other_formats, read_topics
 
 VELOCITY = "/warthog/platform/motor/left/status/velocity"
 
@@ -91,7 +91,7 @@ def test_what_is_not_in_the_folder_is_said(session: Path) -> None:
 
 
 def test_a_table_beyond_the_limit_is_refused(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(text_folders, "_MAX_BYTES", 20)
+    monkeypatch.setattr(other_formats, "_MAX_BYTES", 20)
     with pytest.raises(LogError, match="no more than"):
         open_log(session)
 

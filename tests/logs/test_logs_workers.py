@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from pipeline.logs.source import map_in_order, usable_threads
+from pipeline.core.compute import map_in_order, usable_threads
 
 
 def test_a_limit_of_threads_is_respected(monkeypatch: pytest.MonkeyPatch) -> None:
