@@ -25,8 +25,8 @@ def lack_runs(code: str, what: str, root: Path, hint: str, notes: Iterable[str] 
     A folder that does not exist, a file, or a folder of other things is no results folder: then this is the
     error.
     """
+    from pipeline.store import RUNS  # noqa: PLC0415 - heavy
     from pipeline.store.names import no_results  # noqa: PLC0415 - heavy
-    from pipeline.store.results import RUNS  # noqa: PLC0415 - heavy
 
     if not root.exists():
         return no_results(root)

@@ -17,6 +17,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.store import RUNS, Store
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_bytes, make_folder, replace_file
 from pipeline.store.listing import (
     ABSENT,
@@ -31,7 +32,6 @@ from pipeline.store.listing import (
     require_unsealed,
 )
 from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
-from pipeline.store.results import RUNS, Store
 from pipeline.store.seals import (
     LOG_NOTES,
     encode_manifest,

@@ -149,7 +149,7 @@ def test_a_process_that_dies_is_one_line(out: Path, tmp_path: Path) -> None:
         (tmp_path / "sitecustomize.py").write_text(
             "import os, sys\n"
             "if 'pipeline.cli.query_process' in sys.orig_argv:\n"
-            "    import pipeline.store.results as results\n"
+            "    import pipeline.store as results\n"
             f"    results.Store.query = lambda *_, **__: {how}\n"
         )
         code, said, err = ask(out, "SELECT 1", PYTHONPATH=str(tmp_path))
