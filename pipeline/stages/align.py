@@ -1,4 +1,9 @@
-"""The align stage: systematic errors of a recording are corrected once, and the corrections stored."""
+"""The align stage: systematic errors of a recording are corrected once, and the corrections stored.
+
+Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
+commands, their hold time and those not followed at once: corrections are columns of the stored tables, with
+findings, and every reader of the run gets corrected data.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +15,22 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import NORMAL_95, arrays
-from pipeline.core.arrays import Flags, Floats
-from pipeline.run import Alignment, GyroFit, MotionError, MotionRun, make_run, read_drive, tabulate_alignment
-from pipeline.run.heading import fit_gyro
-from pipeline.sources import Vehicle
+from pipeline.core import arrays
+from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
+from pipeline.run import Alignment, GyroFit, read_drive, tabulate_alignment
+from pipeline.run.signals import STILL_MPS
+from pipeline.run.windows import WINDOW_S
+from pipeline.sources import Vehicle, list_presets
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.command_scale import CommandScale, correct_commands, measure_command_scale
 from pipeline.stages.drive import interpolate_readings
 from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
 from pipeline.stages.incidents import find_incidents
-from pipeline.stages.pose_faults import SAMPLE_S, find_bad_stretches, find_outliers
+from pipeline.stages.pose_faults import align_poses, find_bad_stretches
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
-from pipeline.stages.timing import estimate_latency
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
+    ONE_SCALE,
     Samples,
     check_echo,
     check_independence,
@@ -63,8 +68,6 @@ def measure_wheel_delay(
     return delay.seconds
 
 
-_BESIDE = 0.6
-"""Distance of a pose to a fault, in `SAMPLE_S`, at which it is affected: over a half, to cover all poses."""
 # Alignment uses a grid of its own, so that settings of later stages do not change it.
 _GRID, _STEPS = VelocitySection(), SlipSection()
 
@@ -169,20 +172,21 @@ def _align(
     alignment = Alignment(
         hold, scale.scale, scale.turn_scale, scale.track_multiplier, recorded_moduli=grid.recorded
     )
-    poses, alignment = _align_poses(corrected, aligned_vehicle, alignment, grid, where)
-    imu = tables.get("imu")
+    poses, alignment = align_poses(
+        {**corrected, "slip": grid.steps},
+        aligned_vehicle,
+        alignment,
+        outlier=_spread_to_poses(grid, tables["poses"]["t"].to_numpy()),
+        is_localization=grid.is_localization,
+        where=where,
+    )
+    imu = tables.get("imu", pl.DataFrame())
     if not wheels.is_empty():
-        late = measure_wheel_delay(
-            times,
-            wheels,
-            pl.DataFrame() if imu is None else imu,
-            alignment.gyro,
-            aligned_vehicle,
-        )
+        late = measure_wheel_delay(times, wheels, imu, alignment.gyro, aligned_vehicle)
         alignment = replace(alignment, wheel_delay_s=late)
         corrected = {**corrected, "wheels": wheels.with_columns(pl.lit(late).alias("latency"))}
         findings += _report_wheels(late)
-    if imu is not None and not imu.is_empty():
+    if not imu.is_empty():
         findings += report_gyro(alignment, velocities["v_w"].to_numpy())
     if timeout is not None and hold is not None:
         findings.append(report_timeout(timeout, hold))
@@ -249,69 +253,6 @@ def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
     return medians
 
 
-def _align_poses(
-    tables: Mapping[str, pl.DataFrame], vehicle: Vehicle, alignment: Alignment, grid: _Grid, where: str
-) -> tuple[pl.DataFrame, Alignment]:
-    """Table `poses` with latencies and outliers, and the alignment with the gyro's part."""
-    poses = tables["poses"]
-    times = poses["t"].to_numpy()
-    latency, outlier = np.zeros(times.size), _spread_to_poses(grid, times)
-    try:
-        run = make_run({**tables, "slip": grid.steps}, vehicle, alignment, name=where)
-    except MotionError:
-        # A log without enough data for a model still has slip.
-        return _correct_poses(poses, latency, outlier), alignment
-    if not grid.is_localization:
-        # Integrated wheels have no clock of their own.
-        return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)
-    raw = run.track.times
-    own, spread = estimate_latency(run)
-    run = replace(run, track=replace(run.track, times=raw - own))
-    run = _with_gyro(run)
-    at_fault = find_outliers(run, vehicle)
-    if at_fault.size:
-        near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
-        outlier |= near
-        run = _with_gyro(replace(run, excluded=np.union1d(run.excluded, at_fault)))
-    late, moved = _split_delay(run)
-    for segment in np.unique(run.track.segment).tolist():
-        rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
-        latency[rows] = late + np.interp(times[rows], raw[known], own[known])
-    alignment = _take_off_delay(run.alignment, late, moved)
-    alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
-    return _correct_poses(poses, latency, outlier), alignment
-
-
-def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
-    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
-
-
-def _split_delay(run: MotionRun) -> tuple[float, float]:
-    """Delay of the poses against the gyro, and of the gyro against the poses [s]; one of them is zero.
-
-    Between two samples the time at which the gyro's rate changed is unknown: if commands and samples are
-    synchronous, the gyro appears late by a constant part of half a sampling period. A delay up to this does
-    not concern the poses' clock.
-    """
-    if run.gyro_fit is None or run.gyro is None:
-        return 0.0, 0.0
-    late = run.gyro_fit.yaw_delay_s
-    unknown = 0.5 * float(np.median(np.diff(run.gyro[0]))) + NORMAL_95 * run.gyro_fit.delay_error_s
-    return (late, 0.0) if abs(late) > unknown else (0.0, -late)
-
-
-def _take_off_delay(alignment: Alignment, late: float, moved: float = 0.0) -> Alignment:
-    """The alignment of poses and a gyro on one clock."""
-    gyro = alignment.gyro
-    if gyro is not None:
-        gyro = replace(gyro, yaw_delay_s=0.0, moved_s=moved)
-    return replace(alignment, gyro=gyro, heading_delay_s=late)
-
-
-def _with_gyro(run: MotionRun) -> MotionRun:
-    return replace(run, alignment=replace(run.alignment, gyro=fit_gyro(run)))
-
-
 def _spread_to_poses(grid: _Grid, times: Floats) -> Flags:
     """Whether the grid sample nearest to each pose is in a bad stretch, shape (m,)."""
     if not grid.bad.any():
@@ -339,8 +280,220 @@ def _report_poses(alignment: Alignment) -> list[Finding]:
     return findings
 
 
-# The align stage: systematic errors of a recording are corrected once, and the corrections stored.
-#
-# Clocks, the latency of poses, outliers of the localization, the gyro's sign, scale and bias, the scale of
-# commands, their hold time and those not followed at once: corrections are columns of the stored tables, with
-# findings, and every reader of the run gets corrected data.
+# The scale of recorded commands: measured against the wheels, explained, and corrected.
+
+_LEAST_RATIO = 0.02
+"""Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
+_FEWEST_STEPS = 6
+"""Least number of slow steady steps for a median; half and double change no finding of two recordings."""
+_SCALED = 0.18
+"""Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.81
+on `husky_snow_boreal` and 0.95 to 1.04 on the other recordings."""
+_SAME = 0.05
+"""Absolute logarithm of a ratio below which it is that of two radii: on recordings with the right scale it is
+0.05 at most."""
+_FEWEST_BLOCKS = 60
+"""Half seconds that tell a gain from a lag; half and double change no finding of two recordings."""
+
+
+@dataclass(frozen=True)
+class CommandScale:
+    """Correction factors of commands.
+
+    Attributes:
+        scale: factor on the whole command; of sides that are commanded, on their mean.
+        turn_scale: factor on the difference of sides that are commanded.
+        track_multiplier: factor on the track width in the controller's conversion of yaw rates.
+        findings: findings on it.
+    """
+
+    scale: float
+    turn_scale: float
+    track_multiplier: float
+    findings: tuple[Finding, ...] = ()
+
+
+def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
+    """Compare steady commanded wheel speeds with measured ones.
+
+    Only the slower half of the steps is used: there the drive does not saturate. If a body command has too
+    few steady steps, the gain of a lag from command to wheels gives the controller's multiplier.
+
+    Args:
+        samples: of the run, before any correction.
+        vehicle: as configured.
+    """
+    unscaled = CommandScale(1.0, 1.0, vehicle.controller_track_multiplier)
+    if samples.measured is None or samples.command is None:
+        return unscaled
+    both: Flags = np.all(np.isfinite(np.hstack((samples.measured, samples.command))), axis=1)
+    steps = _average(samples, both & samples.steady, samples.step.astype(np.int64))
+    forward, turning = _measure_ratios(samples, both, steps)
+    if forward is None:
+        return unscaled
+    if abs(np.log(forward)) > _SCALED:
+        return _explain_scale(samples, steps, forward, vehicle)
+    if turning is None or not samples.body_commanded or not _is_multiplied(turning / forward, vehicle):
+        return unscaled
+    used = vehicle.controller_track_multiplier
+    multiplier = turning / forward * used
+    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
+    text = (
+        f"in turns the difference of the wheels is {turning / forward:.2f} times the one commanded "
+        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
+    )
+    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
+    return CommandScale(1.0, 1.0, multiplier, (finding,))
+
+
+def _explain_scale(samples: Samples, steps: Floats, forward: float, vehicle: Vehicle) -> CommandScale:
+    """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
+    asked, got = steps[1]
+    slow = _find_slow(asked)
+    turning = float(np.median(got[slow] / asked[slow])) if slow.sum() >= _FEWEST_STEPS else forward
+    scales, other = (forward, forward), None
+    text = f"in slow steady steps the wheels turn {forward:.2f} times as fast as commanded"
+    if turning <= 0.0 or abs(np.log(turning / forward)) >= _SCALED:
+        text += f", and in turns their difference is {turning:.2f} times the commanded one (median)"
+        if not samples.body_commanded and turning > 0.0:
+            scales, other = _find_geometry(scales, turning, vehicle)
+        if other is None:
+            text += ": no single scale fits, and slip from commands in turns depends on the scale"
+    if other is None:
+        text += (
+            ": the recorded command is in another scale (another vehicle's wheel radius, a unit, or a gain "
+            f"of the drive); commands are multiplied by {forward:.2f}"
+        )
+    else:
+        text += (
+            f": the recorded command was made for a wheel radius of {other.wheel_radius_m:g} m and a track "
+            f"of {other.track_width_m:g} m, as of {other.name}; the mean of the sides is multiplied by "
+            f"{scales[0]:.2f} and their difference by {scales[1]:.2f}"
+        )
+    text += " before all other steps, also for models and exports"
+    finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
+    return CommandScale(*scales, vehicle.controller_track_multiplier, (finding,))
+
+
+def _find_geometry(
+    scales: tuple[float, float], turning: float, vehicle: Vehicle
+) -> tuple[tuple[float, float], Vehicle | None]:
+    """Scales of mean and difference of the sides by a preset's geometry, if nearer to the ratio in turns."""
+    forward, nearest = scales[0], None
+    for other in list_presets():
+        is_alike = other.kind == vehicle.kind == "differential"
+        if not (is_alike and other.wheel_radius_m and other.track_width_m):
+            continue
+        radii = other.wheel_radius_m / (vehicle.wheel_radius_m or np.nan)
+        tracks = radii * (vehicle.track_width_m or np.nan) / other.track_width_m
+        is_nearer = abs(np.log(turning / tracks)) < abs(np.log(turning / scales[1]))
+        # Wheels may differ less than they are asked to, not more.
+        if abs(np.log(forward / radii)) < _SAME and np.log(turning / tracks) < _SCALED and is_nearer:
+            scales, nearest = (radii, tracks), other
+    return scales, nearest
+
+
+def _measure_ratios(samples: Samples, both: Flags, steps: Floats) -> tuple[float | None, float | None]:
+    """Ratio of measured to commanded speed and yaw rate in steady steps; None if it cannot be determined."""
+    forward, turning = (_find_ratio(asked, got) for asked, got in steps)
+    if forward is not None and turning is not None:
+        return forward, turning
+    if samples.body_commanded and both.any():
+        blocks = _average(samples, both, arrays.number_stretches(samples.times - samples.times[0], WINDOW_S))
+        along, across = (_find_gain(asked, got) for asked, got in blocks)
+        # Limits and droops lower the gain of fast turns; only a multiplier raises it.
+        if along is not None and across is not None and abs(np.log(along)) < _SCALED and across > along:
+            return along, across
+    return forward, turning
+
+
+def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
+    """Whether turns show another multiplier than the configured one.
+
+    A controller widens the track or leaves it unchanged: a smaller wheel difference is due to the drive.
+    """
+    multiplier = ratio * vehicle.controller_track_multiplier
+    return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
+
+
+def _average(samples: Samples, counts: Flags, label: Ints) -> Floats:
+    """Means over stretches of one label, in their order.
+
+    Args:
+        samples: of the run.
+        counts: samples to use, shape (n,).
+        label: label of each sample's stretch, shape (n,).
+
+    Returns:
+        Speed and yaw rate, each commanded and measured, shape (2, 2, stretches).
+    """
+    _, number, size = np.unique(label[counts], return_inverse=True, return_counts=True)
+    means = [
+        [
+            np.zeros(0) if values is None else np.bincount(number, values[counts, channel]) / size
+            for values in (samples.command, samples.measured)
+        ]
+        for channel in (0, 2)
+    ]
+    return np.array(means, dtype=np.float64)
+
+
+def _find_ratio(asked: Floats, got: Floats) -> float | None:
+    """Median ratio of measured to commanded over the slower half of the steps; None if they disagree."""
+    slow = _find_slow(asked)
+    if slow.sum() < _FEWEST_STEPS:
+        return None
+    ratio, inverse = got[slow] / asked[slow], 1.0 / np.abs(asked[slow])
+    middle = float(np.median(ratio))
+    spread = robust_spread(ratio - middle)
+    # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
+    apart = inverse - inverse.mean()
+    (level, slope), rest = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
+    is_sloped = float(rest.std()) < 0.5 * float(ratio.std())
+    changed = abs(level - slope * inverse.mean() - middle) if is_sloped else 0.0
+    return middle if middle > _LEAST_RATIO and max(spread, changed) < ONE_SCALE * middle else None
+
+
+def _find_slow(asked: Floats) -> Flags:
+    """The slower half of steps, without those near a standstill."""
+    size, most = np.abs(asked), float(np.abs(asked).max(initial=0.0))
+    slow: Flags = (size > max(0.1 * most, STILL_MPS)) & (size < 0.5 * most)
+    return slow
+
+
+def _find_gain(asked: Floats, got: Floats) -> float | None:
+    """Gain of a first-order lag, got + tau dgot/dt = gain * asked; None if the fit is poor."""
+    if asked.size < _FEWEST_BLOCKS or float(np.abs(asked).max()) < STILL_MPS:
+        return None
+    change = 0.5 * (got[2:] - got[:-2])
+    inner = got[1:-1]
+    design = np.column_stack((asked[1:-1], change))
+    fitted = np.linalg.lstsq(design, inner, rcond=None)[0]
+    gain, rest = float(fitted[0]), inner - design @ fitted
+    agrees = float(np.sum(rest**2)) < ONE_SCALE**2 * float(np.sum(inner**2))
+    return gain if gain > _LEAST_RATIO and agrees else None
+
+
+def correct_commands(commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale) -> pl.DataFrame:
+    """Table `commands` with the drive's inputs after correction of scales and track multiplier."""
+    if commands.is_empty():
+        return commands
+    columns = {
+        name: commands[name].cast(pl.Float64).to_numpy()
+        if name in commands.columns
+        else np.full(commands.height, np.nan)
+        for name in ("left", "right", "speed", "sideways", "body_x", "body_y", "body_w")
+    }
+    left, right = columns["left"], columns["right"]
+    if scale.track_multiplier != vehicle.controller_track_multiplier:
+        there = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
+        body = (columns["body_x"], np.nan_to_num(columns["body_y"]), columns["body_w"])
+        asked = there.kinematics.inverse(body, there)
+        left, right = asked["left"], asked["right"]
+    turned, both = scale.turn_scale, np.nan_to_num(0.5 * (scale.scale - scale.turn_scale) * (left + right))
+    aligned = {"left": turned * left + both, "right": turned * right + both}
+    aligned |= {name: scale.scale * columns[name] for name in ("sideways", "speed")}
+    return commands.with_columns(
+        pl.Series(f"{name}_aligned", values, dtype=pl.Float64).fill_nan(None)
+        for name, values in aligned.items()
+    )

@@ -1,25 +1,23 @@
-"""Faults of the localization: half seconds and stretches in which it reports implausible motion."""
+"""Faults of the localization: its latency, and half seconds and stretches of implausible motion."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, replace
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, format_share
+from pipeline.core import NORMAL_95, arrays, format_share
 from pipeline.core.arrays import Complex, Flags, Floats, Ints, robust_spread
-from pipeline.run import MotionRun
-from pipeline.run.heading import align_heading, has_excluded, mark_excluded
+from pipeline.run import Alignment, MotionError, MotionRun, make_run
+from pipeline.run.heading import align_heading, fit_gyro, has_excluded, mark_excluded
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
-
-if TYPE_CHECKING:
-    import polars as pl
+from pipeline.stages.timing import estimate_latency
 
 # Faults of the localization: half seconds of motion that contradict the vehicle's wheels.
 #
@@ -226,7 +224,7 @@ def find_bad_stretches(
         ideals: ideal velocities by input, shape (n, 3), NaN where unknown; measured wheels are preferred.
         step: number of the command step of each sample, shape (n,).
 
-    Flags of shape (n,), and one finding if any is set.
+    Returns:
         Flags of shape (n,), and one finding when there are any.
     """
     times = velocities["t"].to_numpy()
@@ -411,3 +409,87 @@ def _fit_angle(turned: Floats, angle: Floats) -> tuple[float, float]:
 
 def _wrap(angle: Floats) -> Floats:
     return np.mod(angle + np.pi, 2.0 * np.pi) - np.pi
+
+
+# Correction of the poses: their latency against the gyro, and the outliers among them.
+
+_BESIDE = 0.6
+"""Distance of a pose to a fault, in `SAMPLE_S`, at which it is affected: over a half, to cover all poses."""
+
+
+def align_poses(
+    tables: Mapping[str, pl.DataFrame],
+    vehicle: Vehicle,
+    alignment: Alignment,
+    *,
+    outlier: Flags,
+    is_localization: bool,
+    where: str,
+) -> tuple[pl.DataFrame, Alignment]:
+    """Table `poses` with latencies and outliers, and the alignment with the gyro's part.
+
+    Args:
+        tables: of the run, with the steps of the table `slip`.
+        vehicle: its vehicle.
+        alignment: so far.
+        outlier: poses that are outliers whatever is found here, shape (m,).
+        is_localization: whether the poses are more than integrated wheels, so that their delay is observable.
+        where: the run, for error messages.
+    """
+    poses = tables["poses"]
+    times = poses["t"].to_numpy()
+    latency = np.zeros(times.size)
+    try:
+        run = make_run(tables, vehicle, alignment, name=where)
+    except MotionError:
+        # A log without enough data for a model still has slip.
+        return _correct_poses(poses, latency, outlier), alignment
+    if not is_localization:
+        # Integrated wheels have no clock of their own.
+        return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)
+    raw = run.track.times
+    own, spread = estimate_latency(run)
+    run = replace(run, track=replace(run.track, times=raw - own))
+    run = _with_gyro(run)
+    at_fault = find_outliers(run, vehicle)
+    if at_fault.size:
+        near = np.abs(at_fault[arrays.nearest_indices(times, at_fault)] - times) <= _BESIDE * SAMPLE_S
+        outlier |= near
+        run = _with_gyro(replace(run, excluded=np.union1d(run.excluded, at_fault)))
+    late, moved = _split_delay(run)
+    for segment in np.unique(run.track.segment).tolist():
+        rows, known = poses["segment"].to_numpy() == segment, run.track.segment == segment
+        latency[rows] = late + np.interp(times[rows], raw[known], own[known])
+    alignment = _take_off_delay(run.alignment, late, moved)
+    alignment = replace(alignment, latency_spread_s=spread, outlier_s=float(at_fault.size * SAMPLE_S))
+    return _correct_poses(poses, latency, outlier), alignment
+
+
+def _correct_poses(poses: pl.DataFrame, latency: Floats, outlier: Flags) -> pl.DataFrame:
+    return poses.with_columns(pl.Series("latency", latency), pl.Series("outlier", outlier))
+
+
+def _split_delay(run: MotionRun) -> tuple[float, float]:
+    """Delay of the poses against the gyro, and of the gyro against the poses [s]; one of them is zero.
+
+    Between two samples the time at which the gyro's rate changed is unknown: if commands and samples are
+    synchronous, the gyro appears late by a constant part of half a sampling period. A delay up to this does
+    not concern the poses' clock.
+    """
+    if run.gyro_fit is None or run.gyro is None:
+        return 0.0, 0.0
+    late = run.gyro_fit.yaw_delay_s
+    unknown = 0.5 * float(np.median(np.diff(run.gyro[0]))) + NORMAL_95 * run.gyro_fit.delay_error_s
+    return (late, 0.0) if abs(late) > unknown else (0.0, -late)
+
+
+def _take_off_delay(alignment: Alignment, late: float, moved: float = 0.0) -> Alignment:
+    """The alignment of poses and a gyro on one clock."""
+    gyro = alignment.gyro
+    if gyro is not None:
+        gyro = replace(gyro, yaw_delay_s=0.0, moved_s=moved)
+    return replace(alignment, gyro=gyro, heading_delay_s=late)
+
+
+def _with_gyro(run: MotionRun) -> MotionRun:
+    return replace(run, alignment=replace(run.alignment, gyro=fit_gyro(run)))

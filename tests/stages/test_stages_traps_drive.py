@@ -13,7 +13,7 @@ from pipeline.core import SlipError
 from pipeline.run import read_drive
 from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages import StageError
-from pipeline.stages.command_scale import _find_ratio
+from pipeline.stages.align import _find_ratio
 from pipeline.stages.drive import _mean_steering, interpolate_readings
 
 LONGER = replace(FIELD, duration_s=150.0)
