@@ -1,7 +1,8 @@
-"""What people see on a terminal: the summary of a run, and how a batch goes on."""
+"""What people see on a terminal: the summary of a run, a batch, a log that grows, and a replay."""
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 import time
@@ -10,7 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Self, cast
 
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
-from pipeline.core import INPUT_WORDS, format_duration, format_recorded, mark_finding
+from pipeline.core import (
+    INPUT_WORDS,
+    format_duration,
+    format_recorded,
+    format_share,
+    mark_finding,
+    suffix_unit,
+)
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
@@ -19,6 +27,9 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from pipeline.batch.season import Line
+    from pipeline.job.twin_replay import TwinReplay
+
+    Seen = Mapping[str, object]
 
 
 class SilentWatch:
@@ -330,3 +341,146 @@ def _relative(path: str) -> str:
         return str(Path(path).resolve().relative_to(Path.cwd()))
     except ValueError:
         return path
+
+
+_EVENTS_SHOWN = 5
+
+
+def format_watch(seen: Seen) -> list[str]:
+    """What is known of a log that is being written, as lines of a screen.
+
+    Args:
+        seen: the object of `Watch.to_json`.
+    """
+    lines, last = [], ""
+    for label, text in list_statements(seen):
+        lines.append(f"{'' if label == last else label:<10}{text}")
+        last = label
+    return lines
+
+
+def list_statements(seen: Seen) -> list[tuple[str, str]]:
+    """What is known of a log that is being written: a label and a text each, for screen and page.
+
+    Args:
+        seen: the object of `Watch.to_json`.
+    """
+    knowledge = cast("Seen", seen["knowledge"])
+    state = "closed" if seen["closed"] else "being written"
+    size = cast("float", seen["bytes"]) / 1e6
+    duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
+    rows = [
+        ("watching", f"{seen['log']}    {state}"),
+        ("server", str(seen.get("source") or "")),
+        ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
+        ("slip", _format_slip_now(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
+        ("error", _format_model_error(seen)),
+    ]
+    events = cast("Sequence[Seen]", seen["events"])
+    rows += [
+        ("events", f"{event['t_start']:.1f} to {event['t_end']:.1f} s: {event['text']}")
+        for event in events[-_EVENTS_SHOWN:]
+    ]
+    rows += _format_knowledge(knowledge)
+    if seen["problem"]:
+        rows.append(("not yet", str(seen["problem"])))
+    if not seen["closed"]:
+        rows.append(("looked", _format_looks(seen, knowledge)))
+    return [(label, text) for label, text in rows if text]
+
+
+def _format_slip_now(medians: Mapping[str, float], when: str) -> str:
+    parts = [f"{value:.3g} m/s {INPUT_WORDS.get(name, name)}" for name, value in medians.items()]
+    return f"{', '.join(parts)} {when}" if parts else ""
+
+
+def _format_model_error(seen: Seen) -> str:
+    """Error of the last model, held out over the log and in the last seconds."""
+    error = cast("Seen", seen["knowledge"]).get("error")
+    now = _format_slip_now(cast("Mapping[str, float]", seen["error_mps"]), "now")
+    return "; ".join(filter(None, [f"{error} over 2 s with the model so far" if error else "", now]))
+
+
+def _format_knowledge(knowledge: Seen) -> list[tuple[str, str]]:
+    rows: list[tuple[str, str]] = []
+    for stated in cast("Sequence[Seen]", knowledge.get("stated") or []):
+        numbers = cast("Mapping[str, Seen]", stated["parameters"])
+        known = ", ".join(f"{name} {_format_parameter(one)}" for name, one in numbers.items())
+        rows.append(("known", f"{stated['effect']}: {known}"))
+    waiting = cast("Sequence[str]", knowledge.get("waiting") or [])
+    if waiting:
+        rows.append(("not yet", f"to be confirmed by more driving: {', '.join(waiting)}"))
+    rows += [
+        ("not yet", f"undecided: {' or '.join(one)}")
+        for one in cast("Sequence[Sequence[str]]", knowledge.get("undecided") or [])
+    ]
+    if knowledge.get("enough"):
+        return [*rows, ("enough", "all effects are known to 5 %: no more driving is needed")]
+    if knowledge.get("data"):
+        rows.append(("data", str(knowledge["data"])))
+    rows += [("drive", one) for one in cast("Sequence[str]", knowledge.get("drive") or [])]
+    if knowledge.get("problem"):
+        rows.append(("not yet", str(knowledge["problem"])))
+    return rows
+
+
+def _format_parameter(number: Seen) -> str:
+    value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
+    if value is None or low is None or high is None or share is None:
+        return "not determined"
+    unit = suffix_unit(number["unit"])
+    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {format_share(share)})"
+
+
+def _format_looks(seen: Seen, knowledge: Seen) -> str:
+    until = cast("float | None", knowledge.get("until_s"))
+    parts = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
+    parts += ["diagnosing now"] if seen["diagnosing"] else []
+    return f"{', '.join(parts)}; CPU {format_share(cast('float', seen['cpu_share']))} of a core"
+
+
+_SIDES = {"ideal": "ideal model", "model": "kinematic model", "twin": "twin in MuJoCo"}
+
+
+def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
+    """The errors as a table, what the twin is made of and what it lacks, as lines.
+
+    Args:
+        result: the replay.
+        page: the page that was written; None for none.
+    """
+    judged = "each with parameters fitted without its block of 10 s" if result.is_seen else "not fitted to it"
+    lines = [
+        f"run       {result.run}    {result.body.vehicle.name}",
+        f"model     {', '.join(result.model.ids) or 'ideal'}",
+        f"judged    {result.predictions} predictions of 2 s from measured poses, {judged}",
+        "",
+        f"{'':<18}{'position':>12}{'heading':>12}",
+    ]
+    for side, error in result.errors.items():
+        position, heading = 100.0 * error.t_mrmse_m, math.degrees(error.r_mrmse_rad)
+        lines.append(f"{_SIDES[side]:<18}{position:>9.2f} cm{heading:>8.2f} deg")
+    lines += ["", *_describe_twin(result)]
+    if result.body.controller:
+        names = ", ".join(effect.id for effect in result.body.controller)
+        lines.append(f"MuJoCo has no element for: {names}. The replay applies it before the servos.")
+    lines += [f"note      {note}" for note in result.body.notes]
+    return [*lines, *([f"page      {page}"] if page is not None else [])]
+
+
+def _describe_twin(result: TwinReplay) -> list[str]:
+    share = result.reproduced
+    lines = [f"The twin reproduces {100.0 * share:.0f} % of what the model explains."]
+    if math.isnan(share):
+        lines = ["The model explains nothing of this log beyond the ideal one, and so does the twin."]
+    if not result.is_worse and not result.missing:
+        return lines
+    model = result.errors["model"].t_mrmse_m
+    lines += [
+        f"Contact of wheels cannot reproduce {one.effect}: without it the model errs by "
+        f"{100.0 * one.t_mrmse_m:.2f} cm, not {100.0 * model:.2f} cm. {one.motion.rstrip('.')}."
+        for one in result.missing
+    ]
+    if result.is_worse and not result.missing:
+        lines.append("All of its effects are in the twin: contact reproduces one of them in part only.")
+    return lines

@@ -1,4 +1,4 @@
-"""Drives ahead and drives again: plan, what to drive next; and the replay of `slip simulate --twin`."""
+"""Commands on drives: plan, what to drive next; simulate, and its replay of a twin."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from pipeline.cli.conventions import (
     Choices,
     KeyFile,
     Results,
+    TrustCode,
     build_options,
     open_shown,
     print_error,
@@ -325,9 +326,6 @@ def format_plan(
     return lines
 
 
-_WORDS = {"ideal": "ideal model", "model": "kinematic model", "twin": "twin in MuJoCo"}
-
-
 def replay(
     twin: str, log: str | None, page: Path | None, results: Path, *, trust_code: bool, json: bool
 ) -> int:
@@ -344,6 +342,7 @@ def replay(
     Raises:
         SlipError: a file cannot be read, or the twin cannot be made.
     """
+    from pipeline.cli.screen import describe_replay  # noqa: PLC0415 - heavy
     from pipeline.job.twin_replay import load_mujoco, replay_twin  # noqa: PLC0415 - heavy
 
     # Report a missing package before an analysis, which may take a minute.
@@ -351,7 +350,7 @@ def replay(
     file, run = _open(twin, log, results, trust_code=trust_code, quiet=json)
     result = replay_twin(file, run)
     if page is not None:
-        _write_page(page, result)
+        _write_page(page, result, describe_replay(result, None))
     return print_result(result.to_json(), lambda: describe_replay(result, page), json=json)
 
 
@@ -374,55 +373,127 @@ def _open(
     return file, run
 
 
-def _write_page(path: Path, result: TwinReplay) -> None:
+def _write_page(path: Path, result: TwinReplay, lines: Sequence[str]) -> None:
     from pipeline.report.drive_pages import render_twin  # noqa: PLC0415 - heavy
     from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
 
-    text = render_twin(result.to_json(), describe_replay(result, None), result.paths, result.horizon_errors)
+    text = render_twin(result.to_json(), lines, result.paths, result.horizon_errors)
     hint = "Check the folder and its permissions."
     with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=path, hint=hint):
         replace_file(path, text.encode())
 
 
-def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
-    """The errors as a table, what the twin is made of and what it lacks, as lines.
+def simulate(  # noqa: D417 - arguments document themselves
+    case: Annotated[
+        str | None,
+        Parameter(
+            help="a named case; without one, a plain vehicle. With --twin MODEL: the log or run to replay"
+        ),
+    ] = None,
+    /,
+    *,
+    effect: Annotated[
+        list[str] | None,
+        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated"),
+    ] = None,
+    file: Path | None = None,
+    seed: int | None = None,
+    duration: PositiveFloat | None = None,
+    vehicle: str | None = None,
+    layout: str | None = None,
+    program: str | None = None,
+    platform: str | None = None,
+    play: Path | None = None,
+    cases: Annotated[bool, Parameter(negative=())] = False,
+    twin: Annotated[
+        str | None,
+        Parameter(help="replay commands in MuJoCo: a model file, or a log or run for its own model"),
+    ] = None,
+    page: Annotated[Path | None, Parameter(help="--twin: also write a page to this file")] = None,
+    results: Results = Path("results"),
+    trust_code: TrustCode = False,
+    json: bool = False,
+) -> int:
+    """Write a log with known physics, or replay one through a twin.
+
+    The log does not contain the true values.
 
     Args:
-        result: the replay.
-        page: the page that was written; None for none.
+        file: the log to write (run.mcap).
+        seed: seed of driving and noise.
+        duration: length of the run [s].
+        vehicle: simulated vehicle.
+        layout: layout of topics.
+        program: how the vehicle is driven.
+        platform: platform that sets vehicle, topics, types and frames (husky_a200, turtlebot4, ...).
+        play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
+        cases: list the cases and effects instead.
+        json: print one JSON object.
     """
-    judged = "each with parameters fitted without its block of 10 s" if result.is_seen else "not fitted to it"
-    lines = [
-        f"run       {result.run}    {result.body.vehicle.name}",
-        f"model     {', '.join(result.model.ids) or 'ideal'}",
-        f"judged    {result.predictions} predictions of 2 s from measured poses, {judged}",
-        "",
-        f"{'':<18}{'position':>12}{'heading':>12}",
-    ]
-    for side, error in result.errors.items():
-        position, heading = 100.0 * error.t_mrmse_m, math.degrees(error.r_mrmse_rad)
-        lines.append(f"{_WORDS[side]:<18}{position:>9.2f} cm{heading:>8.2f} deg")
-    lines += ["", *_describe_verdict(result)]
-    if result.body.controller:
-        names = ", ".join(effect.id for effect in result.body.controller)
-        lines.append(f"MuJoCo has no element for: {names}. The replay applies it before the servos.")
-    lines += [f"note      {note}" for note in result.body.notes]
-    return [*lines, *([f"page      {page}"] if page is not None else [])]
+    made = {
+        "--effect": effect, "--file": file, "--seed": seed, "--duration": duration, "--vehicle": vehicle,
+        "--layout": layout, "--program": program, "--platform": platform, "--play": play,
+    }  # fmt: skip
+    idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
+    if idle:
+        what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
+        raise SlipError("wrong_option", what, where="slip simulate", hint="Give only one of them.")
+    if twin is not None:
+        return replay(twin, case, page, results, trust_code=trust_code, json=json)
+    from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
+
+    if cases:
+        topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
+        lists = {
+            "cases": {one.name: one.shows for one in list_cases()},
+            "effects": {effect.id: effect.formula for effect in list_effects()},
+            "platforms": {name: ", ".join(published) for name, published in topics.items()},
+        }
+        return print_result(lists, lambda: _format_case(lists), json=json)
+    effects = dict(_parse_effect(text) for text in effect or [])
+    if len(effects) < len(effect or []):
+        hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
+        raise SlipError("effect_twice", "an effect is given twice", where=" ".join(effect or []), hint=hint)
+    path = simulate_case(
+        case,
+        effects,
+        out=file or Path("run.mcap"),
+        seed=seed,
+        duration_s=duration,
+        vehicle=vehicle,
+        layout=layout,
+        program=program,
+        platform=platform,
+        play=play,
+    )
+    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
 
 
-def _describe_verdict(result: TwinReplay) -> list[str]:
-    share = result.reproduced
-    lines = [f"The twin reproduces {100.0 * share:.0f} % of what the model explains."]
-    if math.isnan(share):
-        lines = ["The model explains nothing of this log beyond the ideal one, and so does the twin."]
-    if not result.is_worse and not result.missing:
-        return lines
-    model = result.errors["model"].t_mrmse_m
-    lines += [
-        f"Contact of wheels cannot reproduce {one.effect}: without it the model errs by "
-        f"{100.0 * one.t_mrmse_m:.2f} cm, not {100.0 * model:.2f} cm. {one.motion.rstrip('.')}."
-        for one in result.missing
-    ]
-    if result.is_worse and not result.missing:
-        lines.append("All of its effects are in the twin: contact reproduces one of them in part only.")
+def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
+    """Parse `drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
+    name, given, values = text.partition("=")
+    if not given:
+        return name, {}
+    try:
+        if ":" not in values:
+            return name, float(values)
+        pairs = [pair.partition(":") for pair in values.split(",")]
+        numbers = {key.strip(): float(value) for key, _, value in pairs}
+    except ValueError:
+        raise SlipError(
+            "bad_effect",
+            f"the effect {text!r} has no number where one belongs",
+            hint="Write ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; `slip simulate --cases` lists them.",
+        ) from None
+    if len(numbers) < len(pairs):
+        hint = "Give each number of an effect once."
+        raise SlipError("number_twice", "a number is given twice", where=text, hint=hint)
+    return name, numbers
+
+
+def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
+    lines = []
+    for title, rows in lists.items():
+        width = max(len(name) for name in rows)
+        lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
     return lines

@@ -1,11 +1,16 @@
-"""Commands on one log: analyze, inspect, results stage, simulate."""
+"""Commands on one log: analyze, inspect, results stage; and watch, on one that is being written."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import io
+import json as json_format
+import shlex
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, cast
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -15,7 +20,6 @@ from pipeline.cli.conventions import (
     LOSSY,
     All,
     Choices,
-    Results,
     TrustCode,
     build_options,
     exit_code,
@@ -24,19 +28,23 @@ from pipeline.cli.conventions import (
     print_error,
     print_json,
     print_lines,
+    print_note,
     print_result,
     show_progress,
     spell_choices,
     summarize_error,
 )
 from pipeline.cli.model_runs import trust_named
-from pipeline.core import SlipError, format_duration, format_share
+from pipeline.core import SlipError, format_duration, format_share, naming_os_errors
 from pipeline.job import FigureFormat, Options
 
 if TYPE_CHECKING:
     from pipeline.job.analyze import Outcome
     from pipeline.job.keys import Inspection, TopicHealth
+    from pipeline.job.watch import Watch
     from pipeline.stages.pose_choice import PoseRating
+
+    Content = Mapping[str, object]
 
 
 def analyze(  # noqa: D417 - the shared choices document themselves
@@ -330,119 +338,123 @@ def stage(  # noqa: D417 - the shared choices document themselves
     return LOSSY if outcome.lossy else CLEAN
 
 
-def simulate(  # noqa: D417 - arguments document themselves
-    case: Annotated[
-        str | None,
+_QUIET_S = 30.0
+_CLEAR = "\x1b[H\x1b[2J"
+"""Escape sequence that moves the cursor to the top left corner and clears the screen."""
+
+
+def watch(  # noqa: D417 - the shared choices document themselves
+    log: Annotated[
+        Path,
         Parameter(
-            help="a named case; without one, a plain vehicle. With --twin MODEL: the log or run to replay"
+            help="MCAP file that is being recorded, the folder it is written to, or the address of a server: "
+            "ws://127.0.0.1:8765"
         ),
-    ] = None,
+    ],
     /,
     *,
-    effect: Annotated[
+    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
+    quiet_for: Annotated[
+        PositiveFloat, Parameter(name="--for", help="end after this many seconds without new data")
+    ] = _QUIET_S,
+    page: Annotated[
+        Path | None, Parameter(help="also write a page to this file, which reloads itself in a browser")
+    ] = None,
+    topic: Annotated[
         list[str] | None,
-        Parameter(help="ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; may be repeated"),
+        Parameter(
+            negative=(), help="of a server: record this topic, NAME or NAME=TYPE; can be given several times"
+        ),
     ] = None,
-    file: Path | None = None,
-    seed: int | None = None,
-    duration: PositiveFloat | None = None,
-    vehicle: str | None = None,
-    layout: str | None = None,
-    program: str | None = None,
-    platform: str | None = None,
-    play: Path | None = None,
-    cases: Annotated[bool, Parameter(negative=())] = False,
-    twin: Annotated[
-        str | None,
-        Parameter(help="replay commands in MuJoCo: a model file, or a log or run for its own model"),
+    record: Annotated[
+        Path | None, Parameter(help="of a server: folder of the recording; by default named by port and time")
     ] = None,
-    page: Annotated[Path | None, Parameter(help="--twin: also write a page to this file")] = None,
-    results: Results = Path("results"),
-    trust_code: TrustCode = False,
     json: bool = False,
 ) -> int:
-    """Write a log with known physics, or replay one through a twin.
+    """Diagnose a recording while it is written.
 
-    The log does not contain the true values.
+    Ends when the log is closed, or on Ctrl-C, with the diagnosis of the finished log. An address is that of a
+    Foxglove WebSocket or rosbridge server on this machine, whose messages are recorded.
 
     Args:
-        file: the log to write (run.mcap).
-        seed: seed of driving and noise.
-        duration: length of the run [s].
-        vehicle: simulated vehicle.
-        layout: layout of topics.
-        program: how the vehicle is driven.
-        platform: platform that sets vehicle, topics, types and frames (husky_a200, turtlebot4, ...).
-        play: commands to drive the hidden physics with in place of a program, as `slip plan` writes them.
-        cases: list the cases and effects instead.
-        json: print one JSON object.
+        json: print one JSON object a line instead of the screen.
     """
-    made = {
-        "--effect": effect, "--file": file, "--seed": seed, "--duration": duration, "--vehicle": vehicle,
-        "--layout": layout, "--program": program, "--platform": platform, "--play": play,
-    }  # fmt: skip
-    idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
-    if idle:
-        what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
-        raise SlipError("wrong_option", what, where="slip simulate", hint="Give only one of them.")
-    if twin is not None:
-        from pipeline.cli.verbs_drives import replay  # noqa: PLC0415 - only for a twin
+    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
+    from pipeline.job.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
 
-        return replay(twin, case, page, results, trust_code=trust_code, json=json)
-    from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
-
-    if cases:
-        topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
-        lists = {
-            "cases": {one.name: one.shows for one in list_cases()},
-            "effects": {effect.id: effect.formula for effect in list_effects()},
-            "platforms": {name: ", ".join(published) for name, published in topics.items()},
-        }
-        return print_result(lists, lambda: _format_case(lists), json=json)
-    effects = dict(_parse_effect(text) for text in effect or [])
-    if len(effects) < len(effect or []):
-        hint = "Give all its numbers at once: --effect ID=NAME:VALUE,NAME:VALUE."
-        raise SlipError("effect_twice", "an effect is given twice", where=" ".join(effect or []), hint=hint)
-    path = simulate_case(
-        case,
-        effects,
-        out=file or Path("run.mcap"),
-        seed=seed,
-        duration_s=duration,
-        vehicle=vehicle,
-        layout=layout,
-        program=program,
-        platform=platform,
-        play=play,
-    )
-    return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
+    options = build_options(choices)
+    address = parse_address(str(log))
+    with contextlib.ExitStack() as receiving:
+        live = None
+        if address is not None:
+            live = receiving.enter_context(receive_live(address, record, topic or [], quiet_for))
+        path = choose_recording(log) if live is None else live.path
+        arguments = shlex.split(spell_choices(_without_results(choices)))
+        watched = Watch(path, options, arguments, quiet_for, live)
+        is_screen = sys.stdout.isatty() and not json
+        stopped = False
+        try:
+            for seen in watched.follow():
+                _show(seen, page, json=json, is_screen=is_screen)
+                write_statement(choices.results, path, list_statements(seen))
+        except KeyboardInterrupt:
+            stopped = True
+            print_note("slip: stopped watching; this is the diagnosis of the log so far")
+    if watched.live.problem and not watched.live.slip_mps:
+        print_note(f"slip: no slip was seen: {watched.live.problem}")
+    return _conclude(watched, choices, page, json=json, stopped=stopped)
 
 
-def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
-    """Parse `drive_lag`, `drive_lag=0.6` or `turn_lag=tau_mean:0.4,tau_diff:1.2`."""
-    name, given, values = text.partition("=")
-    if not given:
-        return name, {}
-    try:
-        if ":" not in values:
-            return name, float(values)
-        pairs = [pair.partition(":") for pair in values.split(",")]
-        numbers = {key.strip(): float(value) for key, _, value in pairs}
-    except ValueError:
-        raise SlipError(
-            "bad_effect",
-            f"the effect {text!r} has no number where one belongs",
-            hint="Write ID, ID=VALUE or ID=NAME:VALUE,NAME:VALUE; `slip simulate --cases` lists them.",
-        ) from None
-    if len(numbers) < len(pairs):
-        hint = "Give each number of an effect once."
-        raise SlipError("number_twice", "a number is given twice", where=text, hint=hint)
-    return name, numbers
+def _without_results(choices: Choices) -> Choices:
+    """The choices for a diagnosis of the log so far, which has its own results folder."""
+    return replace(choices, results=Choices().results)
 
 
-def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
-    lines = []
-    for title, rows in lists.items():
-        width = max(len(name) for name in rows)
-        lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
-    return lines
+def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> None:
+    """Show the current state: a JSON line, the redrawn screen, or lines; and the page."""
+    from pipeline.cli.screen import format_watch  # noqa: PLC0415 - heavy
+
+    lines = format_watch(seen)
+    if json:
+        sys.stdout.write(json_format.dumps({"kind": "look", **seen}, allow_nan=False) + "\n")
+    else:
+        sys.stdout.write(_CLEAR if is_screen else "")
+        print_lines(lines if is_screen else [*lines, ""])
+    sys.stdout.flush()
+    if page is not None:
+        _write_page(page, lines, is_live=True)
+
+
+def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
+    from pipeline.report import render_template  # noqa: PLC0415 - heavy
+    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+
+    text = render_template("report/templates/watch.html", lines=lines, is_live=is_live)
+    hint = "Check the folder and its permissions."
+    with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=page, hint=hint):
+        replace_file(page, text.encode())
+
+
+def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
+    """Diagnose the whole log with the command `slip diagnose`."""
+    from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
+    from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
+    from pipeline.job.watch import write_statement  # noqa: PLC0415 - heavy
+
+    taken = io.StringIO()
+    with contextlib.redirect_stdout(taken):
+        code = diagnose([str(watched.path)], choices=choices, json=json, quiet=False)
+    text = taken.getvalue()
+    if json:
+        answer = cast("dict[str, object]", json_format.loads(text))
+        sys.stdout.write(json_format.dumps({"kind": "final", "stopped": stopped, **answer}) + "\n")
+    else:
+        sys.stdout.write(text)
+    if page is not None:
+        _write_page(page, text.splitlines(), is_live=False)
+    rows = list_statements(watched.to_json()) if json else [("", line) for line in text.splitlines()]
+    write_statement(choices.results, watched.path, rows, ended=True)
+    if not stopped:
+        watched.forget()
+    return code

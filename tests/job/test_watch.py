@@ -16,7 +16,7 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from verbs import run_verb
 
-from pipeline.cli.verb_watch import format_watch
+from pipeline.cli.screen import format_watch
 from pipeline.job import Options
 from pipeline.job.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
