@@ -171,7 +171,7 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             for others in {(), tuple(one.id for one in free if one is not effect)}
         ]
         before = selection.loss(current)
-        fitted = selection.approach_each(current, beside, before) + selection.enter_each(starts, before)
+        fitted = selection.approach_each(current, beside, before) + selection.enter_each(starts)
         restarted = [one for one in fitted if selection.is_sound(one)]
         best = min(restarted, key=selection.loss, default=current)
         if not selection.is_better(best, current):

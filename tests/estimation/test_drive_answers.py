@@ -13,7 +13,16 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
-from pipeline.simulate import VEHICLES, Disturbance, Ground, Scenario, simulate_case, simulate_run, write_log
+from pipeline.simulate import (
+    VEHICLES,
+    Disturbance,
+    Ground,
+    Program,
+    Scenario,
+    simulate_case,
+    simulate_run,
+    write_log,
+)
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -81,3 +90,36 @@ def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp
     (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
     found = {effect.id: next(iter(effect.parameters.values())).value for effect in told.effects}
     assert found == pytest.approx(hidden, rel=0.05)
+
+
+@pytest.mark.parametrize("imbalance", [0.0, 0.22])
+def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(imbalance: float, tmp_path: Path) -> None:
+    """From a bound of 1.3 m/s, which never acts at 1 m/s, it ended beside a lag, a side gain or a turn lag."""
+    servo = {
+        "tau": 0.22,
+        "reset": 0.4,
+        "drag": 0.055,
+        "bound": 0.57,
+        "no_load": 1.9,
+        "scrub": 0.57,
+        "creep": 0.07,
+    }
+    effects = {"wheel_servo": servo, "motor_imbalance": imbalance}
+    scenario = Scenario(
+        vehicle=VEHICLES["husky"],
+        effects=effects,
+        program=Program("drive_steps", step_s=4.0),
+        duration_s=120.0,
+        seed=15,
+        disturbance=Disturbance(0.03, 0.05),
+    )
+    write_log(simulate_run(scenario), tmp_path / "run.mcap")
+    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
+    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    named = {effect.id: effect.parameters for effect in told.effects}
+    assert named.keys() == {"wheel_servo", *(["motor_imbalance"] if imbalance else [])}
+    for name in ("tau", "bound", "no_load", "scrub"):
+        assert named["wheel_servo"][name].value == pytest.approx(servo[name], rel=0.05)
+    if imbalance:
+        assert named["motor_imbalance"]["e"].value == pytest.approx(imbalance, rel=0.1)
