@@ -94,7 +94,7 @@ def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp
 
 @pytest.mark.parametrize("imbalance", [0.0, 0.22])
 def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(imbalance: float, tmp_path: Path) -> None:
-    """From a bound of 1.3 m/s, which never acts at 1 m/s, it ended beside a lag, a side gain or a turn lag."""
+    """From a bound of 1.3 m/s, which never acts at 1 m/s, it ended beside a lag, or a gain of one side."""
     servo = {
         "tau": 0.22,
         "reset": 0.4,
