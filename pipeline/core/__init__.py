@@ -63,6 +63,11 @@ def shorten(text: str, most: int = _READABLE) -> str:
     return text if len(text) <= most else f"{text[:most]}..."
 
 
+def make_plain(text: str) -> str:
+    """Replace unprintable characters, so that the text fits on one line, or into XML."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
 def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
     """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty.
 

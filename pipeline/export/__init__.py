@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from pipeline.core import INPUT_WORDS, guess_names, suffix_unit
+from pipeline.core import INPUT_WORDS, guess_names, make_plain, suffix_unit
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
@@ -447,11 +447,6 @@ def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
     unmapped = facts.list_unmapped(sheet)
     lines = [*sheet.head, *(["Not covered by these parameters:"] if unmapped else [])]
     return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
-
-
-def make_plain(text: str) -> str:
-    """Replace unprintable characters, so that the text fits on one line."""
-    return "".join(c if c.isprintable() else " " for c in text)
 
 
 def write_yaml(facts: Facts, sheet: Sheet) -> str:

@@ -12,6 +12,7 @@ from collections.abc import Collection
 import msgspec
 import yaml
 
+from pipeline.core import make_plain
 from pipeline.export import (
     Amount,
     Current,
@@ -21,7 +22,6 @@ from pipeline.export import (
     Target,
     combine,
     list_comments,
-    make_plain,
     start_sheet,
     write_yaml,
 )

@@ -8,8 +8,9 @@ from xml.etree import ElementTree as ET
 
 import numpy as np
 
+from pipeline.core import make_plain
 from pipeline.core.arrays import Floats
-from pipeline.export import Current, Facts, Target, make_plain
+from pipeline.export import Current, Facts, Target
 from pipeline.export.twin_body import (
     GRIP,
     TwinBody,

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core import enumerate_texts, format_angle, format_length, format_share, suffix_unit
+from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
 from pipeline.estimation.verdict import name_effect
 from pipeline.job.check import Check, find_pace
 from pipeline.job.stored_fits import ERRORS, POSITION_ERROR, Label
@@ -288,7 +288,7 @@ def format_markdown(check: Check) -> str:
 
 def _escape(text: str) -> str:
     """Escape names of runs and terrains, which may contain Markdown or HTML markup."""
-    escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", _printable(text))
+    escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", make_plain(text))
     return escaped.replace("<", "&lt;").replace(">", "&gt;")
 
 
@@ -313,14 +313,9 @@ def format_junit(check: Check) -> str:
         "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])
     )
     for group, name, kind, text in cases:
-        case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=_printable(name))
+        case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=make_plain(name))
         if kind:
-            ET.SubElement(case, kind, message=_printable(text))
-    ET.SubElement(suite, "system-out").text = _printable(format_verdict(check))
+            ET.SubElement(case, kind, message=make_plain(text))
+    ET.SubElement(suite, "system-out").text = make_plain(format_verdict(check))
     ET.indent(suite)
     return f'<?xml version="1.0" encoding="utf-8"?>\n{ET.tostring(suite, encoding="unicode")}\n'
-
-
-def _printable(text: str) -> str:
-    """Text without control characters, which XML cannot represent."""
-    return "".join(sign if sign.isprintable() else " " for sign in text)
