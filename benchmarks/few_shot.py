@@ -31,8 +31,9 @@ from pipeline.estimation.problem import Problem
 from pipeline.job.compared_runs import read_digest
 from pipeline.job.next_drive import forecast_deployment
 from pipeline.job.prediction import find_estimates, predict_deployment
+from pipeline.job.run_results import load_vehicle
 from pipeline.models.model import Model
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run
 from pipeline.run.windows import cut_run, find_driven
 from pipeline.store import Store
 

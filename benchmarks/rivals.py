@@ -46,11 +46,11 @@ from pipeline.estimation.rivals import (
 )
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import find_diagnosis
+from pipeline.job.run_results import find_diagnosis, load_vehicle
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models
-from pipeline.report.motion_view import load_motion_run, load_vehicle, read_model_text
+from pipeline.report.motion_view import load_motion_run, read_model_text
 from pipeline.store import Manifest, Store
 
 LOGS = Path(__file__).parents[2] / "shared" / "logs"

@@ -21,10 +21,11 @@ from pipeline.fleet.levels import split_levels
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.check_sides import read_under
+from pipeline.job.run_results import load_vehicle
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run
 from pipeline.store import Manifest, Store
 
 MODELS = (

@@ -40,11 +40,12 @@ from pipeline.fleet.forecast import Forecast, forecast_vehicle, list_held
 from pipeline.job.compared_runs import read_digest
 from pipeline.job.next_drive import forecast_deployment
 from pipeline.job.prediction import find_estimates
+from pipeline.job.run_results import load_vehicle
 from pipeline.models.effect import Effect, Late
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import Model, Timing
 from pipeline.models.parameter import Level
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run
 from pipeline.store import Manifest, Store
 
 Source = Literal["command", "measured"]

@@ -35,11 +35,11 @@ from pipeline.job.check import check_as_json, check_runs, keep_baseline, read_li
 from pipeline.job.check_sides import Baseline, read_baseline
 from pipeline.job.check_text import format_junit, format_markdown, list_lines
 from pipeline.job.keys import Owner, find_run
-from pipeline.job.run_results import LINES, diagnose_stored, find_diagnosis, find_peers
+from pipeline.job.run_results import LINES, diagnose_stored, find_diagnosis, find_peers, load_vehicle
 from pipeline.job.stored_fits import Against, contest_models, read_runs
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report import format_distance
-from pipeline.report.motion_view import load_vehicle, read_model_text, view_diagnosis
+from pipeline.report.motion_view import read_model_text, view_diagnosis
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.store import Manifest, Store

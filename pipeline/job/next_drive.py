@@ -23,6 +23,7 @@ from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
 from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.job.prediction import find_estimates
+from pipeline.job.run_results import load_vehicle
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.plan import Area, Limits, is_steered
@@ -30,7 +31,7 @@ from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question
 from pipeline.plan.rehearsal import Knowledge
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
 

@@ -22,12 +22,12 @@ from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, ma
 from pipeline.fleet.levels import draw_run
 from pipeline.job import JobError, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
-from pipeline.job.run_results import read_length_scale
+from pipeline.job.run_results import load_vehicle, read_length_scale
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import COLUMNS, load_motion_run, load_vehicle
+from pipeline.report.motion_view import COLUMNS, load_motion_run
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest, Store

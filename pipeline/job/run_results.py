@@ -15,7 +15,7 @@ import polars as pl
 
 from pipeline.core import PACKAGE, SlipError, read_version
 from pipeline.core.untrusted import PathError, mapping_in, number_in, objects_in, read_object, resolve_inside
-from pipeline.job import INPUTS
+from pipeline.job import INPUTS, JobError
 from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
 from pipeline.job.work import Work, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
@@ -200,14 +200,29 @@ def judge_run(findings: pl.DataFrame, diagnosis: Mapping[str, JSON] | None) -> s
     return format_verdict({"findings": findings.to_dicts()} if diagnosis is None else diagnosis)
 
 
+def load_vehicle(manifest: Manifest) -> Vehicle:
+    """Vehicle that a run was analyzed with.
+
+    Raises:
+        JobError: ``no_vehicle``, the results do not contain it.
+    """
+    from pipeline.sources import Vehicle  # noqa: PLC0415 - heavy
+
+    try:
+        return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
+    except msgspec.ValidationError as error:
+        hint = "Analyze the log again with --force."
+        raise JobError(
+            "no_vehicle", "the results do not say which vehicle the run is of", where=manifest.run, hint=hint
+        ) from error
+
+
 def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
     """Vehicle and input data of a diagnosis from a stored run.
 
     Raises:
         SlipError: the results do not contain the vehicle, or a table cannot be read.
     """
-    from pipeline.report.motion_view import load_vehicle  # noqa: PLC0415 - heavy, and only for stored runs
-
     recording = _make_recording(
         manifest.run,
         (manifest.tables, manifest.read),

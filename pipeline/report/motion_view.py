@@ -8,7 +8,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import msgspec
 import numpy as np
 import polars as pl
 
@@ -76,23 +75,6 @@ def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, p
         )
     sha256 = str(manifest.part("log").get("sha256", ""))
     return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
-
-
-def load_vehicle(manifest: Manifest) -> Vehicle:
-    """Vehicle that a run was analyzed with.
-
-    Raises:
-        ReportError: ``no_vehicle``, the results do not contain it.
-    """
-    from pipeline.sources import Vehicle  # noqa: PLC0415 - heavy
-
-    try:
-        return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
-    except msgspec.ValidationError as error:
-        hint = "Analyze the log again with --force."
-        raise ReportError(
-            "no_vehicle", "the results do not say which vehicle the run is of", where=manifest.run, hint=hint
-        ) from error
 
 
 # Comparison of a model with the ideal one on a run, as rows for figures.

@@ -39,7 +39,6 @@ from pipeline.stages.drive import (
 from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.pose_topics import read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
-from pipeline.stages.satellite import Located, Receiver, locate_vehicle
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -296,7 +295,7 @@ class _Extraction:
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))
         return arrays
 
-    def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> Located | None:
+    def _head_positions(self, source: PoseSource, arrays: reading.PoseArrays) -> reading.Located | None:
         """Poses with the course as heading if a topic gives positions alone; otherwise None.
 
         A vehicle that moves sideways may keep one heading.
@@ -308,8 +307,10 @@ class _Extraction:
             or not pose_topics.lacks_heading(arrays)
         ):
             return None
+        from pipeline.stages.satellite import head_positions  # noqa: PLC0415 - few logs need it
+
         imu = self._timed(self.sources.imu.topic) if self.sources.imu else None
-        located = pose_topics.head_positions(arrays, receiver, imu, self._read_ahead())
+        located = head_positions(arrays, receiver, imu, self._read_ahead())
         self.findings += () if located is None else located.findings
         return located
 
@@ -320,6 +321,8 @@ class _Extraction:
 
     def _locate_vehicle(self, source: PoseSource) -> tuple[Ints, reading.PoseArrays]:
         """Messages of a satellite receiver that give a pose, in time order, and these poses."""
+        from pipeline.stages.satellite import locate_vehicle  # noqa: PLC0415 - few logs need it
+
         receiver, beside, imu = (
             self._timed(topic)
             for topic in (source.topic, source.velocity, self.sources.imu.topic if self.sources.imu else "")
@@ -335,14 +338,14 @@ class _Extraction:
             raise self._nothing("pose", source.topic)
         return made.rows, made.arrays
 
-    def _timed(self, topic: str) -> Receiver | None:
+    def _timed(self, topic: str) -> reading.Receiver | None:
         ordered = self._ordered(topic)
         if ordered is None:
             return None
         columns, clock, order = ordered
         # Messages with equal stamps have no position on a track.
         order = order[np.diff(clock.stamp[order], prepend=np.iinfo(np.int64).min) > 0]
-        return Receiver(columns, self._seconds(clock.stamp), order)
+        return reading.Receiver(columns, self._seconds(clock.stamp), order)
 
     def _time_columns(self, times: Floats, stamp: Stamps, log_time: Stamps) -> dict[str, NDArray[np.generic]]:
         return {"t": times, "stamp": stamp, "log_time": log_time}

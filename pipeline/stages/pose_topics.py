@@ -18,7 +18,6 @@ from pipeline.sources.message_types import PoseFields, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
-from pipeline.stages.satellite import Located, Receiver, find_heading, follow_track, is_new, list_turnings
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")
 _MOVES_M: Final = 0.5
@@ -290,38 +289,6 @@ def lacks_heading(arrays: PoseArrays) -> bool:
         return False
     yaw = float(rigid.euler_from_quaternions(quaternion[:1])[2][0]) if quaternion[0].any() else 0.0
     return bool(np.ptp(position @ np.array([-np.sin(yaw), np.cos(yaw)])) > _ACROSS_M)
-
-
-def head_positions(
-    arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
-) -> Located | None:
-    """Poses of a position-only topic, with the course as heading, or a gyro aligned with the course.
-
-    Args:
-        arrays: poses of all messages.
-        receiver: the topic with its clock.
-        imu: gyro, and attitude if available.
-        ahead: times [s] and forward speed [m/s] of the wheels or the command.
-
-    Returns:
-        The poses with a known heading; None if there are too few, as for a vehicle at rest.
-    """
-    rows, topic = (
-        receiver.order[np.isfinite(arrays.position[receiver.order]).all(axis=1)],
-        receiver.columns.topic,
-    )
-    rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
-    times, position = receiver.times[rows], arrays.position[rows]
-    turnings = [] if imu is None else list_turnings(imu)
-    heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
-    headed = np.isfinite(heading.yaw)
-    if headed.sum() < FEWEST_MESSAGES:
-        return None
-    text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
-    alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))
-    quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
-    made = PoseArrays(position[headed], quaternion, arrays.parent, arrays.child)
-    return Located(rows[headed], made, (alone, heading.finding))
 
 
 _BASES = ("base_link", "base_footprint", "base")

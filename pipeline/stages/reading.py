@@ -357,6 +357,36 @@ class PoseArrays:
         )
 
 
+@dataclass(frozen=True)
+class Receiver:
+    """A topic with its clock.
+
+    Attributes:
+        columns: as recorded.
+        times: of all its messages [s], shape (n,).
+        order: indices of the valid messages, in time order.
+    """
+
+    columns: TopicColumns
+    times: Floats
+    order: Ints
+
+
+@dataclass(frozen=True)
+class Located:
+    """Poses of the vehicle.
+
+    Attributes:
+        rows: messages that give a pose, in time order, shape (m,).
+        arrays: poses of base_link, shape (m,).
+        findings: findings on the poses.
+    """
+
+    rows: Ints
+    arrays: PoseArrays
+    findings: tuple[Finding, ...]
+
+
 def read_pose_topic(columns: TopicColumns) -> PoseArrays:
     """Poses of a topic whose type has a pose, axes ahead, left, up."""
     pose = find_type(columns.type_name).pose

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 from pipeline.core import arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.logs import TopicColumns
 from pipeline.run.heading import fit_turning
 from pipeline.run.signals import MOVING_MPS, STILL_MPS
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, reading
-from pipeline.stages.reading import PoseArrays
+from pipeline.stages.reading import FEWEST_MESSAGES, Located, PoseArrays, Receiver
 
 # Heading of a vehicle from its course over ground, and possibly from a sensor that turns with it.
 #
@@ -339,36 +338,6 @@ def to_local_plane(latitude: Floats, longitude: Floats, altitude: Floats) -> Flo
     return local
 
 
-@dataclass(frozen=True)
-class Receiver:
-    """A topic with its clock.
-
-    Attributes:
-        columns: as recorded.
-        times: of all its messages [s], shape (n,).
-        order: indices of the valid messages, in time order.
-    """
-
-    columns: TopicColumns
-    times: Floats
-    order: Ints
-
-
-@dataclass(frozen=True)
-class Located:
-    """Poses of the vehicle.
-
-    Attributes:
-        rows: messages that give a pose, in time order, shape (m,).
-        arrays: poses of base_link, shape (m,).
-        findings: findings on the poses.
-    """
-
-    rows: Ints
-    arrays: PoseArrays
-    findings: tuple[Finding, ...]
-
-
 def locate_vehicle(
     receiver: Receiver,
     beside: Receiver | None,
@@ -485,3 +454,35 @@ def is_new(times: Floats, position: Floats) -> Flags:
     again = np.concatenate(([False], np.all(np.diff(position, axis=0) == 0.0, axis=1)))
     new: Flags = ~(again & moves)
     return new
+
+
+def head_positions(
+    arrays: PoseArrays, receiver: Receiver, imu: Receiver | None, ahead: tuple[Floats, Floats] | None
+) -> Located | None:
+    """Poses of a position-only topic, with the course as heading, or a gyro aligned with the course.
+
+    Args:
+        arrays: poses of all messages.
+        receiver: the topic with its clock.
+        imu: gyro, and attitude if available.
+        ahead: times [s] and forward speed [m/s] of the wheels or the command.
+
+    Returns:
+        The poses with a known heading; None if there are too few, as for a vehicle at rest.
+    """
+    rows, topic = (
+        receiver.order[np.isfinite(arrays.position[receiver.order]).all(axis=1)],
+        receiver.columns.topic,
+    )
+    rows = rows[is_new(receiver.times[rows], arrays.position[rows])]
+    times, position = receiver.times[rows], arrays.position[rows]
+    turnings = [] if imu is None else list_turnings(imu)
+    heading = find_heading(times, follow_track(times, position, ahead), turnings, np.zeros(2), topic)
+    headed = np.isfinite(heading.yaw)
+    if headed.sum() < FEWEST_MESSAGES:
+        return None
+    text = f"the orientations of {topic} never turn, though its positions do: they are positions alone"
+    alone = Finding("no_heading", "warning", text, where=topic, count=int(arrays.position.shape[0]))
+    quaternion = rigid.quaternions_from_yaw(heading.yaw[headed])
+    made = PoseArrays(position[headed], quaternion, arrays.parent, arrays.child)
+    return Located(rows[headed], made, (alone, heading.finding))

@@ -35,9 +35,10 @@ from pipeline.estimation.learned_step import fit_and_hold_out, hold_out_model
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
+from pipeline.job.run_results import load_vehicle
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run, load_vehicle
+from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest

@@ -24,8 +24,8 @@ from pipeline.estimation.verdict import (
 )
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.run_results import load_vehicle
 from pipeline.models import find_effect, list_effects
-from pipeline.report.motion_view import load_vehicle
 from pipeline.sources import Vehicle, list_presets
 from pipeline.stages.checks import FAULTS
 

@@ -14,10 +14,11 @@ from pipeline.export import export_model
 from pipeline.export.twin_body import build_twin_body
 from pipeline.job import Options, twin_replay
 from pipeline.job.analyze import analyze_log
+from pipeline.job.run_results import load_vehicle
 from pipeline.job.stored_fits import read_runs
 from pipeline.job.twin_replay import LEAST_REPRODUCED, TwinGround, make_twin_effects, replay_twin
 from pipeline.models import Model, ModelFile, find_effect, write_model
-from pipeline.report.motion_view import load_motion_run, load_vehicle
+from pipeline.report.motion_view import load_motion_run
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 

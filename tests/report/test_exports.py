@@ -23,12 +23,12 @@ from rosbags.highlevel import AnyReader
 from pipeline.core import python_command
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.job.run_results import load_vehicle
 from pipeline.logs.writer import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report import ReportError
 from pipeline.report import viewer_files as derived_module
 from pipeline.report.export_source import ExportSource
-from pipeline.report.motion_view import load_vehicle
 from pipeline.report.viewer_files import (
     write_csv,
     write_derived_log,

@@ -17,7 +17,8 @@ from pipeline.simulate.platforms import Published, fix, ground_velocity, imu, jo
 from pipeline.simulate.sensors import to_earth
 from pipeline.sources import PoseContent
 from pipeline.sources.candidates import Topics
-from pipeline.stages.satellite import Receiver, follow_track, locate_vehicle, read_over_ground, to_local_plane
+from pipeline.stages.reading import Receiver
+from pipeline.stages.satellite import follow_track, locate_vehicle, read_over_ground, to_local_plane
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(
