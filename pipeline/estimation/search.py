@@ -53,7 +53,7 @@ def search_effects(
             return current, extensions
         adapted = selection.reweight(chosen)
         if any(one.starts for one in adapted.state.effects if one.id not in current.ids):
-            adapted = restart(selection, adapted)
+            adapted = _restart_once(selection, adapted, restarted)
         new = set(adapted.ids) - set(current.ids)
         unsound = {name for name in new if not selection.may_stay(adapted.state.find(name), adapted.state)}  # type: ignore[arg-type]
         if unsound:
