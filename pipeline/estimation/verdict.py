@@ -250,7 +250,7 @@ def _name_model(step: Content, shown: int) -> str:
     if count == shown:
         words = {0: "", 1: "this", 2: "both"}.get(count, "these")
     else:
-        words = {1: "one effect", 2: "both effects"}.get(count, "all effects")
+        words = {1: "one effect", 2: "two effects"}.get(count, "all effects")
     return " and ".join(filter(None, [words, formula]))
 
 

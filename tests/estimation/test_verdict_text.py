@@ -171,7 +171,7 @@ def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> N
     effects = {"lateral_skid": {"c": 0.02}, "deadband": {"d": 0.01}}
     drawn = draw_diagnosis(effects, [(0.2, 0.1), (0.21, 0.12), (0.2, 0.115)])
     assert list(rank_main(drawn["ladder"])) == ["deadband"]
-    assert "below 0.01 m/s; with both effects in the model" in check_verdict(drawn)
+    assert "below 0.01 m/s; with two effects in the model" in check_verdict(drawn)
 
 
 def test_the_verdict_keeps_the_order_of_the_effects_whatever_their_subject() -> None:
