@@ -58,6 +58,7 @@ from pipeline.estimation.ladder import (
     compare_losses,
     judge_model,
     ladder_as_json,
+    list_order,
     note_fit,
 )
 from pipeline.estimation.learned_step import learn_beyond
@@ -65,7 +66,6 @@ from pipeline.estimation.parts import BodyPart, Part
 from pipeline.estimation.selection import Context
 from pipeline.estimation.terms import is_term
 from pipeline.estimation.unexplained import find_places
-from pipeline.estimation.verdict import rank_effects
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
@@ -128,13 +128,16 @@ def summarize(
         # The values of the other effects change without these.
         taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
+    judgements = {name: one.ordered for name, one in judgements.items()}
+    judgement = judgements.get(source.value)
     unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = find_places(part.comparisons)
-    hidden = {name for item in undecided for name in item.candidates}
-    hidden = hidden.union(*({effect.id, *effect.searched_as} for effect in taken))
-    described = tuple(replace(one, as_if=format_stand_in(one)) for one in described)
+    hidden = {name for item in undecided for name in item.candidates}.union(
+        *({effect.id, *effect.searched_as} for effect in taken)
+    )
+    described = tuple(replace(one, as_if=format_stand_in(one)) for one in _order(described, judgement))
     named = _mark_tentative(described, judgements, doubted)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
@@ -310,7 +313,7 @@ def _name_all(
     effects: Sequence[Effect], context: Context, paths: Sequence[Explored], judgement: Judgement | None
 ) -> tuple[Named, ...]:
     widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    return tuple(_name(effect, context, paths, judgement, widths) for effect in _order(effects, judgement))
+    return tuple(_name(effect, context, paths, judgement, widths) for effect in effects)
 
 
 def _name(
@@ -423,10 +426,10 @@ def _note_unless(
     return tuple(replace(one, unless=tuple(un for n, un in conditions if n == one.id)) for one in named)
 
 
-def _order(effects: Sequence[Effect], judgement: Judgement | None) -> list[Effect]:
-    """Effects in the order of `rank_effects`, those without a step last."""
-    ranked = [] if judgement is None else [*rank_effects(_list_steps(judgement))]
-    return sorted(effects, key=lambda effect: [*ranked, effect.id].index(effect.id))
+def _order(named: tuple[Named, ...], judgement: Judgement | None) -> tuple[Named, ...]:
+    """Named effects in the order of the ladder, those without a step last."""
+    ranked = [] if judgement is None else list_order(judgement.ladder.steps)
+    return tuple(sorted(named, key=lambda one: [*ranked, one.id].index(one.id)))
 
 
 def _path_of(effect: Effect, paths: Sequence[Explored]) -> Explored:
@@ -466,11 +469,8 @@ def _delay_poses(part: Part, state: State) -> Floats:
 def _list_steps(judgement: Judgement) -> list[Mapping[str, Json]]:
     rungs = []
     for step in ladder_as_json(judgement.ladder, judgement.floor):
-        names: list[str] = []
-        for name in cast("list[str]", step["effects"]):
-            plain = "unexplained" if is_term(name) else name
-            if plain not in names:
-                names.append(plain)
+        ids = cast("list[str]", step["effects"])
+        names = list(dict.fromkeys("unexplained" if is_term(name) else name for name in ids))
         rungs.append(cast("Mapping[str, Json]", {**step, "effects": names}))
     return rungs
 

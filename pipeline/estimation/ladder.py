@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick
 from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
-from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out
+from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.parts import RIDGE, average_windows, locate_windows
 from pipeline.estimation.problem import Problem
@@ -95,7 +95,7 @@ def find_share_removed(error: float, ideal: float, floor: float) -> float | None
 def climb(
     problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[LadderStep] = ()
 ) -> Ladder:
-    """Build the ladder of a model's effects, the most useful first.
+    """Build the ladder of a model's effects, that with the largest gain of likelihood first.
 
     All effects are fitted together. At each step the effect with the largest predicted gain is added, and
     all parameters are refitted; the last step is the model itself. An effect that raises an error is also a
@@ -105,21 +105,58 @@ def climb(
         problem: the runs.
         model: model with the effects, whose values are the starts.
         per_run: as in `fit_model`.
-        known_steps: known steps, reused for the same effects, except for the last step.
+        known_steps: steps of a larger model, reused for the same effects, except for the last step; effects
+            are added in their order.
     """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     whole = fit_model(problem, active, per_run=per_run, exact=True)
     known = {frozenset(step.effects): step for step in known_steps}
     rungs: list[LadderStep] = []
-    waiting, taken = list(whole.model.ids), list[str]()
+    waiting, taken = [name for name in list_order(known_steps) if name in whole.model], list[str]()
+    waiting += [name for name in whole.model.ids if name not in waiting]
     while True:
         # The last step is the model that is written: unlike the steps before, it is fitted exactly.
         step = (known.get(frozenset(taken)) if waiting else None) or fit_step(problem, whole, taken, per_run)
         rungs.append(step)
         if not waiting:
             return Ladder(tuple(rungs))
-        losses = _predict_losses(step.fitted, whole, waiting)
+        is_open = not known_steps and len(waiting) > 1
+        losses = _predict_losses(step.fitted, whole, waiting) if is_open else [(0.0, 0.0)]
         taken.append(waiting.pop(losses.index(min(losses))))
+
+
+def sort_steps(problem: Problem, ladder: Ladder) -> Ladder:
+    """The ladder with that effect next which most lowers the sum of both errors over 2 s.
+
+    Errors count relative to those of the ideal model. They are predicted with the values of the whole model;
+    of effects that lower them alike, the earlier one of the given ladder comes first.
+    """
+    whole, known = ladder.steps[-1].fitted, {frozenset(step.effects): step for step in ladder.steps}
+    waiting, taken, steps = list_order(ladder.steps), list[str](), [ladder.steps[0]]
+    while waiting:
+        errors = [_predict_error(problem, ladder, [*taken, name]) for name in waiting[1:] and waiting]
+        least = min(errors, default=0.0)
+        taken.append(waiting.pop(next((i for i, one in enumerate(errors) if one <= least + CHANCE), 0)))
+        steps.append(known.get(frozenset(taken)) or fit_step(problem, whole, taken, whole.per_run))
+    return Ladder(tuple(steps))
+
+
+def _predict_error(problem: Problem, ladder: Ladder, names: Sequence[str]) -> float:
+    """Sum of both errors over 2 s with some effects of the whole model, relative to the ideal model's."""
+    whole, ideal = ladder.steps[-1].fitted.state, ladder.steps[0].errors
+    state = whole.drop(set(whole.ids) - set(names))
+    horizons = [
+        comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
+        for run, comparison in enumerate(problem.comparisons)
+    ]
+    position, yaw = (np.concatenate([getattr(one, name) for one in horizons]) for name in ("position", "yaw"))
+    t, r = measure_errors(np.empty((0, 3)), position, yaw).ratios(ideal)[3:]
+    return t + r
+
+
+def list_order(steps: Sequence[LadderStep]) -> list[str]:
+    """Ids of the effects in the order in which steps add them."""
+    return list(dict.fromkeys(name for step in steps for name in step.effects))
 
 
 def fit_step(
@@ -233,6 +270,11 @@ class Judgement:
     def floor(self) -> Errors:
         """The noise floor of the runs."""
         return self.problem.floor
+
+    @property
+    def ordered(self) -> Judgement:
+        """With the steps in the order in which effects are listed everywhere, see `sort_steps`."""
+        return replace(self, ladder=sort_steps(self.problem, self.ladder))
 
     def drop(self, name: str) -> LadderStep:
         """The model without one effect, refitted."""

@@ -97,7 +97,7 @@ def _list_open_ends(diagnosis: Content) -> tuple[str, str, str]:
 
 
 def rank_effects(ladder: Sequence[Content]) -> dict[str, float]:
-    """Effects in the order in which they are listed everywhere: the one that removes most error first.
+    """Effects in the order in which they are listed everywhere: that of the ladder.
 
     Args:
         ladder: rungs with ``effects``, ``t_mrmse_m`` and ``r_mrmse_rad``, from the ideal model up.
@@ -116,14 +116,18 @@ def rank_effects(ladder: Sequence[Content]) -> dict[str, float]:
         ]
         for name in list_added(before, after):
             shares.setdefault(name, max(falls, default=0.0))
-    return dict(sorted(shares.items(), key=lambda one: -one[1]))
+    return shares
 
 
 def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
-    """Those of `rank_effects` that remove a tenth of the error, and the first effect whatever it removes."""
+    """Those of `rank_effects` up to the last one that removes a tenth of the error, at least one effect.
+
+    What removes less before it stays in the list, so that each error continues from the one above.
+    """
     ranked = rank_effects(ladder)
-    first = next((name for name in ranked if name != FORMULA), FORMULA)
-    return {name: share for name, share in ranked.items() if share >= _MAIN_SHARE or name == first}
+    large = [number for number, share in enumerate(ranked.values()) if share >= _MAIN_SHARE]
+    first = next((number for number, name in enumerate(ranked) if name != FORMULA), 0)
+    return dict([*ranked.items()][: max([*large, first]) + 1])
 
 
 def split_main(
@@ -189,7 +193,7 @@ def _name_small(diagnosis: Content) -> str:
 
 
 def _list_clauses(diagnosis: Content) -> dict[str, str]:
-    """What the robot does by each main effect of the ladder, by its id, the one that removes most first."""
+    """What the robot does by each main effect of the ladder, by its id, in its order."""
     undecided = {one.get("in_model") for one in objects_in(diagnosis, "undecided")}
     known = {
         str(one["id"]): str(one["clause"])

@@ -140,12 +140,19 @@ def test_what_is_too_small_to_be_named_is_not_unexplained() -> None:
 
 
 def test_what_removes_less_than_a_tenth_is_counted_and_not_told() -> None:
-    effects = {"drive_lag": {"tau": 0.3}, "wheel_asymmetry": {"e": 0.02}, "effective_track": {"k": 1.5}}
-    drawn = draw_diagnosis(effects, [(1.0, 0.5), (0.5, 0.5), (0.45, 0.48), (0.05, 0.02)])
+    effects = {"effective_track": {"k": 1.5}, "drive_lag": {"tau": 0.3}, "wheel_asymmetry": {"e": 0.02}}
+    drawn = draw_diagnosis(effects, [(1.0, 0.5), (0.5, 0.05), (0.1, 0.04), (0.05, 0.02)])
     assert list(rank_main(drawn["ladder"])) == ["effective_track", "drive_lag"]
     verdict = check_verdict(drawn)
     assert "with all effects in the model 5 cm and 1.1 degrees remain, at the noise floor." in verdict
     assert "larger" not in verdict
+
+
+def test_what_removes_little_is_listed_where_a_later_effect_removes_more() -> None:
+    """Errors chain from line to line: an effect may remove most beside one that removes little alone."""
+    effects = {"drive_lag": {"tau": 0.3}, "wheel_asymmetry": {"e": 0.02}, "effective_track": {"k": 1.5}}
+    drawn = draw_diagnosis(effects, [(1.0, 0.5), (0.5, 0.5), (0.45, 0.48), (0.05, 0.02)])
+    assert list(rank_main(drawn["ladder"])) == list(effects)
 
 
 def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
@@ -160,7 +167,7 @@ def test_no_effect_is_smaller_where_none_is_larger() -> None:
     """A formula that removed most left `1 smaller effect` as all that was said of effects."""
     drawn = draw_diagnosis({"deadband": {"d": 0.01}}, [(1.0, 0.5), (0.95, 0.5)])
     drawn["ladder"].append({"effects": ["deadband", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.1})
-    assert [*rank_main(drawn["ladder"])] == ["unexplained", "deadband"]
+    assert [*rank_main(drawn["ladder"])] == ["deadband", "unexplained"]
     band = ("deadband", False)
     assert split_main([band], drawn["ladder"], lambda one: one) == ([band], [])
     assert not is_small("deadband", drawn["ladder"])
@@ -168,8 +175,8 @@ def test_no_effect_is_smaller_where_none_is_larger() -> None:
 
 
 def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> None:
-    effects = {"lateral_skid": {"c": 0.02}, "deadband": {"d": 0.01}}
-    drawn = draw_diagnosis(effects, [(0.2, 0.1), (0.21, 0.12), (0.2, 0.115)])
+    effects = {"deadband": {"d": 0.01}, "lateral_skid": {"c": 0.02}}
+    drawn = draw_diagnosis(effects, [(0.2, 0.1), (0.19, 0.095), (0.2, 0.115)])
     assert list(rank_main(drawn["ladder"])) == ["deadband"]
     assert "below 0.01 m/s; with two effects in the model" in check_verdict(drawn)
 
