@@ -176,6 +176,9 @@ def explain_refusals(
         stretches = np.concatenate(number_predictions(problem))
         said = explain_no_help(before.held_out, after.held_out, stretches)
         return {LEARNED: said} if said else {}
+    ids = {*after.fitted.model.ids}
+    if idle := [one for one in added if one.acts_with and not ids.intersection(one.acts_with)]:
+        return {one.id: f"it acts only beside {' or '.join(one.acts_with)}" for one in idle}
     conditions = Context(problem).conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone

@@ -289,6 +289,7 @@ def format_effect(effect: type[Effect] | Effect) -> str:
         # A paragraph is one line; the display wraps it.
         page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
     lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
+    lines += [f"acts beside   {name}, which a model must contain" for name in effect.acts_with]
     lines.append(f"vehicles      {', '.join(effect.kinds)}")
     for parameter in effect.parameters:
         low, high = parameter.bounds

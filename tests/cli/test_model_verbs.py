@@ -151,3 +151,16 @@ def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(
     printed = capsys.readouterr().out
     assert "  ! position error rises by " in printed
     assert ": changed as requested" in printed
+
+
+def test_an_effect_that_acts_beside_another_one_alone_says_which(
+    results: Path, model: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = ["model", "add", str(model), "motor_imbalance", "--on", RUN, "--results", str(results), "--quiet"]
+    with pytest.raises(SystemExit) as ended:
+        main(asked)
+    assert ended.value.code == 1
+    said = capsys.readouterr().err
+    assert "motor_imbalance is not supported by the data (it acts only beside wheel_servo)" in said
+    slip("effects", "motor_imbalance")
+    assert "acts beside   wheel_servo, which a model must contain" in capsys.readouterr().out
