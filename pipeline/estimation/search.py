@@ -168,7 +168,7 @@ def restart(selection: Selection, current: CandidateModel) -> CandidateModel:
             current.state.drop(others).add(effect.change(**start))
             for effect in free
             for start in effect.list_starts(selection.largest)
-            for others in {(), tuple(one.id for one in free if one is not effect)}
+            for others in dict.fromkeys(((), tuple(one.id for one in free if one is not effect)))
         ]
         before = selection.loss(current)
         fitted = selection.approach_each(current, beside, before) + selection.enter_each(starts)

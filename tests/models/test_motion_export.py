@@ -199,10 +199,14 @@ def test_every_effect_moves_alike_at_any_of_its_values(name: str, runs: Mapping[
                 )
                 for p in kind().parameters
             }
-            effect = kind(**values)
-            expected = comparison.predict_velocity([effect], Timing())
+            effect, moved = kind(**values), model
+            for beside in map(find_effect, kind.acts_with):
+                # Bounds that act: what acts beside them alone moves nothing otherwise.
+                moved += beside(tau=0.2, reset=0.3, drag=0.05, bound=0.3, no_load=1.2, scrub=0.6, creep=0.07)
+            moved += effect
+            expected = comparison.predict_velocity(moved.effects, Timing())
             fine = run_exported(
-                export_model(ModelFile(model + effect), "python"), rows, run.duration_s, step_s=STEP_S / 5
+                export_model(ModelFile(moved), "python"), rows, run.duration_s, step_s=STEP_S / 5
             )
             # The model's cells hold means; so do these.
             got = fine[: len(fine) // 5 * 5].reshape(-1, 5, 7).mean(axis=1)

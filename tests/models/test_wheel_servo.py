@@ -292,3 +292,11 @@ def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: floa
 def test_a_loop_that_nothing_loads_or_bounds_is_a_lag(numbers: dict[str, float], *, is_lag: bool) -> None:
     conditions = Conditions(Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11)))
     assert find_effect("wheel_servo")(tau=0.3, **numbers).is_degenerate(conditions) is is_lag
+
+
+@pytest.mark.parametrize("rim", [0.0, 1e-3, 0.05, 1.0, 5.0, 80.0, 1e4])
+def test_its_starts_are_within_its_bounds_however_fast_the_wheels_are(rim: float) -> None:
+    kind = find_effect("wheel_servo")
+    largest = Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11), rim=rim)
+    starts = [kind(**values) for values in kind().list_starts(largest)]
+    assert len(starts) == (3 if rim in {0.0, 5.0} else 6)

@@ -241,7 +241,8 @@ class WheelServo(JointDrive):
         if max(share, 1.0 / share) < _OTHER_RIM:
             return starts
         factors = {p.name: {"m/s": share, "s/m": 1.0 / share}.get(p.unit, 1.0) for p in self.parameters}
-        return starts + [{name: factors[name] * start[name] for name in start} for start in starts]
+        scaled = ({name: factors[name] * start[name] for name in start} for start in starts)
+        return starts + [dict(self.change_within(**one).values) for one in scaled]
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a lag: neither ground nor resistance loads it, and its force is never bounded."""
