@@ -314,7 +314,7 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.models.catalogue import find_effect, format_effect, list_effects, list_pages  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect, format_effect, list_effects, list_pages  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
     pages = list_pages(chosen) if effect is None else [format_effect(chosen[0])]

@@ -90,7 +90,8 @@ def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
     by_id = {candidate.id: candidate for candidate in candidates}
     promising = []
     for part, fit in zip(problem.parts, fitted.fits, strict=True):
-        mine = [candidate for candidate in candidates if part.owns(candidate())]
+        effects = [candidate for candidate in candidates if candidate().acts_in(fitted.model.ids)]
+        mine = [candidate for candidate in effects if part.owns(candidate())]
         ranked = Evidence(part, fit, mine, problem.largest).rank_singles(PRICE)
         paying = [one for one in ranked if one.chi_square > PRICE * one.numbers]
         promising += [by_id[one.starts[0].effect.id] for one in paying[:MOST_FITTED]]
@@ -176,8 +177,7 @@ def explain_refusals(
         stretches = np.concatenate(number_predictions(problem))
         said = explain_no_help(before.held_out, after.held_out, stretches)
         return {LEARNED: said} if said else {}
-    ids = {*after.fitted.model.ids}
-    if idle := [one for one in added if one.acts_with and not ids.intersection(one.acts_with)]:
+    if idle := [one for one in added if not one.acts_in(after.fitted.model.ids)]:
         return {one.id: f"it acts only beside {' or '.join(one.acts_with)}" for one in idle}
     conditions = Context(problem).conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:

@@ -134,8 +134,9 @@ def sort_steps(problem: Problem, ladder: Ladder) -> Ladder:
     whole, known = ladder.steps[-1].fitted, {frozenset(step.effects): step for step in ladder.steps}
     waiting, taken, steps = list_order(ladder.steps), list[str](), [ladder.steps[0]]
     while waiting:
-        errors = [_predict_error(problem, ladder, [*taken, name]) for name in waiting[1:] and waiting]
-        least = min(errors, default=0.0)
+        is_open = len(waiting) > 1
+        errors = [_predict_error(problem, ladder, [*taken, name]) for name in waiting] if is_open else [0.0]
+        least = min(errors)
         taken.append(waiting.pop(next((i for i, one in enumerate(errors) if one <= least + CHANCE), 0)))
         steps.append(known.get(frozenset(taken)) or fit_step(problem, whole, taken, whole.per_run))
     return Ladder(tuple(steps))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import cast
@@ -335,9 +335,9 @@ class Selection:
         self.budget.report(self.part.title, model.ids)
         return self.enter(model.fit)
 
-    def list_acting(self, ids: Iterable[str]) -> list[Candidate]:
+    def list_acting(self, ids: Collection[str]) -> list[Candidate]:
         """Candidates that act in a model of these effects."""
-        return [one for one in self.candidates if not one().acts_with or {*one().acts_with} & {*ids}]
+        return [one for one in self.candidates if one().acts_in(ids)]
 
     def take_evidence(
         self, base: CandidateModel, without: Iterable[str] = (), noise: Noise | None = None

@@ -6,7 +6,7 @@ import enum
 import math
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from copy import copy
 from functools import cached_property
 from string import Formatter
@@ -175,6 +175,11 @@ class Effect(ABC):
     def is_neutral(self) -> bool:
         """Whether every parameter that has a neutral value is at it."""
         return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+
+    @classmethod
+    def acts_in(cls, ids: Collection[str]) -> bool:
+        """Whether it acts in a model of these effects, see `acts_with`."""
+        return not cls.acts_with or not set(cls.acts_with).isdisjoint(ids)
 
     @property
     def delay(self) -> float:
@@ -376,14 +381,12 @@ class Effect(ABC):
             parameter = self.parameter(name)
             low, high = parameter.bounds
             neutral = value == parameter.neutral or (math.isnan(value) and math.isnan(parameter.neutral))
+            hint = "Give a value inside the bounds."
             if not neutral and not math.isfinite(value):
                 what = f"{name} = {value:g} is not a finite number"
-                hint = "Give a value inside the bounds."
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
             if not neutral and not low <= value <= high:
-                unit = suffix_unit(parameter.unit)
-                what = f"{name} = {value:g}{unit} is outside of {low:g} to {high:g}"
-                hint = "Give a value inside the bounds."
+                what = f"{name} = {value:g}{suffix_unit(parameter.unit)} is outside of {low:g} to {high:g}"
                 raise MotionError("out_of_bounds", what, where=f"{self.id}.{name}", hint=hint)
         return {p.name: float(given.get(p.name, p.neutral)) for p in self.parameters}
 

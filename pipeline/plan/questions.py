@@ -361,8 +361,7 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
 def list_names(knowledge: Knowledge) -> tuple[str, ...]:
     """Every effect of the catalogue that exists on the vehicle, and acts in its model."""
     here = [effect for effect in list_effects() if knowledge.vehicle.kind in effect.kinds]
-    ids = {*knowledge.base.names}
-    return tuple(one.id for one in here if not one.acts_with or ids.intersection(one.acts_with))
+    return tuple(effect.id for effect in here if effect.acts_in(knowledge.base.names))
 
 
 # Open questions of a plan: what keeps a drive from answering them, found by driving without it.

@@ -397,8 +397,8 @@ class _Motors:
         self._reset, self._drag, self._bound, self._no_load, self._scrub, self._creep = (
             effects.value("wheel_servo", name) for name in names
         )
-        apart = effects.value("motor_imbalance", "e")
-        self._left_supply, self._right_supply = 1.0 - apart / 2.0, 1.0 + apart / 2.0
+        uneven = effects.value("motor_imbalance", "e")
+        self._left_supply, self._right_supply = 1.0 - uneven / 2.0, 1.0 + uneven / 2.0
 
     def step(self, on_left: float, on_right: float) -> None:
         """One step under the commanded speeds of the rims [m/s]."""

@@ -27,6 +27,8 @@ from pipeline.simulate import (
 if TYPE_CHECKING:
     from pathlib import Path
 
+    from pipeline.estimation import RunDiagnosis
+
 _GAINS = {
     "drive_gain": {"g": 0.9},
     "gain_drift": {"k": 0.2},
@@ -44,6 +46,13 @@ _DRIVES = {
 _GROUNDS = {"grade_load": Ground(hill_m=1.0, hill_length_m=25.0)}
 
 
+def _diagnose(log: Path) -> RunDiagnosis:
+    options = Options(out=log.with_name("out"), report=False, diagnosis=False)
+    vehicle, recording = read_recording(analyze_log(log, options).manifest)
+    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    return told
+
+
 @pytest.mark.parametrize("name", _DRIVES)
 def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
     """49 % of the asked difference at all rates was named a limit, and ramps a servo."""
@@ -56,9 +65,7 @@ def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path:
         disturbance=Disturbance(0.02, 0.02),
     )
     write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
-    vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
-    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    told = _diagnose(tmp_path / "run.mcap")
     assert [effect.id for effect in told.effects] == [name]
     found = {key: number.value for key, number in told.effects[0].parameters.items()}
     assert found == pytest.approx(_DRIVES[name], rel=0.03)
@@ -85,9 +92,7 @@ def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp
     hidden = {"acceleration_limit": 78.0, "steering_lag": 0.1, "steering_gain": 0.88}
     out = tmp_path / "run.mcap"
     log = simulate_case(None, hidden, out=out, seed=3, duration_s=120.0, platform="f1tenth")
-    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
-    vehicle, recording = read_recording(analyze_log(log, options).manifest)
-    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    told = _diagnose(log)
     found = {effect.id: next(iter(effect.parameters.values())).value for effect in told.effects}
     assert found == pytest.approx(hidden, rel=0.05)
 
@@ -114,9 +119,7 @@ def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(imbalance: float, t
         disturbance=Disturbance(0.03, 0.05),
     )
     write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    options = Options(out=tmp_path / "out", report=False, diagnosis=False)
-    vehicle, recording = read_recording(analyze_log(tmp_path / "run.mcap", options).manifest)
-    (told,) = diagnose_runs([recording], vehicle, inputs=("command",)).runs
+    told = _diagnose(tmp_path / "run.mcap")
     named = {effect.id: effect.parameters for effect in told.effects}
     assert named.keys() == {"wheel_servo", *(["motor_imbalance"] if imbalance else [])}
     for name in ("tau", "bound", "no_load", "scrub"):

@@ -43,7 +43,7 @@ class MotorImbalance(DriveEffect):
     acts_with = ("wheel_servo",)
     needs = (Excitation.BOTH_SIGNS, Excitation.LARGE)
     confused_with = ("side_gain", "wheel_asymmetry", "wheel_servo")
-    python = "apart = {e}"
+    python = "imbalance = {e}"
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers."""

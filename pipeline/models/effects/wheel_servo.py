@@ -175,7 +175,7 @@ class WheelServo(JointDrive):
     )
     python_state = (
         *("rolled_left", "rolled_right", "load_v", "load_w", "push_left", "push_right"),
-        *("more_left", "more_right", "more_v", "more_w", "apart"),
+        *("more_left", "more_right", "more_v", "more_w", "imbalance"),
     )
     python = """
         rate, aside, tau = 2.0 / step_s, B / 2.0, max({tau}, 0.01)
@@ -186,7 +186,7 @@ class WheelServo(JointDrive):
         near = (rolled_left + more_left, rolled_right + more_right)
         near_v, near_w = load_v + more_v, load_w + more_w
         most = [
-            [gain * max({bound} * (1.0 + side * apart) - way * slope * u, 0.0) for way in (1.0, -1.0)]
+            [gain * max({bound} * (1.0 + side * imbalance) - way * slope * u, 0.0) for way in (1.0, -1.0)]
             for u, side in zip(near, (-0.5, 0.5))
         ]
         grip = [
@@ -285,7 +285,7 @@ class WheelServo(JointDrive):
         states[:, :2, known] = np.where(np.isfinite(start), start, states[:, :2, known])
         states[:, 2, known] = np.isfinite(start).all(axis=0)
         states[:, 2, np.searchsorted(at, context.spans.first)] = 0.0
-        numbers = [effect.list_numbers(context, 0.5 * wheels.imbalance) for effect, wheels in pairs]
+        numbers = [effect.list_numbers(context, wheels.imbalance) for effect, wheels in pairs]
         source = [index_of[id(wheels)] for _, wheels in pairs]
         rolled = walk_each(numbers, source, asked, at, states, context.step_s)
         rolled /= radius
@@ -294,8 +294,8 @@ class WheelServo(JointDrive):
             for (_, wheels), (left, right) in zip(pairs, rolled, strict=True)
         ]
 
-    def list_numbers(self, context: RunContext, apart: float) -> Floats:
-        """The numbers of `walk_each`; the voltage of the right side is ``apart`` more than their mean."""
+    def list_numbers(self, context: RunContext, imbalance: float) -> Floats:
+        """The numbers of `walk_each`."""
         tau, scrub = max(self.values["tau"], _LEAST_TAU_S), self.values["scrub"]
         gain = 0.5 * (1.0 + ROTATING) / tau
         return np.array(
@@ -303,8 +303,8 @@ class WheelServo(JointDrive):
                 gain,
                 self.values["reset"] * gain,
                 self.values["drag"] * gain,
-                (1.0 - apart) * self.values["bound"] * gain,
-                (1.0 + apart) * self.values["bound"] * gain,
+                (1.0 - 0.5 * imbalance) * self.values["bound"] * gain,
+                (1.0 + 0.5 * imbalance) * self.values["bound"] * gain,
                 (self.values["creep"] * tau) ** 2,
                 (_REST * tau) ** 2 if scrub > 0.0 else math.inf,
                 (tau / max(scrub, _TINY)) ** 2,
