@@ -52,8 +52,6 @@ program may share the folder, and recompiles what is missing."""
 
 LANES = 16
 """Most walks through a signal in one loop: the numbers of twice as many do not fit the fastest memory."""
-_PACK = 4
-"""Walks for which a step takes as long as for one: AVX2 computes with four numbers at a time."""
 
 _loops: list[Loop[Any]] = []
 
@@ -174,9 +172,10 @@ def deal_lanes(count: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
         The first walk of a loop; the walk of every lane, the last one repeated in a pack that is not full;
         how many of the lanes are wanted.
     """
+    pack = _find_pack()
     for first in range(0, count, LANES):
         wanted = min(count - first, LANES)
-        lanes = -(-wanted // _PACK) * _PACK if wanted > 1 else 1
+        lanes = -(-wanted // pack) * pack if wanted > 1 else 1
         yield first, first + np.minimum(np.arange(lanes), wanted - 1), wanted
 
 
@@ -197,6 +196,12 @@ def list_caches() -> set[str | None]:
 def _load_compiler() -> ModuleType:
     """LLVM without Numba, to link and to write object files."""
     return import_module("llvmlite.binding")
+
+
+@functools.cache
+def _find_pack() -> int:
+    """Walks that the processor computes at a time: a loop of another count does the rest one by one."""
+    return 8 if _load_compiler().get_host_cpu_features().get("avx512f") else 4
 
 
 @functools.cache

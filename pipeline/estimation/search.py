@@ -26,9 +26,9 @@ _CLEAR = 2.5
 """Evidence and gain of an effect over those required, by a rough fit without it, above which it is kept: for
 421 effects on recordings and drawn logs, complete fits leave 0.41 of that evidence at least."""
 _WHOLE = 0.9
-"""Largest loss with an effect and its companions, over that with its special cases in its place, for a search
-to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to 0.88, on 56 of 60 drawn logs
-without a controller above 0.98."""
+"""Largest loss with an effect and its companions, over that with its special cases in its place or with one
+of them alone, for a search to begin with them: for the drive of nine recordings of a Warthog it is 0.19 to
+0.88, on 56 of 60 drawn logs without a controller above 0.98."""
 _RIVALS = 0.5
 """Minimum predicted gain of an effect's rivals, as a share of its own predicted gain."""
 
@@ -381,7 +381,9 @@ def _begin_whole(selection: Selection, first: CandidateModel) -> tuple[Candidate
         loaded = first.state.add(*(usual[name] for name in one.companions if name in usual))
         cases = [usual[name] for name in one.contains if name in usual]
         starts = [loaded.add(one.change(**values)) for values in one.list_starts(selection.largest)]
-        tried, simpler = selection.enter_each([starts[0], loaded.add(*cases)])
+        alone = (first.state.add(case) for case in cases)
+        tried, *others = selection.enter_each([starts[0], loaded.add(*cases), *alone])
+        simpler = min(others, key=selection.loss)
         if selection.budget.is_spent() or selection.loss(tried) > _WHOLE * selection.loss(simpler):
             continue
         is_clear = selection.loss(tried) < _WHOLE**2 * selection.loss(simpler)
