@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.problem import Transfer
     from pipeline.job.stored_fits import ModelFit
+    from pipeline.models import Model
     from pipeline.models.model_file import ModelFile
     from pipeline.run import MotionRun
 
@@ -115,7 +116,7 @@ def new(
         read_code(model.parent, name)
     write_model(ModelFile(made, effect_files=files), model)
     if not quiet:
-        print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}"])
+        print_lines([f"{model}: {chosen.name}, {_list_effects(made.ids)}", *_list_idle(made)])
     return CLEAN
 
 
@@ -137,6 +138,7 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         return CLEAN
     parameters = format_parameters(list_parameters(file))
     lines = [f"{file.model.vehicle.name}: {_list_effects(file.model.ids)}", *parameters]
+    lines += _list_idle(file.model)
     term = find_learned(file.model)
     lines += [] if term is None else describe_learned(term)
     if runs := file.list_fitted("runs"):
@@ -459,6 +461,13 @@ def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
 
 def _list_effects(ids: Sequence[str]) -> str:
     return ", ".join(ids) if ids else "the ideal model, no effect"
+
+
+def _list_idle(model: Model) -> list[str]:
+    """Effects that do not act, since the model lacks what they act beside."""
+    from pipeline.models.catalogue import explain_idle  # noqa: PLC0415 - heavy
+
+    return [f"  ! {effect.id} {why}" for effect in model if (why := explain_idle(effect, model.ids))]
 
 
 def _warn(warnings: Sequence[str]) -> None:

@@ -23,6 +23,7 @@ from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
+from pipeline.models.catalogue import explain_idle
 from pipeline.models.learned_term import LEARNED
 from pipeline.run import MotionError
 
@@ -177,8 +178,9 @@ def explain_refusals(
         stretches = np.concatenate(number_predictions(problem))
         said = explain_no_help(before.held_out, after.held_out, stretches)
         return {LEARNED: said} if said else {}
-    if idle := [one for one in added if not one.acts_in(after.fitted.model.ids)]:
-        return {one.id: f"it acts only beside {' or '.join(one.acts_with)}" for one in idle}
+    idle = {one.id: explain_idle(one, after.effects) for one in added}
+    if any(idle.values()):
+        return {name: f"it {text}" for name, text in idle.items() if text}
     conditions = Context(problem).conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone

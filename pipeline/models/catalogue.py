@@ -10,7 +10,7 @@ import re
 import stat
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path, PurePosixPath
 from types import ModuleType
@@ -277,6 +277,11 @@ def _effects_of(module: ModuleType) -> list[EffectClass]:
         and not inspect.isabstract(value)
         and value.__module__ == module.__name__
     ]
+
+
+def explain_idle(effect: Effect | EffectClass, ids: Collection[str]) -> str:
+    """Why it does not act in a model of these effects: `acts only beside wheel_servo`; empty if it acts."""
+    return "" if effect.acts_in(ids) else f"acts only beside {' or '.join(effect.acts_with)}"
 
 
 def format_effect(effect: type[Effect] | Effect) -> str:

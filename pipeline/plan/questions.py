@@ -19,7 +19,7 @@ from pipeline.core.arrays import STRETCH_S, Floats, Ints
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.error_regions import find_goal
 from pipeline.models import Excitation, find_effect, list_effects
-from pipeline.models.catalogue import suggest_manoeuvre
+from pipeline.models.catalogue import explain_idle, suggest_manoeuvre
 from pipeline.models.parameter import Largest
 from pipeline.plan import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser, PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
@@ -340,7 +340,8 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
     """Whether effects act that the logs could not show: each at its usual size, against its absence.
 
     Raises:
-        PlanError: ``wrong_vehicle``, one does not exist on this kind of vehicle.
+        PlanError: ``wrong_vehicle``, one does not exist on this kind of vehicle; ``acts_beside``, one acts
+            only beside an effect that the model lacks.
         MotionError: ``unknown_effect``.
     """
     questions = []
@@ -351,6 +352,10 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
             raise PlanError("wrong_vehicle", what, where=knowledge.vehicle.id, hint="Choose another effect.")
         if name in knowledge.base.names:
             continue
+        if why := explain_idle(effect, knowledge.base.names):
+            what = f"{name} {why}, which the model of the logs does not contain"
+            hint = "Choose another effect, or record logs that identify that one first."
+            raise PlanError("acts_beside", what, where=knowledge.vehicle.id, hint=hint)
         with_it = knowledge.base.extend(effect().make_usual(largest))
         questions.append(
             Separation(f"whether {name} acts", (name,), (with_it, knowledge.base), both_ways=False)

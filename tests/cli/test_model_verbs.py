@@ -164,3 +164,8 @@ def test_an_effect_that_acts_beside_another_one_alone_says_which(
     assert "motor_imbalance is not supported by the data (it acts only beside wheel_servo)" in said
     slip("effects", "motor_imbalance")
     assert "acts beside   wheel_servo, which a model must contain" in capsys.readouterr().out
+    new = model.with_name("idle.toml")
+    slip("model", "new", new, "--vehicle", "husky_a200", "--effects", "motor_imbalance")
+    assert "  ! motor_imbalance acts only beside wheel_servo" in capsys.readouterr().out
+    slip("model", "show", new)
+    assert "  ! motor_imbalance acts only beside wheel_servo" in capsys.readouterr().out

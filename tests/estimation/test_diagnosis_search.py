@@ -14,6 +14,7 @@ from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
 from pipeline.estimation.selection import USEFUL, CandidateModel, Selection, open_selection, prepare
+from pipeline.estimation.state import State
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -33,7 +34,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.state import State
     from pipeline.models import Effect
     from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
@@ -396,6 +396,14 @@ def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path
     (found,) = begun.state.effects
     assert found.values["reset"] == pytest.approx(0.3, rel=0.15)
     assert found.values["scrub"] == pytest.approx(1.2, rel=0.15)
+
+
+def test_an_effect_that_acts_beside_another_one_alone_leaves_a_model_with_it() -> None:
+    state = State((), ()).add(
+        _give("drive_lag", 0.4), _give("wheel_servo", 0.1), _give("motor_imbalance", 0.1)
+    )
+    assert state.drop(["drive_lag"]).ids == ("motor_imbalance", "wheel_servo")
+    assert state.drop(["wheel_servo"]).ids == ("drive_lag",)
 
 
 def test_a_model_without_an_effect_is_fitted_anew_under_other_weights(tmp_path: Path) -> None:

@@ -312,6 +312,13 @@ def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     assert "slope" in plan.impossible[0].because
 
 
+def test_an_effect_that_cannot_act_in_the_model_is_refused() -> None:
+    vehicle = _find("husky_a200")
+    knowledge, limits = assume(vehicle), choose_limits(vehicle)
+    with pytest.raises(PlanError, match="motor_imbalance acts only beside wheel_servo, which the model"):
+        ask_presence(knowledge, ["motor_imbalance"], find_largest(knowledge, limits, 60.0))
+
+
 def _ask_for(effect: str, seconds: float, area: str, speed_mps: float = 1.0) -> Plan:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle, speed_mps=speed_mps)
