@@ -153,7 +153,7 @@ bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time a
 bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
 
-bench-constants: $(VENV)/.ready-dev ## effect of half and double of each constant of a file [FILE=pipeline/stages/align.py, ARGS="--diagnosis"]
+bench-constants: $(VENV)/.ready-dev ## effect of half and double of each constant of a file, or of a sample of all [FILE=pipeline/stages/align.py, ARGS="--sample 40 --diagnosis"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/constants.py $$FILE $$ARGS
 
 bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]

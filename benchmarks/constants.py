@@ -1,11 +1,13 @@
 """What half and double of the numbers at the head of a file change: findings and medians of logs.
 
-    python benchmarks/constants.py FILE... [--names NAME ...] [--log LOG ...] [--factors 0.5 2] [--diagnosis]
+    python benchmarks/constants.py [FILE...] [--names NAME ...] [--sample N --seed S] [--log LOG ...]
+                                   [--factors 0.5 2] [--diagnosis]
 
-Each number of each file is set to its value times each factor, alone, and the logs are analyzed again in this
-process. Prints one line a number and factor: `same`, or what differs, and last how many numbers change an
-answer. A number that is used only while modules are imported, or by compiled loops, keeps its value there: it
-is `same` whatever it is.
+Each number of each file, without files of all rooms that decide answers or of a random sample, is set to its
+value times each factor, alone, and the logs are analyzed again in this process. Prints one line a number and
+factor: `same`, or what differs, and last how many numbers change what is said (a named effect or a finding)
+and how many a median. A number that is used only while modules are imported, or by compiled loops, keeps its
+value there: it is `same` whatever it is.
 """
 
 from __future__ import annotations
@@ -15,12 +17,13 @@ import importlib
 import json
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+import numpy as np
 import polars as pl
-from house import list_constants, read_sources
+from house import EXPLAINED, list_constants, read_sources
 
 from pipeline.core import SlipError
 from pipeline.job import Options
@@ -51,9 +54,9 @@ def judge(logs: list[Path], *, diagnosis: bool) -> dict[str, float | str]:
     return answers
 
 
-def compare(before: Mapping[str, float | str], after: Mapping[str, float | str]) -> str:
-    """What differs, in words; `same` where nothing does."""
-    differences = []
+def compare(before: Mapping[str, float | str], after: Mapping[str, float | str]) -> list[str]:
+    """What differs, in words: what is said begins with + or -, a median with its log."""
+    differences: list[str] = []
     for key in sorted(before.keys() | after.keys()):
         old, new = before.get(key, "no"), after.get(key, "no")
         if isinstance(old, float) and isinstance(new, float):
@@ -61,7 +64,7 @@ def compare(before: Mapping[str, float | str], after: Mapping[str, float | str])
                 differences.append(f"{key} {old:.4g} -> {new:.4g}")
         elif old != new:
             differences.append(f"{'+' if old == 'no' else '-'} {key}")
-    return "; ".join(differences) or "same"
+    return differences
 
 
 @contextmanager
@@ -82,31 +85,49 @@ def replace_number(module: str, name: str, factor: float) -> Iterator[None]:
             setattr(holder, name, value)
 
 
+def choose_numbers(files: Sequence[Path], names: Sequence[str]) -> list[tuple[str, str, float]]:
+    """Module, name and value of the numbers of some files, without files of all rooms that decide answers."""
+    wanted = {file.resolve().relative_to(ROOT) for file in files}
+    chosen = []
+    for source in read_sources(ROOT):
+        if source.path in wanted if wanted else source.path.parts[1] in EXPLAINED:
+            for constant in list_constants(source):
+                value = getattr(importlib.import_module(source.module), constant.name)
+                if isinstance(value, int | float) and (not names or constant.name in names):
+                    chosen.append((source.module, constant.name, value))
+    return chosen
+
+
 def main() -> None:
     """Print what each number does."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("files", nargs="+", type=Path)
+    parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--names", nargs="*", default=[])
+    parser.add_argument("--sample", type=int, help="how many of these numbers, at random")
+    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--log", dest="logs", nargs="*", type=Path, default=list(LOGS))
     parser.add_argument("--factors", nargs="*", type=float, default=[0.5, 2.0])
     parser.add_argument("--diagnosis", action="store_true")
     asked = parser.parse_args()
-    wanted = {file.resolve().relative_to(ROOT) for file in asked.files}
+    numbers = every = choose_numbers(asked.files, asked.names)
+    if asked.sample is not None:
+        chance = np.random.default_rng(asked.seed)
+        numbers = [every[index] for index in chance.permutation(len(every))[: asked.sample]]
     before = judge(asked.logs, diagnosis=asked.diagnosis)
-    tried, deciding = 0, 0
-    for source in read_sources(ROOT):
-        for constant in list_constants(source) if source.path in wanted else []:
-            value = getattr(importlib.import_module(source.module), constant.name)
-            if not isinstance(value, int | float) or (asked.names and constant.name not in asked.names):
-                continue
-            changes = set[str]()
-            for factor in asked.factors:
-                with replace_number(source.module, constant.name, factor):
-                    words = compare(before, judge(asked.logs, diagnosis=asked.diagnosis))
-                changes.add(words)
-                print(f"{source.path.stem}.{constant.name} = {value:g} x {factor:g}: {words}", flush=True)
-            tried, deciding = tried + 1, deciding + (changes != {"same"})
-    print(f"{deciding} of {tried} numbers change an answer")
+    speaking, moving = 0, 0
+    for module, name, value in numbers:
+        changes = list[str]()
+        for factor in asked.factors:
+            with replace_number(module, name, factor):
+                differences = compare(before, judge(asked.logs, diagnosis=asked.diagnosis))
+            words = "; ".join(differences) or "same"
+            print(f"{module.removeprefix('pipeline.')}.{name} = {value:g} x {factor:g}: {words}", flush=True)
+            changes += differences
+        speaking += any(one[0] in "+-" for one in changes)
+        moving += any(one[0] not in "+-" for one in changes)
+    print(
+        f"{speaking} of {len(numbers)} numbers, {len(every)} in all, change what is said, {moving} a median"
+    )
 
 
 if __name__ == "__main__":
