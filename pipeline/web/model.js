@@ -1,5 +1,5 @@
 // The model of a session: its effects as cards, and what to add next, one row an effect.
-import { h, say, sayAngle, sayLength, sayShare } from "./parts.js";
+import { h, say, sayAngle, sayLength, sayShare, setSquares } from "./parts.js";
 import { buildPlan } from "./plan.js";
 
 const REST_MS = 350;
@@ -52,7 +52,7 @@ const buildCard = (pane, effect) => {
 const buildSlider = (pane, effect, parameter) => {
   const { name, unit, value, low, high, at_bound: atBound } = parameter;
   const label = `${effect.id}.${name}`;
-  const words = (number) => `${say(number, 4)} ${unit === "1" ? "" : unit}`.trim();
+  const words = (number) => setSquares(`${say(number, 4)} ${unit === "1" ? "" : unit}`.trim());
   const shown = h("output", {}, words(value));
   const input = h("input", {
     type: "range", min: String(parameter.from), max: String(parameter.to), step: String(parameter.step),

@@ -1,5 +1,8 @@
 // Small pieces: elements without markup in strings, requests, numbers in words.
 
+// Units with squares as pages set them: m/s² for m/s^2.
+export const setSquares = (text) => text.replace(/\b(m|rad|s)\^2/g, "$1²");
+
 // Text goes in as text nodes only: what a log holds can never become markup.
 export const h = (tag, props = {}, ...children) => {
   const node = document.createElement(tag);
@@ -10,7 +13,8 @@ export const h = (tag, props = {}, ...children) => {
     else if (key in node && typeof value !== "string") node[key] = value;
     else if (value !== null && value !== undefined) node.setAttribute(key, value);
   }
-  node.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
+  const shown = children.flat().filter((child) => child !== null && child !== undefined && child !== false);
+  node.append(...shown.map((child) => (typeof child === "string" ? setSquares(child) : child)));
   return node;
 };
 
