@@ -29,8 +29,12 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
         pytest.skip("there is no mount command")
     if mounted.returncode:
         pytest.skip("mounting a small disk is not allowed here")
-    yield place
-    subprocess.run(["umount", "-l", str(place)], check=True)
+    # A process of its own unmounts it at the end of its input: also where the tests are killed.
+    wait = ["sh", "-c", 'cat; exec umount -l "$1"', "sh", str(place)]
+    with subprocess.Popen(wait, stdin=subprocess.PIPE, start_new_session=True) as keeper:
+        yield place
+        keeper.communicate()
+    assert keeper.returncode == 0
 
 
 def test_a_full_disk_stops_the_batch_and_more_room_lets_it_go_on(
