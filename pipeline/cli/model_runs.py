@@ -233,7 +233,7 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     problem = Problem(runs, vehicle, Input.MEASURED)
-    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run).ordered)
+    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))
 
 
 _SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -11,15 +12,19 @@ import numpy as np
 
 from pipeline.core import format_share, suffix_unit
 from pipeline.core.arrays import Floats, robust_spreads
-from pipeline.estimation.ladder import Judgement
+from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, judge_whole
 from pipeline.estimation.parts import CLIP, count_seconds
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
+from pipeline.run import MotionError
 
 if TYPE_CHECKING:
+    from pipeline.estimation.comparison import Input
     from pipeline.estimation.evidence import Noise
     from pipeline.estimation.parts import Part
+    from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import Weights
+    from pipeline.models import Model
 
 _AT_BOUND = 1e-3
 """Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
@@ -367,6 +372,47 @@ def measure_moves(judgement: Judgement, effect: Effect) -> Moves | None:
         float(np.sqrt(np.mean(np.concatenate(column) ** 2))) for column in zip(*shifts, strict=True)
     )
     return Moves(distance, turn, distance / length if length > 0.0 else 0.0)
+
+
+def find_idle(
+    model: Model,
+    problems: Mapping[Input, Problem],
+    duties: Mapping[str, Collection[Input]],
+    drive: Collection[str],
+) -> list[str]:
+    """Effects that raise the 2 s errors, and those of the drivetrain that reduce no error.
+
+    They are taken out one by one, the one that raises the errors most first: without it others may be needed.
+
+    Args:
+        model: with all effects.
+        problems: the runs by input; those of which nothing can be predicted are left out.
+        duties: inputs from which an effect must serve predictions, by id; others stay.
+        drive: ids of the effects of the drivetrain.
+    """
+    idle, doubtful = list[str](), list(duties)
+    while True:
+        rest, raised = model.keep(name for name in model.ids if name not in idle), dict[str, float]()
+        for source, problem in problems.items():
+            with suppress(MotionError):
+                whole = judge_whole(problem, rest)
+                for name in doubtful:
+                    if source in duties[name] and name in whole.effects:
+                        without = whole.drop(name)
+                        if _is_idle(whole, without, is_of_drive=name in drive):
+                            raised[name] = math.prod(whole.errors.ratios(without.errors)[3:])
+        if not raised:
+            return idle
+        doubtful = sorted(raised, key=raised.__getitem__)
+        idle.append(doubtful.pop())
+
+
+def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
+    """Whether the geometric mean 2 s error rises, or a drivetrain effect lowers no error by `LEAST_GAIN`."""
+    reached = step.errors.ratios(below.errors)[3:]
+    if math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
+        return True
+    return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - LEAST_GAIN
 
 
 def project_out(own: Floats, column: Floats) -> Floats:

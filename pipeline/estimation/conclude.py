@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import replace
-from itertools import pairwise
 from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
 
@@ -14,7 +13,7 @@ import numpy as np
 from pipeline.core import format_share
 from pipeline.core.arrays import Floats
 from pipeline.estimation import unexplained as residual_structure
-from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, grow_evidence, measure_moves
+from pipeline.estimation.acceptance import HALVES, LEAST_GAIN, find_idle, grow_evidence, measure_moves
 from pipeline.estimation.ambiguity import (
     Clocks,
     Undecided,
@@ -54,8 +53,6 @@ from pipeline.estimation.estimates import (
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import (
     Judgement,
-    LadderStep,
-    compare_losses,
     judge_model,
     ladder_as_json,
     list_order,
@@ -75,6 +72,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Mapping, Sequence
 
     from pipeline.estimation import Explored, Recording
+    from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import State
 
 _DRAWS = 400  # resamples of ten-second blocks: a probability near 0.95 has a standard error of 0.01
@@ -105,12 +103,10 @@ def summarize(
     known = frozenset().union(*(path.search.selection.given for path in paths))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.path))))
+    idle = _list_idle([*taken, *terms], context, inputs, paths, open_ids)
+    taken, terms = ([effect for effect in some if effect.id not in idle] for some in (taken, terms))
+    undecided = [item for item in undecided if item.candidates[0] not in idle]
     judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
-    idle = [e for e in _find_idle([*taken, *terms], paths, judgements, source) if e.id not in known]
-    if idle:
-        taken, terms = ([effect for effect in some if effect not in idle] for some in (taken, terms))
-        undecided = [item for item in undecided if item.candidates[0] not in {e.id for e in idle}]
-        judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
     doubts: list[Mapping[str, Json]] = []
     immaterial: list[Named] = []
@@ -128,7 +124,6 @@ def summarize(
         # The values of the other effects change without these.
         taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
         judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
-    judgements = {name: one.ordered for name, one in judgements.items()}
     judgement = judgements.get(source.value)
     unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
@@ -163,7 +158,7 @@ def summarize(
             *note_cut(body.search.selection.budget),
             *note_grounds(context),
             *doubts,
-            *(note_idle(effect) for effect in idle if not is_term(effect.id)),
+            *(note_idle(name) for name in idle if not is_term(name)),
         ),
         ladder=() if judgement is None else tuple(_list_steps(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
@@ -277,6 +272,27 @@ def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list
     return sorted(joined, key=lambda effect: (effect.place, effect.rank, effect.id))
 
 
+def _list_idle(
+    effects: Sequence[Effect],
+    context: Context,
+    inputs: Sequence[Input],
+    paths: Sequence[Explored],
+    open_ids: set[str],
+) -> list[str]:
+    """Effects that do not serve predictions, see `find_idle`; the last input is that of the ground."""
+    known = frozenset().union(*(path.search.selection.given for path in paths))
+    own = {effect.id: _path_of(effect, paths) for effect in effects if effect.id not in known}
+    # A formula is no cause: it must serve predictions from every input. An encoder error affects both the
+    # ground and the drivetrain; from commands the two cancel.
+    duties = {
+        name: inputs if is_term(name) else inputs[-1:] if path is paths[0] else inputs[:1]
+        for name, path in own.items()
+    }
+    problems = {one: _find_problem(context, one) for one in inputs}
+    drive = {name for name, path in own.items() if path is not paths[0]}
+    return find_idle(_join(context, effects, open_ids), problems, duties, drive)
+
+
 def _judge_ways(
     context: Context,
     inputs: Sequence[Input],
@@ -284,7 +300,19 @@ def _judge_ways(
     open_ids: set[str],
     wider: Mapping[str, Judgement] = MappingProxyType({}),
 ) -> dict[str, Judgement]:
-    """The model of these effects judged from each input to the body; ``wider`` is that of a larger model.
+    """The model of these effects judged from each input to the body; ``wider`` is that of a larger model."""
+    model = _join(context, effects, open_ids)
+    # In sequence, so that the ground part of the model is fitted once for both.
+    judged = {source.value: _judge_path(context, model, wider, source) for source in inputs}
+    return {name: one for name, one in judged.items() if one is not None}
+
+
+def _find_problem(context: Context, source: Input) -> Problem:
+    return context.problem if source is context.problem.source else context.problem.behind_wheels
+
+
+def _join(context: Context, effects: Sequence[Effect], open_ids: set[str]) -> Model:
+    """The model of some effects.
 
     An undecided effect on which the values of others depend is left out: their values are stated without it.
     """
@@ -293,19 +321,15 @@ def _judge_ways(
         for effect in effects
         if not (effect.id in open_ids and any(other.depends_on(effect) for other in effects))
     ]
-    model = Model(context.vehicle, tuple(acting))
-    # In sequence, so that the ground part of the model is fitted once for both.
-    judged = {source.value: _judge_path(context, model, wider, source) for source in inputs}
-    return {name: one for name, one in judged.items() if one is not None}
+    return Model(context.vehicle, tuple(acting))
 
 
 def _judge_path(
     context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
 ) -> Judgement | None:
     """The model judged from one input to the body; None where that is not possible."""
-    problem = context.problem if source is context.problem.source else context.problem.behind_wheels
     with contextlib.suppress(MotionError):
-        return judge_model(problem, model, wider=wider.get(source.value))
+        return judge_model(_find_problem(context, source), model, wider=wider.get(source.value))
     return None
 
 
@@ -367,41 +391,11 @@ def _list_trading(effect: Effect, context: Context, judgement: Judgement | None)
     return sorted(set().union(*pairs) - {effect.id})
 
 
-def _find_idle(
-    effects: Sequence[Effect], paths: Sequence[Explored], judgements: Mapping[str, Judgement], source: Input
-) -> list[Effect]:
-    """Effects that raise the 2 s error on their own path, and drivetrain effects that reduce no error."""
-    idle = []
-    for effect in effects:
-        path = _path_of(effect, paths)
-        # An encoder error affects both the ground and the drivetrain; from commands the two cancel.
-        own = judgements.get(path.search.path) or judgements.get(source.value)
-        # A formula is no cause: it must serve predictions from every input.
-        for judgement in judgements.values() if is_term(effect.id) else filter(None, [own]):
-            steps = [*pairwise(judgement.ladder.steps)]
-            came = [pair for pair in steps if effect.id in {*pair[1].effects} - {*pair[0].effects}]
-            # Some effects help only together, or beside effects added in a later step.
-            if any(_is_idle(step, below, is_of_drive=True) for below, step in came) and _is_idle(
-                judgement.whole, judgement.drop(effect.id), is_of_drive=path is not paths[0]
-            ):
-                idle.append(effect)
-                break
-    return idle
-
-
-def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
-    """Whether the geometric mean 2 s error rises, or a drivetrain effect lowers no error by `LEAST_GAIN`."""
-    reached = step.errors.ratios(below.errors)[3:]
-    if math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
-        return True
-    return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - LEAST_GAIN
-
-
 def _is_needed(doubt: Mapping[str, Json], judgement: Judgement | None) -> bool:
     """Whether an effect is doubted for its interval only, and a 2 s error doubles without it."""
     if judgement is None or doubt["id"] != "insignificant_effect":
         return False
-    without = judgement.drop(str(doubt["where"])).errors
+    without = judgement.whole.drop(str(doubt["where"])).errors
     return min(judgement.whole.errors.ratios(without)[3:]) <= HALVES
 
 

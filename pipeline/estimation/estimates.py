@@ -326,10 +326,10 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
     return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
-def note_idle(effect: Effect) -> Mapping[str, Json]:
+def note_idle(name: str) -> Mapping[str, Json]:
     """A finding about an effect that does not improve the prediction."""
-    text = f"{effect.id} reduces the error over half a second, but not the error over two seconds"
-    return {"id": "idle_effect", "text": text, "where": effect.id, "severity": "info"}
+    text = f"{name} reduces the error over half a second, but not the error over two seconds"
+    return {"id": "idle_effect", "text": text, "where": name, "severity": "info"}
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:

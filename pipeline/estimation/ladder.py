@@ -15,7 +15,7 @@ from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.parts import RIDGE, average_windows, locate_windows
+from pipeline.estimation.parts import average_windows, locate_windows
 from pipeline.estimation.problem import Problem
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
@@ -34,8 +34,6 @@ _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
 _LEAST_SQUARE = 1e-24
 """Square below which residuals are rounding [m^2/s^2, rad^2/s^2]: its logarithm stays finite."""
-_ALIKE_DIGITS = 4
-"""Digits to which the logarithms of two effects' predicted losses are compared."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +52,11 @@ class LadderStep:
     def errors(self) -> Errors:
         """Held-out errors over all runs."""
         return self.held_out.pooled
+
+    def drop(self, name: str) -> LadderStep:
+        """The model without one effect, refitted."""
+        rest = [one for one in self.effects if one != name]
+        return fit_step(self.fitted.problem, self.fitted, rest)
 
 
 @dataclass(frozen=True)
@@ -95,64 +98,48 @@ def find_share_removed(error: float, ideal: float, floor: float) -> float | None
 def climb(
     problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[LadderStep] = ()
 ) -> Ladder:
-    """Build the ladder of a model's effects, that with the largest gain of likelihood first.
+    """Build the ladder of a model's effects, that effect next which most lowers the errors over 2 s.
 
-    All effects are fitted together. At each step the effect with the largest predicted gain is added, and
-    all parameters are refitted; the last step is the model itself. An effect that raises an error is also a
-    step: `list_rises` reports it.
+    All effects are fitted together. Errors with one more are predicted with the values of that fit; of
+    effects that lower them alike, the earlier one of the model comes first. At each step all parameters are
+    refitted; the last step is the model itself. An effect that raises an error is also a step: `list_rises`
+    reports it.
 
     Args:
         problem: the runs.
         model: model with the effects, whose values are the starts.
         per_run: as in `fit_model`.
-        known_steps: steps of a larger model, reused for the same effects, except for the last step; effects
-            are added in their order.
+        known_steps: steps of a larger model, reused for the same effects, except for the last step.
     """
-    active = model.keep(effect.id for effect in problem.active_effects(model))
-    whole = fit_model(problem, active, per_run=per_run, exact=True)
+    # The last step is the model that is written: unlike the steps before, it is fitted exactly.
+    whole = judge_whole(problem, model, per_run)
     known = {frozenset(step.effects): step for step in known_steps}
-    rungs: list[LadderStep] = []
-    waiting, taken = [name for name in list_order(known_steps) if name in whole.model], list[str]()
-    waiting += [name for name in whole.model.ids if name not in waiting]
-    while True:
-        # The last step is the model that is written: unlike the steps before, it is fitted exactly.
-        step = (known.get(frozenset(taken)) if waiting else None) or fit_step(problem, whole, taken, per_run)
-        rungs.append(step)
-        if not waiting:
-            return Ladder(tuple(rungs))
-        is_open = not known_steps and len(waiting) > 1
-        losses = _predict_losses(step.fitted, whole, waiting) if is_open else [(0.0, 0.0)]
-        taken.append(waiting.pop(losses.index(min(losses))))
-
-
-def sort_steps(problem: Problem, ladder: Ladder) -> Ladder:
-    """The ladder with that effect next which most lowers the sum of both errors over 2 s.
-
-    Errors count relative to those of the ideal model. They are predicted with the values of the whole model;
-    of effects that lower them alike, the earlier one of the given ladder comes first.
-    """
-    whole, known = ladder.steps[-1].fitted, {frozenset(step.effects): step for step in ladder.steps}
-    waiting, taken, steps = list_order(ladder.steps), list[str](), [ladder.steps[0]]
+    steps, taken, waiting = list[LadderStep](), list[str](), list(whole.effects)
     while waiting:
-        is_open = len(waiting) > 1
-        errors = [_predict_error(problem, ladder, [*taken, name]) for name in waiting] if is_open else [0.0]
+        step = known.get(frozenset(taken)) or fit_step(problem, whole.fitted, taken, per_run)
+        steps.append(step)
+        errors = [_predict_error(problem, whole.fitted, [*taken, name], steps[0].errors) for name in waiting]
         least = min(errors)
         taken.append(waiting.pop(next((i for i, one in enumerate(errors) if one <= least + CHANCE), 0)))
-        steps.append(known.get(frozenset(taken)) or fit_step(problem, whole, taken, whole.per_run))
-    return Ladder(tuple(steps))
+    return Ladder((*steps, whole))
 
 
-def _predict_error(problem: Problem, ladder: Ladder, names: Sequence[str]) -> float:
-    """Sum of both errors over 2 s with some effects of the whole model, relative to the ideal model's."""
-    whole, ideal = ladder.steps[-1].fitted.state, ladder.steps[0].errors
-    state = whole.drop(set(whole.ids) - set(names))
+def judge_whole(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> LadderStep:
+    """The exact fit of a model's effects that act on the input, with its held-out errors."""
+    active = model.keep(effect.id for effect in problem.active_effects(model))
+    fitted = fit_model(problem, active, per_run=per_run, exact=True)
+    return LadderStep(fitted, hold_out(problem, fitted))
+
+
+def _predict_error(problem: Problem, whole: Fitted, names: Sequence[str], ideal: Errors) -> float:
+    """Sum of both errors over 2 s with some effects of a fit, relative to those of the ideal model."""
+    state = whole.state.drop(set(whole.model.ids) - set(names))
     horizons = [
         comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
         for run, comparison in enumerate(problem.comparisons)
     ]
     position, yaw = (np.concatenate([getattr(one, name) for one in horizons]) for name in ("position", "yaw"))
-    t, r = measure_errors(np.empty((0, 3)), position, yaw).ratios(ideal)[3:]
-    return t + r
+    return sum(measure_errors(np.empty((0, 3)), position, yaw).ratios(ideal)[3:])
 
 
 def list_order(steps: Sequence[LadderStep]) -> list[str]:
@@ -164,48 +151,12 @@ def fit_step(
     problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
 ) -> LadderStep:
     """The model with some of its effects, fitted from their values in the whole model."""
-    fitted = whole
-    if not names:
+    if names:
+        fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
+    else:
         # It has only delays: they are estimated as elsewhere, not from those of the whole model.
         fitted = fit_model(problem, whole.model.ideal, exact=True)
-    elif len(names) < len(whole.model.ids):
-        rest = whole.model.keep(names)
-        fitted = fit_model(problem, rest, per_run=per_run, start=whole)
     return LadderStep(fitted, hold_out(problem, fitted))
-
-
-def _predict_losses(fitted: Fitted, whole: Fitted, names: Sequence[str]) -> list[tuple[float, float]]:
-    """Logarithm of the loss of a fit with each effect added, to first order.
-
-    Some effects act alike until others are added: their predicted losses differ by rounding alone. As a tie
-    break, the second value is the loss with the effect's values from the whole model.
-
-    Args:
-        fitted: the fit.
-        whole: fit of all effects, with the values with which each is added.
-        names: ids of the effects.
-    """
-    problem, residuals = fitted.problem, fitted.residuals
-    own = problem.whole.differentiate(fitted.state, residuals, fitted.free)
-    added = []
-    for name in names:
-        with_it = fitted.state.add(whole.model.effect(name))
-        if whole.state.has_own(name):
-            with_it = replace(with_it, own=whole.state.own)
-        added.append(residuals - problem.find_residuals(with_it))
-    columns = np.concatenate((own, np.array(added).transpose(1, 2, 0)), axis=2)
-    weighed = columns / np.sqrt(_mean_squares(residuals))[:, None]
-    size = np.sqrt((weighed**2).sum(axis=(0, 1))) + 1e-300
-    rows = (weighed / size).reshape(-1, size.size)
-    normal = rows.T @ rows + RIDGE * np.eye(size.size)
-    pull = rows.T @ (residuals / np.sqrt(_mean_squares(residuals))).reshape(-1)
-    count, losses = own.shape[2], []
-    for index in range(len(names)):
-        taken = [*range(count), count + index]
-        step = np.linalg.solve(normal[np.ix_(taken, taken)], pull[taken]) / size[taken]
-        promised = _average_logs(residuals - columns[:, :, taken] @ step)
-        losses.append((round(promised, _ALIKE_DIGITS), _average_logs(residuals - added[index])))
-    return losses
 
 
 def list_rises(
@@ -271,16 +222,6 @@ class Judgement:
     def floor(self) -> Errors:
         """The noise floor of the runs."""
         return self.problem.floor
-
-    @property
-    def ordered(self) -> Judgement:
-        """With the steps in the order in which effects are listed everywhere, see `sort_steps`."""
-        return replace(self, ladder=sort_steps(self.problem, self.ladder))
-
-    def drop(self, name: str) -> LadderStep:
-        """The model without one effect, refitted."""
-        rest = [one for one in self.fitted.model.ids if one != name]
-        return fit_step(self.problem, self.fitted, rest)
 
 
 def judge_model(

@@ -166,9 +166,9 @@ def fit_to_runs(
     if tie is not None:
         problem = tie(problem)
     known, physics = (drop_learned(model) for model in (before.model, after.model))
-    old = new = judge_model(problem, replace(known, vehicle=physics.vehicle), per_run=before.per_run).ordered
+    old = new = judge_model(problem, replace(known, vehicle=physics.vehicle), per_run=before.per_run)
     if physics.effects != known.effects:
-        new = judge_model(problem, physics, per_run=after.per_run).ordered
+        new = judge_model(problem, physics, per_run=after.per_run)
     if find_learned(after.model) is not None:
         # The residual of the physical model has changed: train the learned term again.
         new = judge_learned_term(new)
