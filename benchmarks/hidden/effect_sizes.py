@@ -82,4 +82,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "motor_imbalance": {"e": sign * 0.2 * size},
         "side_lag": {"tau_left" if sign > 0.0 else "tau_right": 0.5 * size},
     }
+    if effect not in sizes:
+        what = f"{effect} has no size here"
+        raise KeyError(what)
     return sizes[effect]

@@ -77,7 +77,10 @@ def key_diagnosis(keys: Mapping[str, str]) -> str:
     """Key of the diagnosis of a run whose stages have these keys."""
     from schemas import contract_of  # noqa: PLC0415 - brings a table library along
 
-    return hash_json([keys["slip"], STAGE, VERSION, *(contract_of(table).version for table in DIAGNOSED)])
+    # An effect is searched for by being there.
+    effects = sorted(path.name for path in (Path(__file__).parents[1] / "models" / "effects").glob("*.py"))
+    contracts = [contract_of(table).version for table in DIAGNOSED]
+    return hash_json([keys["slip"], STAGE, VERSION, effects, *contracts])
 
 
 def has_diagnosis(manifest: Manifest | None, key: str) -> bool:

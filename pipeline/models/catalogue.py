@@ -155,6 +155,11 @@ def list_effects() -> tuple[EffectClass, ...]:
     effects: list[EffectClass] = []
     for module in pkgutil.iter_modules(folder.__path__):
         effects += _effects_of(importlib.import_module(f"pipeline.models.effects.{module.name}"))
+    by_id: dict[str, EffectClass] = {}
+    for effect in effects:
+        if (other := by_id.setdefault(effect.id, effect)) is not effect:
+            what = f"{other.__module__} and {effect.__module__} have one id, {effect.id}"
+            raise MotionError("same_id", what, where=effect.id, hint="Give each effect an id of its own.")
     return tuple(sorted(effects, key=lambda effect: (effect.place, effect.rank, effect.id)))
 
 

@@ -184,6 +184,9 @@ class Effects:
         given = self._values.get(effect, {})
         if parameter in given:
             return given[parameter]
+        if effect not in CATALOGUE:
+            what = f"{effect} is not in pipeline/simulate/effects.toml"
+            raise KeyError(what)
         return next(item.neutral for item in CATALOGUE[effect].parameters if item.name == parameter)
 
     def is_active(self, effect: str) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.job import Options
+from pipeline.job import Options, run_results
 from pipeline.job.analyze import Outcome, analyze_log
 from pipeline.models import find_effect
 from pipeline.simulate import simulate_case
@@ -114,3 +114,14 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     assert diagnosis["effects"] == []
     assert diagnosis["undecided"] == []
     assert "not_moving" in [finding["id"] for finding in diagnosis["findings"]]
+
+
+def test_a_new_effect_asks_for_a_new_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "models" / "effects"
+    folder.mkdir(parents=True)
+    monkeypatch.setattr(run_results, "__file__", str(tmp_path / "job" / "run_results.py"))
+    (folder / "drive_lag.py").touch()
+    before = run_results.key_diagnosis({"slip": "key"})
+    assert run_results.key_diagnosis({"slip": "key"}) == before
+    (folder / "new_effect.py").touch()
+    assert run_results.key_diagnosis({"slip": "key"}) != before

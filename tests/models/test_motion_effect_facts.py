@@ -9,10 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.models import Effect, list_effects
+from pipeline.models import Effect, catalogue, list_effects
 from pipeline.models.catalogue import find_late_effect, format_effect
 from pipeline.models.effect import Late
 from pipeline.models.parameter import Conditions, Largest, TwinRole, is_of_one_run
+from pipeline.run import MotionError
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
@@ -144,3 +145,17 @@ def test_of_two_places_of_a_change_only_the_one_that_is_given_counts() -> None:
         effect = change(**{given: 10.0})
         assert effect.is_used(effect.parameter(given))
         assert not effect.is_used(effect.parameter(idle))
+
+
+def test_two_effects_of_one_id_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Copy(Effect):
+        id = "drive_lag"
+
+    found = catalogue._effects_of
+    monkeypatch.setattr(
+        catalogue,
+        "_effects_of",
+        lambda module: [Copy] if module.__name__.endswith("turn_lag") else found(module),
+    )
+    with pytest.raises(MotionError, match="have one id, drive_lag"):
+        list_effects.__wrapped__()

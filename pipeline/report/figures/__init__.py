@@ -57,7 +57,7 @@ class Figure:
         title: what it shows, in a few words.
         section: the question it answers.
         draw: the function from tables to a drawing; returns None if there is nothing to draw.
-        order: position within the section, in ascending order.
+        order: position within the section, in ascending order; figures of half the width may come first.
         id: stable name.
         width: share of a wide page's width.
         panels: parts by title, for a figure that a page shows part by part; may be empty.

@@ -221,7 +221,10 @@ def _read() -> tuple[dict[str, MessageType], tuple[Pair, ...]]:
             content = tomllib.loads(entry.read_text(encoding="utf-8"))
             pairs += msgspec.convert(content.pop("pairs", []), list[Pair])
             package = entry.name.removesuffix(".toml")
-            kinds |= {
-                f"{package}/{name}": msgspec.convert(fields, MessageType) for name, fields in content.items()
-            }
+            for name, fields in content.items():
+                try:
+                    kinds[f"{package}/{name}"] = msgspec.convert(fields, MessageType)
+                except msgspec.ValidationError as error:
+                    what = f"[{name}] of message_types/{entry.name}: {error}"
+                    raise msgspec.ValidationError(what) from None
     return kinds, tuple(pairs)
