@@ -391,7 +391,7 @@ def find_idle(
         drive: ids of the effects of the drivetrain.
     """
     idle, doubtful = list[str](), list(duties)
-    while True:
+    while doubtful:
         rest, raised = model.keep(name for name in model.ids if name not in idle), dict[str, float]()
         for source, problem in problems.items():
             with suppress(MotionError):
@@ -401,10 +401,9 @@ def find_idle(
                         without = whole.drop(name)
                         if _is_idle(whole, without, is_of_drive=name in drive):
                             raised[name] = math.prod(whole.errors.ratios(without.errors)[3:])
-        if not raised:
-            return idle
         doubtful = sorted(raised, key=raised.__getitem__)
-        idle.append(doubtful.pop())
+        idle += [doubtful.pop()] if doubtful else []
+    return idle
 
 
 def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
