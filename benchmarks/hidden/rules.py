@@ -295,7 +295,7 @@ RULES: tuple[Rule, ...] = (
          _same_structure),
     Rule("lasting", "motion that lasts is unexplained", residual_structure, "_find_lasting", _give(None),
          _same_presence),
-    Rule("idle", "what helps the wheels and not the body is not named", conclude, "_find_idle", _give([])),
+    Rule("idle", "what helps the wheels and not the body is not named", conclude, "find_idle", _give([])),
     Rule("material", "what moves no prediction by what is felt is not named", conclude, "measure_moves",
          _give(None), _same_matter),
     Rule("needed", "what halves an error is named though its numbers are open", conclude, "_is_needed",

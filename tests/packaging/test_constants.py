@@ -1,15 +1,18 @@
-import pytest
-from constants import compare, replace_number
+from pathlib import Path
 
+import pytest
+from constants import choose_numbers, compare, replace_number
+
+from pipeline.estimation import search
 from pipeline.run import signals
 from pipeline.stages import align, pose_faults, timing, trust
 
 
-def test_what_a_number_changes_is_told_in_one_line() -> None:
+def test_what_a_number_changes_is_told_in_words() -> None:
     before: dict[str, float | str] = {"a modulus": 1.0, "a pose_jump pose": "found", "a fails": "ValueError"}
     after: dict[str, float | str] = {"a modulus": 1.1, "a bad_stretch pose": "found", "a fails": "ValueError"}
-    assert compare(before, after) == "+ a bad_stretch pose; a modulus 1 -> 1.1; - a pose_jump pose"
-    assert compare(before, {**before, "a modulus": 1.0005}) == "same"
+    assert compare(before, after) == ["+ a bad_stretch pose", "a modulus 1 -> 1.1", "- a pose_jump pose"]
+    assert compare(before, {**before, "a modulus": 1.0005}) == []
 
 
 def test_a_shared_number_is_replaced_wherever_it_was_imported_and_put_back() -> None:
@@ -23,3 +26,11 @@ def test_a_private_number_of_another_file_is_another_number() -> None:
     with replace_number("pipeline.stages.timing", "_FEWEST", 0.5):
         assert timing._FEWEST == 100
         assert pose_faults._FEWEST == 200
+
+
+def test_without_files_all_rooms_that_decide_answers_are_asked() -> None:
+    every = choose_numbers([], [])
+    assert ("pipeline.estimation.search", "_WHOLE", 0.9) in every
+    assert not any(module.startswith("pipeline.web") for module, _, _ in every)
+    (one,) = choose_numbers([Path(search.__file__)], ["_WHOLE"])
+    assert one in every
