@@ -151,6 +151,15 @@ def _same_ids(one: Any, other: Any) -> bool:
     return bool(one.ids == other.ids)
 
 
+def _begin_simply(_original: Any, _selection: Any, first: Any) -> Any:
+    """The search begins with the model that it has."""
+    return first, True
+
+
+def _same_beginning(one: Any, other: Any) -> bool:
+    return _same_ids(one[0], other[0])
+
+
 def _same_names(one: Any, other: Any) -> bool:
     return [(effect.id, effect.tentative) for effect in one] == [
         (effect.id, effect.tentative) for effect in other
@@ -253,7 +262,7 @@ RULES: tuple[Rule, ...] = (
     Rule("predicted_gain", "a gain counts in predictions from measured states, too", selection, "compare",
          _forget_restarts, _same_verdict),
     Rule("begin_whole", "a search begins with a controller, or contact, and its companions", search,
-         "_begin_whole", _second, _same_ids),
+         "_begin_whole", _begin_simply, _same_beginning),
     Rule("expected", "companions stay while they take away a share of the loss", search, "prune",
          _forget_companions, costly=True),
     Rule("covered", "special cases of an effect are not added beside it", selection.Selection,
