@@ -3,11 +3,11 @@
     python benchmarks/constants.py [FILE...] [--names NAME ...] [--sample N --seed S] [--log LOG ...]
                                    [--factors 0.5 2] [--diagnosis]
 
-Each number of each file, without files of all rooms that decide answers or of a random sample, is set to its
-value times each factor, alone, and the logs are analyzed again in this process. Prints one line a number and
-factor: `same`, or what differs, and last how many numbers change what is said (a named effect or a finding)
-and how many a median. A number that is used only while modules are imported, or by compiled loops, keeps its
-value there: it is `same` whatever it is.
+Each number of the files, where none is given of all rooms that decide answers, or each of a random sample of
+them, is set to its value times each factor, alone, and the logs are analyzed again in this process. Prints
+one line a number and factor: `same`, or what differs, and last how many numbers change what is said (a named
+effect or a finding) and how many a median. A number that is used only while modules are imported, or by
+compiled loops, keeps its value there: it is `same` whatever it is.
 """
 
 from __future__ import annotations

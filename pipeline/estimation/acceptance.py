@@ -382,27 +382,30 @@ def find_idle(
 ) -> list[str]:
     """Effects that raise the 2 s errors, and those of the drivetrain that reduce no error.
 
-    They are taken out one by one, the one that raises the errors most first: without it others may be needed.
+    They are taken out one by one, the one that raises the errors most first: without it others may be needed,
+    or help no longer.
 
     Args:
         model: with all effects.
-        problems: the runs by input; those of which nothing can be predicted are left out.
+        problems: the runs by input; what cannot be fitted from an input is not judged from it.
         duties: inputs from which an effect must serve predictions, by id; others stay.
         drive: ids of the effects of the drivetrain.
     """
-    idle, doubtful = list[str](), list(duties)
-    while doubtful:
-        rest, raised = model.keep(name for name in model.ids if name not in idle), dict[str, float]()
+    idle = list[str]()
+    while rest := [name for name in duties if name not in idle]:
+        part, raised = model.keep(name for name in model.ids if name not in idle), dict[str, float]()
         for source, problem in problems.items():
             with suppress(MotionError):
-                whole = judge_whole(problem, rest)
-                for name in doubtful:
-                    if source in duties[name] and name in whole.effects:
+                whole = judge_whole(problem, part)
+                for name in (one for one in rest if source in duties[one] and one in whole.effects):
+                    with suppress(MotionError):
                         without = whole.drop(name)
                         if _is_idle(whole, without, is_of_drive=name in drive):
-                            raised[name] = math.prod(whole.errors.ratios(without.errors)[3:])
-        doubtful = sorted(raised, key=raised.__getitem__)
-        idle += [doubtful.pop()] if doubtful else []
+                            size = math.prod(whole.errors.ratios(without.errors)[3:])
+                            raised[name] = max(raised.get(name, 0.0), size)
+        if not raised:
+            break
+        idle.append(max(raised, key=raised.__getitem__))
     return idle
 
 

@@ -118,8 +118,9 @@ def climb(
     while waiting:
         step = known.get(frozenset(taken)) or fit_step(problem, whole.fitted, taken, per_run)
         steps.append(step)
-        errors = [_predict_error(problem, whole.fitted, [*taken, name], steps[0].errors) for name in waiting]
-        least = min(errors)
+        ideal, several = steps[0].errors, waiting if len(waiting) > 1 else []
+        errors = [_predict_error(problem, whole.fitted, [*taken, name], ideal) for name in several]
+        least = min(errors, default=math.nan)
         taken.append(waiting.pop(next((i for i, one in enumerate(errors) if one <= least + CHANCE), 0)))
     return Ladder((*steps, whole))
 
@@ -132,14 +133,20 @@ def judge_whole(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> 
 
 
 def _predict_error(problem: Problem, whole: Fitted, names: Sequence[str], ideal: Errors) -> float:
-    """Sum of both errors over 2 s with some effects of a fit, relative to those of the ideal model."""
+    """Sum of both errors over 2 s with some effects of a fit, relative to those of the ideal model.
+
+    Where nothing can be predicted over 2 s, it is that of the velocities' errors.
+    """
     state = whole.state.drop(set(whole.model.ids) - set(names))
     horizons = [
         comparison.find_horizon_errors(state.effects_of(run), state.timing[run])
         for run, comparison in enumerate(problem.comparisons)
     ]
     position, yaw = (np.concatenate([getattr(one, name) for one in horizons]) for name in ("position", "yaw"))
-    return sum(measure_errors(np.empty((0, 3)), position, yaw).ratios(ideal)[3:])
+    is_known = np.isfinite(position).any()
+    residuals = np.empty((0, 3)) if is_known else problem.find_residuals(state)
+    ratios = measure_errors(residuals, position, yaw).ratios(ideal)
+    return sum(ratios[3:] if is_known else ratios[:3])
 
 
 def list_order(steps: Sequence[LadderStep]) -> list[str]:

@@ -236,9 +236,9 @@ class State:
         return replace(self, effects=tuple(ordered))
 
     def drop(self, names: Iterable[str]) -> State:
-        """The state without some effects, and without those that act only beside them."""
-        rest = set(self.ids) - set(names)
-        return self.hold([effect for effect in self.effects if effect.id in rest and effect.acts_in(rest)])
+        """The state without some effects."""
+        gone = set(names)
+        return self.hold([effect for effect in self.effects if effect.id not in gone])
 
     def hold(self, effects: Sequence[Effect]) -> State:
         """These effects and no others, with the numbers of each run's own that the state has of them."""

@@ -353,7 +353,7 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
         if name in knowledge.base.names:
             continue
         if why := explain_idle(effect, knowledge.base.names):
-            what = f"{name} {why}, which the model of the logs does not contain"
+            what = f"{name} {why}, which the model does not contain"
             hint = "Choose another effect, or record logs that identify that one first."
             raise PlanError("acts_beside", what, where=knowledge.vehicle.id, hint=hint)
         with_it = knowledge.base.extend(effect().make_usual(largest))

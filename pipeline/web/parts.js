@@ -14,7 +14,8 @@ export const h = (tag, props = {}, ...children) => {
     else if (value !== null && value !== undefined) node.setAttribute(key, value);
   }
   const shown = children.flat().filter((child) => child !== null && child !== undefined && child !== false);
-  node.append(...shown.map((child) => (typeof child === "string" ? setSquares(child) : child)));
+  const isPlain = (child) => typeof child !== "string" || tag === "code";
+  node.append(...shown.map((child) => (isPlain(child) ? child : setSquares(child))));
   return node;
 };
 

@@ -14,7 +14,6 @@ from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.search import choose, list_rivals, prune, restart, search_effects, simplify
 from pipeline.estimation.selection import USEFUL, CandidateModel, Selection, open_selection, prepare
-from pipeline.estimation.state import State
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -34,6 +33,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.state import State
     from pipeline.models import Effect
     from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
@@ -398,12 +398,17 @@ def test_a_speed_loop_that_was_fitted_as_a_lag_is_begun_again_as_a_loop(tmp_path
     assert found.values["scrub"] == pytest.approx(1.2, rel=0.15)
 
 
-def test_an_effect_that_acts_beside_another_one_alone_leaves_a_model_with_it() -> None:
-    state = State((), ()).add(
-        _give("drive_lag", 0.4), _give("wheel_servo", 0.1), _give("motor_imbalance", 0.1)
-    )
-    assert state.drop(["drive_lag"]).ids == ("motor_imbalance", "wheel_servo")
-    assert state.drop(["wheel_servo"]).ids == ("drive_lag",)
+def test_an_effect_that_acts_beside_another_one_alone_is_not_named_without_it(tmp_path: Path) -> None:
+    run, vehicle = _load(replace(_HUSKY, effects={"drive_lag": 0.4}), tmp_path / "husky")
+    context = prepare([run], vehicle, Input.COMMAND)
+    part, begin = context.problem.parts[1], context.problem.start_state()
+    selection, _ = open_selection(part, begin, (), context.conditions, Budget())
+    given = {"drive_lag": 0.4, "wheel_servo": 0.1, "motor_imbalance": 0.1}
+    state = begin.add(*(_give(name, value) for name, value in given.items()))
+    imbalance = state.find("motor_imbalance")
+    assert imbalance is not None
+    assert selection.may_stay(imbalance, state)
+    assert not selection.may_stay(imbalance, state.drop(["wheel_servo"]))
 
 
 def test_a_model_without_an_effect_is_fitted_anew_under_other_weights(tmp_path: Path) -> None:

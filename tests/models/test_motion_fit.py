@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,6 +20,8 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
+from pipeline.estimation.acceptance import find_idle
+from pipeline.estimation.comparison import HorizonErrors
 from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
 from pipeline.estimation.ladder import judge_model
@@ -191,7 +194,7 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
 
 
 def test_of_effects_that_act_alike_alone_the_one_that_does_more_is_the_lower_rung() -> None:
-    """Both change how far it turns by a share: what each promises the ideal model differs by rounding."""
+    """Both change how far it turns by a share: the first on the path is not the first step for that."""
     truth = {"difference_gain": 1.05, "effective_track": 1.8}
     problem = Problem([simulate(truth)], HUSKY, Input.COMMAND)
     ladder = climb(problem, model_of(*truth))
@@ -204,6 +207,31 @@ def test_the_next_rung_is_the_effect_that_lowers_the_error_over_2_s_most() -> No
     problem = Problem([simulate(truth)], HUSKY, Input.COMMAND)
     ladder = climb(problem, model_of(*truth))
     assert [step.effects for step in ladder.steps][1] == ("effective_track",)
+
+
+def test_without_predictions_the_velocities_errors_order_the_rungs(monkeypatch: pytest.MonkeyPatch) -> None:
+    predict = Comparison.find_horizon_errors
+
+    def predict_nothing(self: Comparison, *args: Any, **named: Any) -> HorizonErrors:  # noqa: ANN401 - its own
+        nothing = np.full(predict(self, *args, **named).position.size, np.nan)
+        return HorizonErrors(nothing, nothing, nothing)
+
+    monkeypatch.setattr(Comparison, "find_horizon_errors", predict_nothing)
+    truth = {"drive_lag": 0.3, "effective_track": 1.8}
+    ladder = climb(Problem([simulate(truth)], HUSKY, Input.COMMAND), model_of("side_gain", *truth))
+    assert ladder.idle == ("side_gain",)
+    assert set(ladder.steps[2].effects) == set(truth)
+
+
+@pytest.mark.parametrize("others", [(), ("deadband",)])
+def test_of_effects_that_replace_each_other_one_serves_predictions(others: tuple[str, ...]) -> None:
+    problem = Problem([simulate({"drive_lag": 0.4, "effective_track": 1.8})], HUSKY, Input.COMMAND)
+    names = ("drive_lag", "side_lag", *others, "effective_track")
+    duties = dict.fromkeys(names, (Input.COMMAND,))
+    idle = find_idle(model_of(*names), {Input.COMMAND: problem}, duties, set(names) - {"effective_track"})
+    assert "effective_track" not in idle
+    assert len({"drive_lag", "side_lag"} & set(idle)) == 1
+    assert ("deadband" in idle) == bool(others)
 
 
 def test_the_model_is_fitted_to_the_end_whatever_rungs_are_known() -> None:
