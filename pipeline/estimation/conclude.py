@@ -103,7 +103,8 @@ def summarize(
     known = frozenset().union(*(path.search.selection.given for path in paths))
     terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.path))))
-    idle = _list_idle([*taken, *terms], context, inputs, paths, open_ids)
+    on_ground = {e.id: _path_of(e, paths) is body for e in (*taken, *terms) if e.id not in known}
+    idle = _list_idle(context, inputs, _join(context, [*taken, *terms], open_ids), on_ground)
     taken, terms = ([effect for effect in some if effect.id not in idle] for some in (taken, terms))
     undecided = [item for item in undecided if item.candidates[0] not in idle]
     judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
@@ -273,24 +274,24 @@ def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list
 
 
 def _list_idle(
-    effects: Sequence[Effect],
-    context: Context,
-    inputs: Sequence[Input],
-    paths: Sequence[Explored],
-    open_ids: set[str],
+    context: Context, inputs: Sequence[Input], model: Model, on_ground: Mapping[str, bool]
 ) -> list[str]:
-    """Effects that do not serve predictions, see `find_idle`; the last input is that of the ground."""
-    known = frozenset().union(*(path.search.selection.given for path in paths))
-    own = {effect.id: _path_of(effect, paths) for effect in effects if effect.id not in known}
+    """Effects of a model that do not serve predictions, see `find_idle`.
+
+    Args:
+        context: the runs.
+        inputs: from which they are predicted; the last one is that of the ground.
+        model: with all effects.
+        on_ground: whether an effect acts on the ground, not in the drivetrain, by id; others stay.
+    """
     # A formula is no cause: it must serve predictions from every input. An encoder error affects both the
     # ground and the drivetrain; from commands the two cancel.
     duties = {
-        name: inputs if is_term(name) else inputs[-1:] if path is paths[0] else inputs[:1]
-        for name, path in own.items()
+        name: inputs if is_term(name) else inputs[-1:] if is_ground else inputs[:1]
+        for name, is_ground in on_ground.items()
     }
-    problems = {one: _find_problem(context, one) for one in inputs}
-    drive = {name for name, path in own.items() if path is not paths[0]}
-    return find_idle(_join(context, effects, open_ids), problems, duties, drive)
+    drive = {name for name, is_ground in on_ground.items() if not is_ground}
+    return find_idle(model, {one: _find_problem(context, one) for one in inputs}, duties, drive)
 
 
 def _judge_ways(

@@ -114,15 +114,22 @@ def climb(
     # The last step is the model that is written: unlike the steps before, it is fitted exactly.
     whole = judge_whole(problem, model, per_run)
     known = {frozenset(step.effects): step for step in known_steps}
-    steps, taken, waiting = list[LadderStep](), list[str](), list(whole.effects)
-    while waiting:
+    steps, taken = list[LadderStep](), list[str]()
+    while len(taken) < len(whole.effects):
         step = known.get(frozenset(taken)) or fit_step(problem, whole.fitted, taken, per_run)
         steps.append(step)
-        ideal, several = steps[0].errors, waiting if len(waiting) > 1 else []
-        errors = [_predict_error(problem, whole.fitted, [*taken, name], ideal) for name in several]
-        least = min(errors, default=math.nan)
-        taken.append(waiting.pop(next((i for i, one in enumerate(errors) if one <= least + CHANCE), 0)))
+        taken.append(_choose_next(problem, whole.fitted, taken, steps[0].errors))
     return Ladder((*steps, whole))
+
+
+def _choose_next(problem: Problem, whole: Fitted, taken: Sequence[str], ideal: Errors) -> str:
+    """The effect of a fit, beside those already taken, with the lowest predicted error."""
+    first, *others = (name for name in whole.model.ids if name not in taken)
+    if not others:
+        return first
+    errors = {name: _predict_error(problem, whole, [*taken, name], ideal) for name in (first, *others)}
+    least = min(errors.values())
+    return next((name for name, error in errors.items() if error <= least + CHANCE), first)
 
 
 def judge_whole(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> LadderStep:

@@ -467,8 +467,10 @@ class Selection:
             state: the state.
             as_if: it may have values beyond the observed range, though it was not admitted with them.
         """
-        if effect.id in self.given or not effect.acts_in(state.ids):
-            return effect.id in self.given
+        if effect.id in self.given:
+            return True
+        if not effect.acts_in(state.ids):
+            return False
         acting = state.list_as_it_acts(effect)
         if len(acting) > 1:
             # Of clocks that differ, the earliest is early against the latest, which no delay of a drive is.
