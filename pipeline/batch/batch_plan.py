@@ -19,6 +19,7 @@ from pipeline.job import Options, run_results
 from pipeline.job.keys import VERSIONS, hash_json, name_plainly
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets
+from pipeline.sources.message_types import read_tables
 from pipeline.store import LogIdentities, LogSighting, Manifest, Store, StoreError, see_log
 from pipeline.store.mirror import Mirror
 from pipeline.store.names import path_unread
@@ -71,6 +72,7 @@ def _fingerprint_program() -> object:
         {**VERSIONS, run_results.STAGE: run_results.VERSION},
         {contract.name: contract.version for contract in list_contracts()},
         [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
+        msgspec.to_builtins(read_tables()),
     ]
 
 

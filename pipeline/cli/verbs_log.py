@@ -179,7 +179,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
 
     seen = inspect_log(log, build_options(choices))
     print_result(_log_as_json(seen), lambda: _format_log(seen), json=json)
-    return LOSSY if seen.losses else CLEAN
+    return LOSSY if seen.losses or seen.problem else CLEAN
 
 
 def _log_as_json(seen: Inspection) -> dict[str, object]:

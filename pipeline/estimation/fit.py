@@ -52,8 +52,8 @@ _SAME_SCALE = 0.01
 _SETTLED = 1e-9
 """Relative decrease of the loss at which the fit of a model that is written ends."""
 _SETTLED_ROUNDS = 60
-"""Maximum number of rounds until neither parameters nor weights change, a safeguard: half a minute of gentle
-driving, which hardly determines a controller, needs 20."""
+"""Maximum number of rounds until parameters, weights and digits no longer change, a safeguard: half a minute
+of gentle driving, which hardly determines a controller, needs 20."""
 _SAME_NUMBER = 2e-4
 """Relative change below which a parameter counts as unchanged."""
 
@@ -175,7 +175,7 @@ def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *
     """
     if not exact:
         return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=False)
-    for _ in range(_REWEIGHTED):
+    for _ in range(_SETTLED_ROUNDS):
         state = state.hold([effect.rounded for effect in state.effects])
         fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=True)
         if _are_same(state, fit.state, [number for number in fit.free if number.effect]):

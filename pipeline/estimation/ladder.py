@@ -191,8 +191,8 @@ def list_rises(
 
 
 def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
-    """An error by its name; NaN if unknown."""
-    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
+    """An error by its name, with the digits it has in JSON, so that screen and page agree; NaN if unknown."""
+    value = errors.get(name) if isinstance(errors, Mapping) else _round(getattr(errors, name))
     return float(value) if isinstance(value, int | float) else math.nan
 
 

@@ -38,7 +38,7 @@ from pipeline.sources import (
     choose_sources,
     load_configuration,
 )
-from pipeline.sources.message_types import MessageType, find_type, plain_type
+from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import blame_damage
 from pipeline.store import Manifest, Store
@@ -465,6 +465,7 @@ def key_stages(
             "roles": [plain[role] for role in ("command", "wheels", "pose", "imu", "interval")],
             "use_intervals": plain["use_intervals"],
             "limits": pose_limits,
+            "message_types": describe_types(one.type_name for one in setup.index.channels),
         },
         "align": {},
         "velocity": plain["velocity"],

@@ -79,6 +79,7 @@ def test_a_log_that_cannot_be_analyzed_gets_one_line(
     if seen.returncode == 1:
         assert seen.stderr == done.stderr
     else:
+        assert seen.returncode == 3
         why = done.stderr.removeprefix(f"slip: {field / name}: ")
         assert seen.stdout.endswith(f"\nproblem   the log cannot be analyzed: {why}")
         assert "it is analyzed" not in seen.stdout
@@ -365,7 +366,7 @@ def test_inspect_shows_topics_roles_and_damage(field: Path) -> None:
 
     assert "note = one: - two\n" in run_verb("inspect", field / "no_messages.mcap").stdout
     unknown = run_verb("inspect", field / "no_vehicle.mcap")
-    assert unknown.returncode == 0
+    assert unknown.returncode == 3
     assert "cannot be determined" in unknown.stdout
 
 

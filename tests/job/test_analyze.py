@@ -11,6 +11,7 @@ from pathlib import Path
 
 import polars as pl
 import pytest
+from msgspec import structs
 
 from pipeline.cli.screen import format_run
 from pipeline.core import SlipError
@@ -18,7 +19,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
 from pipeline.logs import LogData
 from pipeline.simulate import Recording, make_scenario, simulate_case, simulate_run, write_log
-from pipeline.sources import Sources
+from pipeline.sources import Sources, message_types
 from pipeline.stages import StageError
 from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.store import Store
@@ -142,6 +143,21 @@ def test_force_computes_again_and_gives_the_same(log: Path, out: Path) -> None:
     assert second.computed == STAGES
     for table, entry in first.manifest.tables.items():
         assert second.manifest.tables[table].sha256 == entry.sha256, table
+
+
+def test_results_know_what_was_known_of_the_types_in_the_log(
+    log: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    analyze(log, out)
+    kinds, pairs = message_types.read_tables()
+    odometry = kinds["nav_msgs/Odometry"]
+    assert odometry.pose is not None
+    # The messages have a frame, so that this one is not used: the numbers stay the same.
+    changed = structs.replace(odometry, pose=structs.replace(odometry.pose, fixed="odd"))
+    for name, computed in (("odd_msgs/Odometry", ()), ("nav_msgs/Odometry", STAGES)):
+        tables = {**kinds, name: changed}, pairs
+        monkeypatch.setattr(message_types, "read_tables", lambda tables=tables: tables)
+        assert analyze(log, out).computed == computed, name
 
 
 def test_equal_content_is_one_run(log: Path, out: Path, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ of
 
 import functools
 import tomllib
+from collections.abc import Iterable
 from importlib import resources
 from typing import Literal
 
@@ -198,21 +199,28 @@ def plain_type(type_name: str) -> str:
 
 def find_type(type_name: str) -> MessageType:
     """Known fields of a message type; empty for an unknown one."""
-    return _read()[0].get(plain_type(type_name), MessageType())
+    return read_tables()[0].get(plain_type(type_name), MessageType())
+
+
+def describe_types(type_names: Iterable[str]) -> dict[str, object]:
+    """What is known of some message types, in JSON; results depend on it."""
+    known = {name: find_type(name) for name in sorted({plain_type(name) for name in type_names})}
+    return {name: msgspec.to_builtins(kind) for name, kind in known.items() if kind != MessageType()}
 
 
 def list_types(part: str) -> tuple[str, ...]:
     """Types that have a part (``pose``, ``drive``, ...)."""
-    return tuple(name for name, kind in _read()[0].items() if getattr(kind, part) is not None)
+    return tuple(name for name, kind in read_tables()[0].items() if getattr(kind, part) is not None)
 
 
 def list_pairs() -> tuple[Pair, ...]:
     """Topics that belong together by name."""
-    return _read()[1]
+    return read_tables()[1]
 
 
 @functools.cache
-def _read() -> tuple[dict[str, MessageType], tuple[Pair, ...]]:
+def read_tables() -> tuple[dict[str, MessageType], tuple[Pair, ...]]:
+    """All message types by name, and the pairs of topics."""
     kinds: dict[str, MessageType] = {}
     pairs: list[Pair] = []
     folder = resources.files("pipeline.sources") / "message_types"
