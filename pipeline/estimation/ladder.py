@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick
+from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick, round_digits
 from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
@@ -178,6 +178,8 @@ def list_rises(
 ) -> tuple[str, ...]:
     """Names in `ERRORS_OVER_2S` of the errors that rise in a step; unknown errors do not rise.
 
+    They are compared as they are written, so that screen and page agree.
+
     Args:
         below: errors before the step, or the step in JSON.
         errors: errors after it.
@@ -186,13 +188,18 @@ def list_rises(
     return tuple(
         name
         for name in ERRORS_OVER_2S
-        if read_error(errors, name) > read_error(below, name) * (1.0 + forgiven)
+        if _as_written(errors, name) > _as_written(below, name) * (1.0 + forgiven)
     )
 
 
+def _as_written(errors: Errors | Mapping[str, object], name: str) -> float:
+    """An error with the digits that JSON has; NaN if unknown."""
+    return round_digits(read_error(errors, name), JSON_DIGITS)
+
+
 def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
-    """An error by its name, with the digits it has in JSON, so that screen and page agree; NaN if unknown."""
-    value = errors.get(name) if isinstance(errors, Mapping) else _round(getattr(errors, name))
+    """An error by its name; NaN if unknown."""
+    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
     return float(value) if isinstance(value, int | float) else math.nan
 
 
