@@ -37,8 +37,8 @@ def test_the_readme_gives_the_medians(name: str, samples: Path, tmp_path: Path) 
 
 
 def test_samples_are_small_and_made_by_the_simulator(samples: Path, tmp_path: Path) -> None:
-    decoders = DecoderFactory()
     for made in write_samples(tmp_path):
+        decoders = DecoderFactory()
         kept = samples / made.name
         again = f"{made.name}: run `make samples`"
         assert kept.stat().st_size < 2_000_000
