@@ -51,6 +51,7 @@ class Case:
 # snow recording are 1.82 times too large: so is its wheel_radius from commands.
 TILE = (TRACK, "icr_offset", "yaw_misalignment", "wheel_asymmetry", "wheel_radius")
 SNOW = (TRACK, "icr_offset", "turning_resistance")
+SNOW_DRIVE = ("body_turn_limit", "turn_acceleration_limit", "wheel_speed_scaling", "drive_lag")
 WET = (TRACK, "icr_offset", "body_turn_limit", "turn_lag", "transport_delay")
 FAST = (TRACK, INERTIA, "turn_lag", "wheel_speed_limit")
 GRAVEL = (TRACK, INERTIA, "lateral_skid")
@@ -69,7 +70,7 @@ _ROWS: tuple[tuple[str, tuple[str, ...], tuple[str, ...], tuple[Ratios, Ratios]]
     (
         "husky_snow_boreal",
         SNOW,
-        (*SNOW, "wheel_radius", "body_turn_limit", "turn_lag"),
+        (*SNOW, "wheel_radius", *SNOW_DRIVE),
         ((0.68, 0.73, 0.21, 0.41, 0.17), (0.67, 0.75, 0.06, 0.37, 0.05)),
     ),
     (
