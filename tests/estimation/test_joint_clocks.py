@@ -14,6 +14,7 @@ import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.ambiguity import find_undecided
+from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model
 from pipeline.job import Options
@@ -77,7 +78,9 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
         assert clock["low"] < late < clock["high"]
         assert clock["high"] - clock["low"] < 0.08
         assert told["timing"]["pose_delay_s"] == pytest.approx(clock["value"], abs=1e-4)
-        assert f"d = {clock['value']:.3g} s [{clock['low']:.3g}, {clock['high']:.3g}] in {run.run}" in screen
+        # A value has the digits that its interval supports.
+        value, low, high = (clock[name] for name in ("value", "low", "high"))
+        assert f"d = {Value(value, low, high, 's')} in {run.run}" in screen
     for name, value in effects.items():
         (number,) = named[name].values()
         assert number["low"] < value < number["high"]
