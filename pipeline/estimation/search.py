@@ -253,21 +253,21 @@ def _list_doubtful(selection: Selection, current: CandidateModel) -> list[str]:
 
 
 def simplify(selection: Selection, current: CandidateModel, excluded: set[str]) -> CandidateModel:
-    """The model with one effect replaced by its special cases or one of them, if the data allow it."""
+    """The model with one effect replaced by one, two or all of its special cases, if the data allow it."""
     most = (1.0 + LEAST_GAIN) * selection.sum_losses(current)
     usual = {one.id: one().make_usual(selection.largest) for one in selection.candidates}
     for effect in current.state.effects:
         cases = [usual[name] for name in effect.contains if name in usual and name not in current.ids]
-        if effect.id in selection.given or excluded & {case.id for case in cases}:
+        if not cases or effect.id in selection.given or excluded & {case.id for case in cases}:
             continue
-        for some in dict.fromkeys([tuple(cases), *((case,) for case in cases)]) if cases else ():
+        for some in dict.fromkeys([*combinations(cases, 1), *combinations(cases, 2), tuple(cases)]):
             simpler = selection.enter(current.state.drop([effect.id]).add(*some))
             if selection.sum_losses(simpler) < most:
                 simpler = _make_sound(selection, simpler)
             if simpler.numbers >= current.numbers:
                 continue
             if selection.sum_losses(simpler) < most:
-                if selection.judge(simpler, current).share < 1.0:
+                if not selection.judge(simpler, current).is_significant:
                     return simpler
             elif _lacks_sampling(selection, simpler, most):
                 excluded.add(effect.id)

@@ -165,7 +165,7 @@ class WheelServo(JointDrive):
     clause = "has its wheels slowed by ground friction (time constant {tau:.2g} s)"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
-    contains = ("deadband", "drive_lag", "turn_lag")
+    contains = ("deadband", "drive_lag", "turn_lag", "difference_gain")
     companions = (
         "transport_delay",
         "body_turn_limit",
