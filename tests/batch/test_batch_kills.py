@@ -24,7 +24,7 @@ from pipeline.store import STEPS, Store
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FEW_ROUNDS, MANY_ROUNDS = 12, 200
+FEW_ROUNDS, MANY_ROUNDS = 20, 200
 
 
 @pytest.fixture(scope="module")
