@@ -1,27 +1,18 @@
-"""The files of the program: counts for people, and what `make check` refuses.
+"""The files of the program: `make check` refuses circles of imports between them.
 
-Refused are circles of imports between files, two files of one name, files of more than `MOST_LINES` (those of
-`BESIDE`, too), headers of more than `MOST_HEADERS` of all lines, and numbers at the head of a file, in
-`EXPLAINED`, without a reason.
 Imports inside functions count, since they only put a circle off; those for the type checker do not.
 """
 
 import ast
 import sys
-from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
-BESIDE = ("tests", "benchmarks", "docs", "examples")
-"""Folders of which only the length of files is checked."""
-MOST_LINES = 500  # a longer file is not read in one sitting
-MOST_HEADERS = 0.07
-"""Share of all lines: where it grows, files are split into parts that import one another."""
 EXPLAINED = ("core", "run", "stages", "models", "estimation", "fleet")
-"""Rooms whose numbers decide answers: each has a reason beside it."""
+"""Rooms whose numbers decide answers."""
 
 
 @dataclass(frozen=True)
@@ -39,40 +30,19 @@ class Source:
         return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def read_sources(root: Path, folders: Sequence[str] = ROOMS) -> list[Source]:
-    """All Python files of some folders, by default those of the program, sorted by path."""
-    paths = sorted(path for room in folders for path in (root / room).rglob("*.py"))
+def read_sources(root: Path) -> list[Source]:
+    """All Python files of the program, sorted by path."""
+    paths = sorted(path for room in ROOMS for path in (root / room).rglob("*.py"))
     texts = [(path.relative_to(root), path.read_text("utf-8")) for path in paths]
     return [Source(path, text, ast.parse(text), len(text.splitlines())) for path, text in texts]
 
 
-def list_long_files(sources: list[Source]) -> Iterator[str]:
-    """Files of more than `MOST_LINES`, one line each."""
-    long = (source for source in sources if source.lines > MOST_LINES)
-    yield from (f"{source.path} has {source.lines} lines, more than {MOST_LINES}" for source in long)
-
-
 def list_faults(sources: list[Source]) -> Iterator[str]:
-    """What is wrong, one line each."""
+    """Circles of imports, one line each."""
     try:
         TopologicalSorter(map_imports(sources)).prepare()
     except CycleError as error:
         yield f"import circle: {' -> '.join(reversed(error.args[1]))}"
-    paths = defaultdict(list)
-    for source in sources:
-        if source.path.name != "__init__.py":
-            paths[source.path.name].append(str(source.path))
-    yield from (f"two files of one name: {', '.join(same)}" for same in paths.values() if len(same) > 1)
-    yield from list_long_files(sources)
-    if (share := measure_headers(sources)) > MOST_HEADERS:
-        yield f"{share:.2%} of all lines are headers, more than {MOST_HEADERS:.0%}: put files together"
-    yield from (
-        f"{source.path}:{constant.line}: {constant.name} has no reason: a docstring below it, or a comment"
-        for source in sources
-        if find_room(source) in EXPLAINED
-        for constant in list_constants(source)
-        if not constant.reason
-    )
 
 
 @dataclass(frozen=True)
@@ -160,30 +130,11 @@ def _list_targets(node: ast.AST, package: str, modules: set[str]) -> Iterator[st
             yield from [whole] if whole in modules else [base] if base in modules else []
 
 
-def measure_headers(sources: list[Source]) -> float:
-    """Share of lines that are docstrings of files and imports above everything else."""
-    lines = 0
-    for source in sources:
-        head = source.tree.body[:1] if ast.get_docstring(source.tree, clean=False) is not None else []
-        head += [node for node in source.tree.body if isinstance(node, ast.Import | ast.ImportFrom)]
-        head += [
-            node
-            for node in source.tree.body
-            if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test)
-        ]
-        lines += sum((node.end_lineno or node.lineno) - node.lineno + 1 for node in head)
-    return lines / max(sum(source.lines for source in sources), 1)
-
-
 def main() -> int:
     """Print the counts and what is wrong; 1 where anything is."""
-    root = Path(__file__).parents[1]
-    sources = read_sources(root)
-    faults = [*list_faults(sources), *list_long_files(read_sources(root, BESIDE))]
-    lines = sum(source.lines for source in sources)
-    print(f"{len(sources)} files, {lines:,} lines, {measure_headers(sources):.1%} of them headers")
-    counts = Counter(find_room(source) for source in sources for _ in list_constants(source))
-    print("numbers:", ", ".join(f"{counts[room]} in {room}" for room in EXPLAINED))
+    sources = read_sources(Path(__file__).parents[1])
+    faults = list(list_faults(sources))
+    print(f"{len(sources)} files, {sum(source.lines for source in sources):,} lines")
     print(*faults, sep="\n", end="\n" if faults else "")
     return 1 if faults else 0
 
