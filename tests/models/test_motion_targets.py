@@ -99,10 +99,10 @@ def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     lines = export_model(make(*effects, intervals=intervals, fit=fit), "ros2_control").splitlines()
     at = next(i for i, line in enumerate(lines) if "wheel_separation_multiplier: 1.8" in line)
     assert "effective_track.k = 1.8 (95 %: 1.7 to 1.9)" in "".join(lines[at - 2 : at])
-    rivals = "undecided: drive_lag would explain the data as well"
+    rivals = "undecided: 'drive_lag' would explain the data as well"
     at_bound = "at its bound: a limit of the search, not a measurement"
     assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
-    assert "# Fitted from wheel encoders of yard/monday." in lines
+    assert "# Fitted from wheel encoders of 'yard/monday'." in lines
 
 
 def test_show_marks_the_numbers_that_an_export_marks() -> None:
