@@ -417,7 +417,9 @@ def check_geometry(vehicle: Vehicle, where: str) -> None:
             "implausible_geometry",
             f"{name} = {value:g} is {more} than any vehicle has ({limit:.3g})",
             where=where,
-            hint=f"If it is in {meant[0]}, write {meant[1]:g}." if meant else "Correct it.",
+            hint=f"If it is in {meant[0]}, write {meant[1]:g}."
+            if meant
+            else f"Give the true value: {name} under [vehicle] in run.toml, or in the model file.",
         )
 
 

@@ -12,7 +12,6 @@ from xml.etree import ElementTree as ET
 from xml.sax.saxutils import quoteattr
 
 import mujoco
-import pytest
 import yaml
 from verbs import run_verb
 
@@ -20,9 +19,14 @@ from pipeline.export import list_targets
 from pipeline.simulate import PLATFORMS, simulate_case
 
 if TYPE_CHECKING:
+    import pytest
+
     from pipeline.simulate.platforms import Published
 
-NAME = 'bot"""; EXECUTED = 1; """ \'\'\'---><include file="/etc/passwd"/><!--- {name}\\N{x}\n\r\t\u2028\U0001f916 -'
+NAME = (
+    'bot"""; EXECUTED = 1; """ \'\'\'---><include file="/etc/passwd"/><!--- '
+    "{name}\\N{x}\n\r\t\u2028\U0001f916 -"
+)
 
 
 def rename_robot(topic: Published, name: str) -> Published:

@@ -19,8 +19,11 @@ import yaml
 from exported_files import CAR, FIT, HUSKY, make
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from msgspec import structs
+from verbs import run_verb
 
-from pipeline.export import export_model, list_targets
+from pipeline.core import SlipError
+from pipeline.export import export_model, list_targets, read_current
 from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
@@ -130,9 +133,8 @@ def read_json(text: str) -> tuple[object, list[str]]:
 
 
 def read_xml(text: str) -> tuple[object, list[str]]:
-    root = ET.fromstring(  # noqa: S314 - it is our own
-        text, ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))
-    )
+    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))  # noqa: S314 - it is our own
+    root = ET.fromstring(text, parser)  # noqa: S314
     comments = [str(one.text).strip() for one in root.iter() if one.tag is ET.Comment]
     elements = [one for one in root.iter() if one.tag is not ET.Comment]
     if root.tag == "mujoco":
@@ -233,3 +235,78 @@ def test_a_name_comes_back_from_a_model_file(name: str) -> None:
     assert (again.model.vehicle.name, again.note) == (name, name)
     assert format_model(again) == text
     assert READERS["python"](export_model(again, "python"))[1] == [name]
+
+
+GEOMETRY = (
+    "wheel_radius_m",
+    "track_width_m",
+    "wheelbase_m",
+    "base_to_rear_axle_m",
+    "mass_kg",
+    "max_speed_mps",
+    "max_yaw_rate_radps",
+    "max_steering_rad",
+    "controller_track_multiplier",
+)
+ABSURD = (math.nan, math.inf, -math.inf, 1e300, -1e300)
+
+
+def list_absurd(kind: str) -> list[ModelFile]:
+    """The model with one number that no robot has, in every place that has one."""
+    file = make_named(kind, HARMLESS)
+    vehicle = file.model.vehicle
+    files = [
+        replace(file, model=Model(structs.replace(vehicle, **{key: value}), file.model.effects))
+        for key in GEOMETRY
+        for value in (*ABSURD, *((-1.0, 0.0, 1e-300) if key != "base_to_rear_axle_m" else ()))
+    ]
+    wide = (make_parameter("k", "1", (-math.inf, math.inf)),)
+    wild = [FormulaEffect("wild", {"v_y": "k * v0"}, wide, k=value) for value in (1e300, -1e300)]
+    files += [replace(file, model=file.model + effect) for effect in wild]
+    (run,) = file.list_fitted("runs")
+    files += [
+        replace(file, fit={**file.fit, "runs": [{**run, key: value}]})
+        for key in ("driven_speed_mps", "driven_yaw_rate_radps")
+        for value in (*ABSURD, -1.0)
+    ]
+    return files
+
+
+@pytest.mark.parametrize(("target", "kind"), TARGETS)
+def test_absurd_numbers_are_refused_in_one_line(target: str, kind: str) -> None:
+    for file in list_absurd(kind):
+        with pytest.raises(SlipError) as caught:
+            export_model(file, target, GAINS)
+        assert caught.value.code in {"absurd_number", "implausible_geometry"}
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [*ABSURD, -0.1])
+def test_absurd_errors_are_refused_before_a_covariance_is_made(value: float) -> None:
+    file = make_named("differential", HARMLESS)
+    ladder = [{"effects": [], "velocity_rms": [0.3, value, 0.4]}]
+    with pytest.raises(MotionError, match="velocity_rms"):
+        export_model(replace(file, fit={**file.fit, "ladder": ladder}), "robot_localization")
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e300"])
+def test_absurd_numbers_of_the_robots_own_file_are_refused(tmp_path: Path, text: str) -> None:
+    yaml_text = text.replace("inf", ".inf").replace("nan", ".nan").replace("1e300", "1.0e+300")
+    files = {"px4": f"1\t1\tRO_MAX_THR_SPEED\t{text}\t9\n", "vesc": f"speed_to_erpm_gain: {yaml_text}\n"}
+    for target, content in files.items():
+        path = tmp_path / target
+        path.write_text(content, encoding="utf-8")
+        with pytest.raises(MotionError, match="not a plausible number"):
+            export_model(make(vehicle=CAR), target, GAINS | read_current(path, target))
+
+
+def test_nothing_is_written_of_an_absurd_model(tmp_path: Path) -> None:
+    model, out = tmp_path / "m.toml", tmp_path / "out.yaml"
+    text = '[vehicle]\npreset = "husky_a200"\nmass_kg = 1e300\n'
+    for content in (text, text.replace("1e300", "inf"), text.replace("1e300", "-5")):
+        model.write_text(content, encoding="utf-8")
+        said = run_verb("model", "export", model, "--to", "nav2", "--file", out)
+        assert said.returncode != 0
+        assert len(said.stderr.splitlines()) == 1
+        assert "mass_kg" in said.stderr
+        assert not out.exists()
