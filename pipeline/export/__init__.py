@@ -163,6 +163,24 @@ def require_plausible(label: str, *values: float, least: float = -LARGEST) -> No
             raise MotionError("absurd_number", what, where=label, hint=hint)
 
 
+_FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
+_LEAST_FACTOR = 0.01
+"""Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
+
+
+def require_factors(file: ModelFile) -> None:
+    """Refuse effective lengths of almost zero, by which controllers and simulators divide.
+
+    Raises:
+        MotionError: ``absurd_number``.
+    """
+    for effect in file.model:
+        for parameter in effect.parameters:
+            if _FACTORS.intersection(parameter.quantities):
+                value = effect.values[parameter.name]
+                require_plausible(f"{effect.id}.{parameter.name}", value, least=_LEAST_FACTOR)
+
+
 def _check_numbers(file: ModelFile, current: Current) -> None:
     """Refuse absurd numbers that a target may write or calculate with.
 
@@ -285,6 +303,7 @@ class Facts:
     """
 
     def __init__(self, file: ModelFile) -> None:
+        require_factors(file)
         self.file = file
         self.vehicle = file.model.vehicle
 

@@ -10,7 +10,16 @@ import numpy as np
 
 from pipeline.core import make_plain
 from pipeline.core.arrays import Floats
-from pipeline.export import DRIVEN_SPEED, Current, Facts, Target, name_entity, quote_name, require_plausible
+from pipeline.export import (
+    DRIVEN_SPEED,
+    Current,
+    Facts,
+    Target,
+    name_entity,
+    quote_name,
+    require_factors,
+    require_plausible,
+)
 from pipeline.export.twin_body import (
     GRIP,
     TwinBody,
@@ -64,8 +73,9 @@ def build_twin(file: ModelFile) -> TwinBody:
     """Build the body of a model file's vehicle, whose geometry must be its own.
 
     Raises:
-        MotionError: ``wrong_vehicle``; ``no_geometry``.
+        MotionError: ``wrong_vehicle``; ``no_geometry``; ``absurd_number``.
     """
+    require_factors(file)
     return build_twin_body(file.model, find_driven_speed(file))
 
 

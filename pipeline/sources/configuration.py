@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
@@ -331,6 +332,15 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace("-", "_").replace(" ", "_")
 
 
+_LONGEST_ID: Final = 64
+"""Longest id of a vehicle, which stands in names of files and in errors, as long as that of an effect."""
+
+
+def make_id(name: str) -> str:
+    """Id of a vehicle of that name: lower case, with underscores in place of all but letters and digits."""
+    return re.sub(r"\W+", "_", name.strip().lower())[:_LONGEST_ID] or "vehicle"
+
+
 def resolve_vehicle(
     section: VehicleSection, *, recorded: str | None, where: str, recognized: Vehicle | None = None
 ) -> Vehicle:
@@ -358,10 +368,10 @@ def resolve_vehicle(
             said = f"names {recorded!r}, which is not a preset" if recorded else "does not name one"
             raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
         label = str(values.pop("name", None) or recorded or "vehicle")
-        values = {"kind": list_kinds()[0], "id": _plain(label), "name": label, **values}
+        values = {"kind": list_kinds()[0], "id": make_id(label), "name": label, **values}
         return _require_geometry(msgspec.convert(values, Vehicle), where)
     if "name" in values:
-        values["id"] = _plain(str(values["name"]))
+        values["id"] = make_id(str(values["name"]))
     return _require_geometry(msgspec.structs.replace(base, **values), where)
 
 

@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import ast
-import csv
-import json
 import math
-import re
 import tomllib
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
-from xml.etree import ElementTree as ET
 
-import mujoco
 import pytest
-import yaml
 from exported_files import CAR, FIT, HUSKY, make
+from exported_texts import HOSTILE, READERS
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec import structs
@@ -32,45 +26,7 @@ from pipeline.run import MotionError
 if TYPE_CHECKING:
     from pipeline.sources import Vehicle
 
-RUNS = "EXECUTED"
-"""A name of the exported module that only a name that runs can assign."""
 HARMLESS = "Yard robot 7"
-HOSTILE = [
-    f'bot"""\n{RUNS} = 1\n"""',
-    f"bot'''\n{RUNS} = 1\n'''",
-    f'"; {RUNS} = 1; "',
-    f"x\\'; {RUNS} = 1 #",
-    f"{{radius}}{{name}}{{steps}} {{{RUNS}}} {{0}} %s %(name)s $HOME",
-    "\\N{x}",
-    "\\u0022\\x2d\\",
-    "\\",
-    '\\"""\n"""',
-    "a-",
-    "a--",
-    "a---",
-    "--->",
-    "---->",
-    '---><include file="/etc/passwd"/><!---',
-    "--><plugin filename='evil.so' name='evil'/><!--",
-    "]]></x><x>&amp;&#10;&lt;",
-    "line\nevil: 1",
-    "line\r\nevil: 1",
-    "line\revil: 1",
-    "a\u2028evil: 1\u2029b\x85c",
-    "\x00\x01\x07\x1b[31m\x7f\x9f",
-    "\ud800 alone",
-    "\U0001f916 \U0010ffff \ufeff\u202e",
-    "é ß 雪 \u0301",
-    "# a\n1\t1\tRO_SPEED_LIM\t9\t9",
-    ": [ *a &b !!python/object/apply:os.system ['x']",
-    "- a: b\n---\n...\n%YAML 9.9",
-    "",
-    " ",
-    "'",
-    '"',
-    "''",
-    "x" * 5000,
-]
 NAMES = st.one_of(
     st.sampled_from(HOSTILE),
     st.text(max_size=30),
@@ -109,84 +65,6 @@ def make_named(kind: str, name: str) -> ModelFile:
     )  # fmt: skip
 
 
-def read_python(text: str) -> tuple[object, list[str]]:
-    tree = ast.parse(text)
-    space: dict[str, object] = {}
-    exec(compile(text, "exported", "exec"), space)  # noqa: S102 - that is what it is for
-    assert RUNS not in space
-    names = [str(space["VEHICLE"])]
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "VEHICLE":
-            node.value = ast.Constant("")
-    return ast.dump(tree), names
-
-
-def read_json(text: str) -> tuple[object, list[str]]:
-    content = json.loads(text, parse_constant=pytest.fail)
-    vehicle = content["vehicle"]
-    return [sorted(content), sorted(vehicle), content["effects"]], [
-        vehicle["name"],
-        vehicle["id"],
-        content["fit"]["runs"][0]["run"],
-        *content["warnings"],
-    ]
-
-
-def read_xml(text: str) -> tuple[object, list[str]]:
-    parser = ET.XMLParser(target=ET.TreeBuilder(insert_comments=True))  # noqa: S314 - it is our own
-    root = ET.fromstring(text, parser)  # noqa: S314
-    comments = [str(one.text).strip() for one in root.iter() if one.tag is ET.Comment]
-    elements = [one for one in root.iter() if one.tag is not ET.Comment]
-    if root.tag == "mujoco":
-        mujoco.MjModel.from_xml_string(text)
-    entities = [root.attrib.pop("model")] if root.tag == "mujoco" else []
-    entities += [one.attrib.pop("name") for one in root.iter("model") if one.get("name") != "ground"]
-    assert all(re.fullmatch(r"\w+", name) for name in entities)
-    return [(one.tag, one.attrib, (one.text or "").strip()) for one in elements], list_literals(comments)
-
-
-def read_parameters(text: str) -> tuple[object, list[str]]:
-    tree = yaml.safe_load(text)
-    assert tree == yaml.load(text, Loader=yaml.CSafeLoader)
-    return tree, list_literals(list_comments(text))
-
-
-def read_table(text: str) -> tuple[object, list[str]]:
-    rows = [row for row in csv.reader(text.split("\n"), delimiter="\t") if row and row[0][:1] != "#"]
-    assert {len(row) for row in rows} == {5}
-    assert all(math.isfinite(float(row[3])) for row in rows)
-    return rows, list_literals(list_comments(text))
-
-
-def list_comments(text: str) -> list[str]:
-    return [line.strip() for line in text.split("\n") if line.strip().startswith("#")]
-
-
-LITERAL = r"""(?<!\w)(?:'(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*")"""
-
-
-def list_literals(comments: list[str]) -> list[str]:
-    """The literals in comments, from left to right."""
-    names = []
-    for line in comments:
-        assert line.isprintable()
-        # An apostrophe of ours follows a letter.
-        names += [ast.literal_eval(one) for one in re.findall(LITERAL, line)]
-    return names
-
-
-READERS = {
-    "json": read_json,
-    "python": read_python,
-    "traction": read_python,
-    "gazebo": read_xml,
-    "mjcf": read_xml,
-    "sdf": read_xml,
-    "px4": read_table,
-    **dict.fromkeys(
-        ("autoware", "nav2", "nav2_traction", "robot_localization", "ros2_control", "vesc"), read_parameters
-    ),
-}
 GAINS = {
     "speed_to_erpm_gain": 4614.0,
     "steering_angle_to_servo_gain": -1.2135,
