@@ -193,8 +193,8 @@ def _check_numbers(file: ModelFile, current: Current) -> None:
                 require_plausible(f"{effect.id}.{parameter.name}", value)
     for row in file.list_fitted("runs"):
         for key in (DRIVEN_SPEED, DRIVEN_TURN):
-            if isinstance(value := row.get(key), float):
-                require_plausible(f"fit.runs.{key}", value, least=0.0)
+            if isinstance(driven := row.get(key), float):
+                require_plausible(f"fit.runs.{key}", driven, least=0.0)
     for name, value in current.items():
         require_plausible(name, value)
 

@@ -330,9 +330,18 @@ def test_a_wrong_file_of_parameters_is_one_clear_error(
     assert error.value.where.startswith(str(file))
 
 
-def test_a_quotient_by_zero_is_not_written() -> None:
-    stuck = make(find_effect("wheel_radius")(k=0.0, fixed=["k"]), vehicle=F1TENTH)
-    assert "speed_to_erpm_gain" not in take("vesc", stuck)
+@pytest.mark.parametrize("k", [0.0, 5e-324, 1e-6])
+def test_a_vehicle_that_does_not_move_has_no_parameters(k: float) -> None:
+    for vehicle in (HUSKY, F1TENTH):
+        stuck = make(find_effect("wheel_radius")(k=k, fixed=["k"]), vehicle=vehicle, fit=FIT)
+        for target in list_targets():
+            if target.name in {"json", "python"}:
+                assert export_model(stuck, target.name)
+                continue
+            with pytest.raises(MotionError) as caught:
+                export_model(stuck, target.name)
+            assert caught.value.code in {"absurd_number", "wrong_vehicle"}
+    assert caught.value.where == "wheel_radius.k"
 
 
 def test_other_targets_and_vehicles_are_one_clear_error() -> None:
