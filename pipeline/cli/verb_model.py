@@ -158,7 +158,7 @@ def add(  # noqa: D417 - the shared options document themselves
 
     An effect is refused, and the file stays as it was, if the data do not support it: its sign is impossible,
     an error over 2 s rises or none falls, the reduction is not significant, or an interval includes the
-    neutral value.
+    neutral value. One that cannot act on the input is always refused: it would have no value.
 
     Args:
         model: the model file.

@@ -11,6 +11,7 @@ import io
 import math
 import operator
 import pkgutil
+import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,6 +27,7 @@ from pipeline.models.formula import FormulaEffect
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
 from pipeline.run import MotionError
+from pipeline.sources.configuration import Vehicle, check_geometry
 
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import ScalarNode
@@ -131,9 +133,70 @@ def export_model(file: ModelFile, name: str, current: Current | None = None) -> 
 
     Raises:
         MotionError: ``unknown_target``; ``wrong_vehicle``, the target has no parameters for its kind;
-            others, see the target.
+            ``absurd_number``, a value that no robot can have; others, see the target.
+        ConfigurationError: ``implausible_geometry``.
     """
-    return find_target(name).write(file, current or {})
+    target = find_target(name)
+    used = dict(current or {})
+    check_geometry(file.model.vehicle, file.model.vehicle.id)
+    _check_numbers(file, used)
+    return target.write(file, used)
+
+
+LARGEST = 1e9
+"""Bound of the absolute values that are exported: in SI units no parameter of a robot or its controller is so
+large."""
+DRIVEN_SPEED, DRIVEN_TURN = "driven_speed_mps", "driven_yaw_rate_radps"
+"""Keys of the largest driven values in the runs of a fit."""
+
+
+def require_plausible(label: str, *values: float, least: float = -LARGEST) -> None:
+    """Refuse numbers that are not finite, or beyond those of any robot.
+
+    Raises:
+        MotionError: ``absurd_number``.
+    """
+    for value in values:
+        if not least <= value <= LARGEST:
+            what = f"{label} = {value:g} is not a plausible number, so nothing is written"
+            hint = "Correct it in the model file or in the file of --current, or fit the model again."
+            raise MotionError("absurd_number", what, where=label, hint=hint)
+
+
+_FACTORS = {Quantity.RADIUS, Quantity.TRACK, Quantity.WHEELBASE}
+_LEAST_FACTOR = 0.01
+"""Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
+
+
+def require_factors(file: ModelFile) -> None:
+    """Refuse effective lengths of almost zero, by which controllers and simulators divide.
+
+    Raises:
+        MotionError: ``absurd_number``.
+    """
+    for effect in file.model:
+        for parameter in effect.parameters:
+            if _FACTORS.intersection(parameter.quantities):
+                value = effect.values[parameter.name]
+                require_plausible(f"{effect.id}.{parameter.name}", value, least=_LEAST_FACTOR)
+
+
+def _check_numbers(file: ModelFile, current: Current) -> None:
+    """Refuse absurd numbers that a target may write or calculate with.
+
+    An open parameter, such as a limit without a value, has a neutral value that is not finite.
+    """
+    for effect in file.model:
+        for parameter in effect.parameters:
+            value = effect.values[parameter.name]
+            if math.isfinite(value) or math.isfinite(parameter.neutral):
+                require_plausible(f"{effect.id}.{parameter.name}", value)
+    for row in file.list_fitted("runs"):
+        for key in (DRIVEN_SPEED, DRIVEN_TURN):
+            if isinstance(driven := row.get(key), float):
+                require_plausible(f"fit.runs.{key}", driven, least=0.0)
+    for name, value in current.items():
+        require_plausible(name, value)
 
 
 @dataclass(frozen=True)
@@ -226,6 +289,7 @@ class Sheet:
             self._append(path, numbers, combine(lambda *_: math.nan, *measured), note)
 
     def _append(self, path: str, value: float | tuple[float, ...], amount: Amount, note: str) -> None:
+        require_plausible(path, *(value if isinstance(value, tuple) else (value,)))
         notes = (note,) if note else ()
         self.settings.append(Setting(path, value, (*amount.sources, *notes), amount.effects))
 
@@ -239,6 +303,7 @@ class Facts:
     """
 
     def __init__(self, file: ModelFile) -> None:
+        require_factors(file)
         self.file = file
         self.vehicle = file.model.vehicle
 
@@ -260,7 +325,8 @@ class Facts:
     def measure(self, name: str) -> Amount:
         """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
         value = getattr(self.vehicle, name)
-        sources = () if name in self.vehicle.stand_ins else (f"vehicle {self.vehicle.id}: {name}",)
+        known = name not in self.vehicle.stand_ins
+        sources = (f"vehicle {name_entity(self.vehicle)}: {name}",) if known else ()
         return Amount(math.nan if value is None else value, sources)
 
     def find_radius(self) -> Amount:
@@ -307,7 +373,7 @@ class Facts:
         """
         wheels = self.take(Quantity.WHEEL_SPEED_LIMIT).change(operator.mul, self.find_radius())
         commanded = self.take(Quantity.SPEED_LIMIT).change(operator.mul, self.take(Quantity.RADIUS))
-        return self._hold(_take_least(commanded, wheels), "driven_speed_mps", "m/s")
+        return self._hold(_take_least(commanded, wheels), DRIVEN_SPEED, "m/s")
 
     def find_turn_limit(self) -> Amount:
         """Largest yaw rate of the body [rad/s], from its command or from the wheels turning on the spot.
@@ -320,7 +386,7 @@ class Facts:
         if width.is_known:
             own = 1.0 if is_car else self.vehicle.controller_track_multiplier
             commanded = commanded.change(lambda w, r, k: w * own * r / k, self.take(Quantity.RADIUS), width)
-        return self._hold(_take_least(commanded, wheels), "driven_yaw_rate_radps", "rad/s")
+        return self._hold(_take_least(commanded, wheels), DRIVEN_TURN, "rad/s")
 
     def _hold(self, limit: Amount, key: str, unit: str) -> Amount:
         """Limit of the body, at most the largest driven value: wheels that turn faster may slip."""
@@ -362,9 +428,10 @@ class Facts:
 
     def format_fit(self) -> str:
         """Data that the model was fitted to; empty before a fit."""
-        names = [str(run.get("run")) for run in self.file.list_fitted("runs")]
+        names = [quote_name(str(run.get("run"))) for run in self.file.list_fitted("runs")]
         source = str(self.file.fit.get("input"))
-        return f"Fitted {INPUT_WORDS.get(source, source)} of {', '.join(names)}." if names else ""
+        words = INPUT_WORDS.get(source) or quote_name(source)
+        return f"Fitted {words} of {', '.join(names)}." if names else ""
 
     def _spin(self, quantity: Quantity) -> Amount:
         return self._turn(self.take(quantity).change(operator.mul, self.find_radius()))
@@ -388,11 +455,22 @@ class Facts:
             low, high = self.file.intervals[label]
             text += f" (95 %: {low:.5g} to {high:.5g})"
         if rivals := self.file.list_rivals(effect.id):
-            text += f", undecided: {' or '.join(rivals)} would explain the data as well"
+            names = " or ".join(map(quote_name, rivals))
+            text += f", undecided: {names} would explain the data as well"
         for number, other, at in self.file.unless:
-            text += f", {at:.5g}{unit} with {other} in the model" if number == label else ""
+            text += f", {at:.5g}{unit} with {quote_name(other)} in the model" if number == label else ""
         doubt = self.file.find_doubt(effect, parameter)
         return f"{text}, {doubt}" if doubt else text
+
+
+def quote_name(name: str) -> str:
+    """A name from a log or a model file as a literal in a comment: printable, and with its own end."""
+    return repr(name)
+
+
+def name_entity(vehicle: Vehicle) -> str:
+    """Name of the vehicle as an identifier: letters, digits and underscores."""
+    return re.sub(r"\W+", "_", vehicle.id) or "robot"
 
 
 def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:
@@ -411,7 +489,7 @@ def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sh
             hint="Export to another target: json and python take every vehicle.",
         )
     head = [
-        f"{facts.vehicle.name}: {target.about}.",
+        f"{quote_name(facts.vehicle.name)}: {target.about}.",
         f"Names: {target.source}.",
         facts.format_fit(),
         facts.vehicle.format_unknown(),

@@ -22,6 +22,8 @@ from pipeline.export import (
     Target,
     combine,
     list_comments,
+    name_entity,
+    require_plausible,
     start_sheet,
     write_yaml,
 )
@@ -208,6 +210,7 @@ def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
     except msgspec.ValidationError:
         steps = []
     for step in reversed(steps):
+        require_plausible("fit.ladder.velocity_rms", *step.velocity_rms, least=0.0)
         if all(name in file.model and _is_seen(file.model.effect(name), known) for name in step.effects):
             return step
     what = "the model was never fitted: it has no held-out errors to make a covariance of"
@@ -450,7 +453,8 @@ def _find_current(facts: Facts, current: Current, name: str) -> Amount:
         hint = "Give the car's file: --current vesc.yaml."
         raise MotionError("gains_unknown", what, where=facts.vehicle.id, hint=hint)
     value = float(getattr(facts.vehicle.units[unit], part))
-    return Amount(value, (f"{name} = {value:g} of the preset {facts.vehicle.id}; others in use: --current",))
+    source = f"{name} = {value:g} of the preset {name_entity(facts.vehicle)}; others in use: --current"
+    return Amount(value, (source,))
 
 
 VESC = Target(

@@ -12,7 +12,7 @@ from importlib import resources
 from typing import cast
 
 from pipeline.core import finite_or_none, pick
-from pipeline.export import Amount, Current, Facts, Target, start_sheet, write_yaml
+from pipeline.export import Amount, Current, Facts, Target, require_plausible, start_sheet, write_yaml
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Place
 from pipeline.models.formula import FormulaEffect
@@ -54,7 +54,7 @@ def write_json_object(file: ModelFile, current: Current) -> str:
     warnings = [*file.warnings, *filter(None, [vehicle.format_unknown()])]
     content = {
         "vehicle": {
-            **pick(vehicle, "id", "kind", *_GEOMETRY),
+            **pick(vehicle, "id", "name", "kind", *_GEOMETRY),
             **dict.fromkeys(stand_ins),
             **({"stand_ins": stand_ins} if stand_ins else {}),
         },
@@ -242,10 +242,11 @@ def write_traction(file: ModelFile, current: Current) -> str:
     del current
     source = textwrap.dedent(inspect.getsource(trace_traction)).replace("Sequence[float]", "list[float]")
     values = {name: float(amount.value) for name, amount in _list_thresholds(Facts(file)).items()}
+    require_plausible("a threshold of traction", *values.values())
     lines = "".join(f"    {name!r}: {value:.6g},\n" for name, value in values.items() if name != "usual_gain")
     return (
-        f'"""Traction of {file.model.vehicle.name.encode("ascii", "replace").decode()}: '
-        'does it dig in, spin or slide."""\n\n'
+        '"""Traction of a vehicle: does it dig in, spin or slide."""\n\n'
+        f"VEHICLE = {file.model.vehicle.name!a}\n"
         f"USUAL_GAIN = {values['usual_gain']:.6g}  # forward speed over that of the wheels\n"
         f"LIMITS = {{\n{lines}}}\n\n\n{source}\n\n"
         "def judge_traction(wheels, turning, body, step_s):\n"
@@ -272,8 +273,7 @@ def write_thresholds(file: ModelFile, current: Current) -> str:
     del current
     facts, sheet = start_sheet(file, NAV2_TRACTION, "differential", "ackermann")
     for name, amount in _list_thresholds(facts).items():
-        if math.isfinite(amount.value):
-            sheet.add(f"{_NODE}.{name}", amount)
+        sheet.add(f"{_NODE}.{name}", amount)
     return write_yaml(facts, sheet)
 
 

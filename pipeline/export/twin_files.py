@@ -10,7 +10,16 @@ import numpy as np
 
 from pipeline.core import make_plain
 from pipeline.core.arrays import Floats
-from pipeline.export import Current, Facts, Target
+from pipeline.export import (
+    DRIVEN_SPEED,
+    Current,
+    Facts,
+    Target,
+    name_entity,
+    quote_name,
+    require_factors,
+    require_plausible,
+)
 from pipeline.export.twin_body import (
     GRIP,
     TwinBody,
@@ -64,15 +73,16 @@ def build_twin(file: ModelFile) -> TwinBody:
     """Build the body of a model file's vehicle, whose geometry must be its own.
 
     Raises:
-        MotionError: ``wrong_vehicle``; ``no_geometry``.
+        MotionError: ``wrong_vehicle``; ``no_geometry``; ``absurd_number``.
     """
+    require_factors(file)
     return build_twin_body(file.model, find_driven_speed(file))
 
 
 def find_driven_speed(file: ModelFile) -> float:
     """Driven speed of the runs of a fit [m/s], otherwise half of the vehicle's maximum."""
     rows = file.list_fitted("runs")
-    driven = [value for row in rows if isinstance(value := row.get("driven_speed_mps"), float)]
+    driven = [value for row in rows if isinstance(value := row.get(DRIVEN_SPEED), float)]
     return max(driven) if driven else 0.5 * (file.model.vehicle.max_speed_mps or 2.0)
 
 
@@ -83,7 +93,7 @@ def write_world(body: TwinBody, head: Sequence[str] = ()) -> str:
         body: the body.
         head: lines of the comment above it.
     """
-    root = ET.Element("mujoco", {"model": body.vehicle.id})
+    root = ET.Element("mujoco", {"model": name_entity(body.vehicle)})
     for line in [*head, *list_notes(body, body.controller), *_note_friction(body)]:
         root.append(ET.Comment(write_comment(line)))
     ET.SubElement(root, "compiler", {"angle": "radian", "autolimits": "true"})
@@ -365,7 +375,7 @@ def _write_lag(lag_s: float) -> dict[str, str]:
 def list_head(file: ModelFile, target: Target) -> list[str]:
     """Head of a twin's file: vehicle, source of its names, and data of the fit."""
     fitted = Facts(file).format_fit()
-    head = [f"{file.model.vehicle.name}: {target.about}.", f"Names: {target.source}."]
+    head = [f"{quote_name(file.model.vehicle.name)}: {target.about}.", f"Names: {target.source}."]
     return [*head, fitted] if fitted else head
 
 
@@ -402,13 +412,21 @@ def _list_effects(title: str, effects: Iterable[Effect]) -> list[str]:
 
 
 def format_numbers(*numbers: float) -> str:
-    """Format numbers as an XML attribute."""
+    """Format numbers as an XML attribute.
+
+    Raises:
+        MotionError: ``absurd_number``.
+    """
+    require_plausible("a dimension or a coefficient of the twin", *numbers)
     return " ".join(f"{number:.6g}" for number in numbers)
 
 
+_DASHES = r"-\x2d"
+
+
 def write_comment(text: str) -> str:
-    """Format a comment; XML does not allow two adjacent dashes in it."""
-    return f" {'- -'.join(make_plain(text).split('--'))} "
+    """Format a comment; XML allows no two adjacent dashes in it, so the second is written as in a literal."""
+    return f" {make_plain(text).replace('--', _DASHES)} "
 
 
 MJCF = Target(

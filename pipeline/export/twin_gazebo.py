@@ -9,7 +9,7 @@ from xml.etree import ElementTree as ET
 
 import msgspec
 
-from pipeline.export import Current, Facts, Sheet, Target, list_comments, start_sheet
+from pipeline.export import Current, Facts, Sheet, Target, list_comments, name_entity, start_sheet
 from pipeline.export.twin_body import GRIP, TwinBody, TwinWheel, weigh_chassis, weigh_wheel
 from pipeline.export.twin_files import build_twin, format_numbers, list_head, list_notes, write_comment
 from pipeline.models import Model
@@ -163,7 +163,7 @@ def _add_texts(element: ET.Element, values: Mapping[str, str]) -> None:
 
 def _add_model(world: ET.Element, body: TwinBody, file: ModelFile) -> None:
     height = max(wheel.radius_m for wheel in body.wheels)
-    model = ET.SubElement(world, "model", {"name": body.vehicle.id})
+    model = ET.SubElement(world, "model", {"name": name_entity(body.vehicle)})
     _add_texts(model, {"pose": format_numbers(0.0, 0.0, height, 0.0, 0.0, 0.0)})
     base = ET.SubElement(model, "link", {"name": "base_link"})
     mass, (flat, turning), low = weigh_chassis(body)

@@ -43,7 +43,7 @@ from pipeline.models.literature import list_models
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import is_of_one_run
 from pipeline.report.motion_view import load_motion_run
-from pipeline.run import MotionRun
+from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
 
@@ -159,9 +159,10 @@ def fit_to_runs(
         tie: function that adds prior knowledge of the parameters to the problem.
 
     Raises:
-        MotionError: the runs lack the input, or are too short.
+        MotionError: the runs lack the input, or are too short; ``not_fitted``, an added effect cannot act.
     """
     chosen = choose_input(runs, source, after.model, last=before.last_input)
+    _require_fitted([effect for effect in after.model if effect.id not in before.model.ids], runs, chosen)
     problem = Problem(runs, after.model.vehicle, chosen.source)
     if tie is not None:
         problem = tie(problem)
@@ -173,6 +174,15 @@ def fit_to_runs(
         # The residual of the physical model has changed: train the learned term again.
         new = judge_learned_term(new)
     return ModelFit(note_fit(after, new), old, new, chosen)
+
+
+def _require_fitted(added: Sequence[Effect], runs: Sequence[MotionRun], chosen: InputChoice) -> None:
+    """Refuse to add effects that the runs cannot give a value, which would be written neutral."""
+    unfit = choose_input(runs, chosen.source.value, added)
+    if unfit.idle:
+        what = f"{unfit.warning}; the model is unchanged"
+        hint = "Fit it to a log and an input on which it acts, or choose another effect."
+        raise MotionError("not_fitted", what, where=", ".join(unfit.idle), hint=hint)
 
 
 Against = Literal["literature", "learned"]

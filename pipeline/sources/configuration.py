@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from importlib import resources
@@ -331,6 +332,15 @@ def _plain(name: str) -> str:
     return name.strip().lower().replace("-", "_").replace(" ", "_")
 
 
+_LONGEST_ID: Final = 64
+"""Longest id of a vehicle, which stands in names of files and in errors, as long as that of an effect."""
+
+
+def make_id(name: str) -> str:
+    """Id of a vehicle of that name: lower case, with underscores in place of all but letters and digits."""
+    return re.sub(r"\W+", "_", name.strip().lower())[:_LONGEST_ID] or "vehicle"
+
+
 def resolve_vehicle(
     section: VehicleSection, *, recorded: str | None, where: str, recognized: Vehicle | None = None
 ) -> Vehicle:
@@ -358,18 +368,33 @@ def resolve_vehicle(
             said = f"names {recorded!r}, which is not a preset" if recorded else "does not name one"
             raise _unknown(f"the vehicle cannot be determined: the log {said}", where)
         label = str(values.pop("name", None) or recorded or "vehicle")
-        values = {"kind": list_kinds()[0], "id": _plain(label), "name": label, **values}
-        return _check_geometry(msgspec.convert(values, Vehicle), where)
+        values = {"kind": list_kinds()[0], "id": make_id(label), "name": label, **values}
+        return _require_geometry(msgspec.convert(values, Vehicle), where)
     if "name" in values:
-        values["id"] = _plain(str(values["name"]))
-    return _check_geometry(msgspec.structs.replace(base, **values), where)
+        values["id"] = make_id(str(values["name"]))
+    return _require_geometry(msgspec.structs.replace(base, **values), where)
 
 
-_LARGEST_M: Final = {"wheel_radius_m": 2.5, "track_width_m": 15.0, "wheelbase_m": 25.0}
-"""Upper bounds [m], above the largest mining trucks: 2.0, 9 and 8."""
+_RANGES: Final = {
+    "wheel_radius_m": (1e-3, 2.5),
+    "track_width_m": (5e-3, 15.0),
+    "wheelbase_m": (5e-3, 25.0),
+    "base_to_rear_axle_m": (-25.0, 25.0),
+    "mass_kg": (1e-3, 1e6),
+    "max_speed_mps": (1e-3, 100.0),
+    "max_yaw_rate_radps": (1e-3, 100.0),
+    "max_steering_rad": (1e-3, math.pi),
+    "controller_track_multiplier": (1e-2, 100.0),
+}
+"""Bounds of a vehicle's values in SI units: above the largest mining trucks (wheels of 2.0 m, a track of 9 m,
+a wheelbase of 8 m, 620 t), and below robots of a centimetre."""
+_SMALLER: Final = {
+    "m": (("centimetres", 1e-2), ("millimetres", 1e-3)),
+    "rad": (("degrees", math.pi / 180.0),),
+}
 
 
-def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
+def _require_geometry(vehicle: Vehicle, where: str) -> Vehicle:
     required = [quantity.name for quantity in vehicle.kinematics.geometry if quantity.required]
     needed = next((name for name in required if getattr(vehicle, name) is None), None)
     if needed is not None:
@@ -380,18 +405,32 @@ def _check_geometry(vehicle: Vehicle, where: str) -> Vehicle:
             hint=f"Set vehicle.{needed} in run.toml"
             + (" or give --track-width." if needed == "track_width_m" else "."),
         )
-    for name, largest in _LARGEST_M.items():
-        value = getattr(vehicle, name)
-        if value is not None and value > largest:
-            units = (("centimetres", 1e-2), ("millimetres", 1e-3))
-            unit, metres = next((one for one in units if value * one[1] <= largest), units[-1])
-            raise ConfigurationError(
-                "implausible_geometry",
-                f"{name} = {value:g} is more than any vehicle has ({largest:g} m)",
-                where=where,
-                hint=f"If it is in {unit}, write {value * metres:g}.",
-            )
+    check_geometry(vehicle, where)
     return vehicle
+
+
+def check_geometry(vehicle: Vehicle, where: str) -> None:
+    """Refuse a vehicle with a value that no vehicle has.
+
+    Raises:
+        ConfigurationError: ``implausible_geometry``.
+    """
+    for name, (least, largest) in _RANGES.items():
+        value = getattr(vehicle, name)
+        if value is None or least <= value <= largest:
+            continue
+        unit = name.rpartition("_")[2]
+        limit, more = (largest, "more") if value > largest else (least, "less")
+        fits = ((word, value * factor) for word, factor in _SMALLER.get(unit, ()))
+        meant = next(((word, number) for word, number in fits if least <= number <= largest), None)
+        raise ConfigurationError(
+            "implausible_geometry",
+            f"{name} = {value:g} is {more} than any vehicle has ({limit:.3g})",
+            where=where,
+            hint=f"If it is in {meant[0]}, write {meant[1]:g}."
+            if meant
+            else f"Give the true value: {name} under [vehicle] in run.toml, or in the model file.",
+        )
 
 
 def _unknown(what: str, where: str, *, named: str = "") -> ConfigurationError:

@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core import rigid
 from pipeline.core.arrays import Floats
 from pipeline.logs import ChannelInfo, LogError, TransformBuffer
-from pipeline.sources.configuration import Vehicle, list_presets
+from pipeline.sources.configuration import Vehicle, list_presets, make_id
 
 # Geometry from a robot description (URDF): wheels, their radii, track width, wheelbase and steering.
 #
@@ -302,7 +302,7 @@ def _build(description: Description) -> Recognized | None:
 def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> Vehicle | None:
     """A vehicle of that name and geometry; None if its kind needs more values."""
     name = name.strip("/")
-    values = {"id": re.sub(r"\W+", "_", name.lower()), "name": name, "kind": kind, **geometry}
+    values = {"id": make_id(name), "name": name, "kind": kind, **geometry}
     try:
         vehicle = msgspec.convert(values, Vehicle)
     except msgspec.ValidationError:

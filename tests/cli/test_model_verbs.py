@@ -9,10 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from verbs import run_verb
 
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.models import Place, list_effects
 from pipeline.simulate import simulate_case
 
 RUN = "field/lagging"
@@ -69,7 +71,8 @@ def test_measured_wheels_are_refused_to_it_in_one_line(
     results: Path, model: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = "not fitted from wheel encoders: drive_lag acts between command and wheels (--input command)"
-    found = change(results, capsys, "add", model, "drive_lag", "--input", "measured")
+    change(results, capsys, "add", model, "drive_lag")
+    found = change(results, capsys, "fit", model, "--input", "measured")
     assert found["input"] == "measured"
     assert found["input_reason"] == "as requested"
     assert found["not_fitted"] == ["drive_lag"]
@@ -79,6 +82,25 @@ def test_measured_wheels_are_refused_to_it_in_one_line(
     printed = capsys.readouterr().out.splitlines()
     assert printed.count(said) == 1
     assert f"from wheel encoders of {RUN} (as requested)" in printed
+
+
+DRIVETRAIN = [
+    effect.id for effect in list_effects() if effect.place <= Place.DRIVE and "differential" in effect.kinds
+]
+
+
+@pytest.mark.parametrize("more", [(), ("--anyway",)])
+def test_an_effect_that_cannot_be_fitted_is_not_added(
+    results: Path, model: Path, more: tuple[str, ...]
+) -> None:
+    written = model.read_bytes()
+    for effect in DRIVETRAIN:
+        on = ("--on", RUN, "--out", results, "--input", "measured", "--quiet")
+        said = run_verb("model", "add", model, "effective_track", effect, *on, *more)
+        assert said.returncode == 1
+        (line,) = said.stderr.splitlines()
+        assert f"{effect} acts between command and wheels (--input command); the model is unchanged" in line
+        assert model.read_bytes() == written
 
 
 def test_two_models_are_compared_on_one_input(

@@ -148,7 +148,7 @@ def test_the_written_model_says_it_until_the_effect_is_in(
     ((label, other, value),) = file.unless
     assert (label, other) == ("lateral_skid.c", "body_inertia")
     assert value == pytest.approx(unless.instead["c"].value, rel=1e-4)
-    assert "s with body_inertia in the model" in export_model(file, "ros2_control")
+    assert "s with 'body_inertia' in the model" in export_model(file, "ros2_control")
     # Added, the effect and the skid have the numbers that were said.
     problem = Problem([load_recording(recording, vehicle)], vehicle, Input.COMMAND)
     both = file.model + find_effect("body_inertia")()

@@ -99,10 +99,10 @@ def test_a_line_says_its_effect_value_interval_and_bound() -> None:
     lines = export_model(make(*effects, intervals=intervals, fit=fit), "ros2_control").splitlines()
     at = next(i for i, line in enumerate(lines) if "wheel_separation_multiplier: 1.8" in line)
     assert "effective_track.k = 1.8 (95 %: 1.7 to 1.9)" in "".join(lines[at - 2 : at])
-    rivals = "undecided: drive_lag would explain the data as well"
+    rivals = "undecided: 'drive_lag' would explain the data as well"
     at_bound = "at its bound: a limit of the search, not a measurement"
     assert f"#   transport_delay.d = 1 s, {rivals}, {at_bound}" in lines
-    assert "# Fitted from wheel encoders of yard/monday." in lines
+    assert "# Fitted from wheel encoders of 'yard/monday'." in lines
 
 
 def test_show_marks_the_numbers_that_an_export_marks() -> None:
@@ -330,9 +330,18 @@ def test_a_wrong_file_of_parameters_is_one_clear_error(
     assert error.value.where.startswith(str(file))
 
 
-def test_a_quotient_by_zero_is_not_written() -> None:
-    stuck = make(find_effect("wheel_radius")(k=0.0, fixed=["k"]), vehicle=F1TENTH)
-    assert "speed_to_erpm_gain" not in take("vesc", stuck)
+@pytest.mark.parametrize("k", [0.0, 5e-324, 1e-6])
+def test_a_vehicle_that_does_not_move_has_no_parameters(k: float) -> None:
+    for vehicle in (HUSKY, F1TENTH):
+        stuck = make(find_effect("wheel_radius")(k=k, fixed=["k"]), vehicle=vehicle, fit=FIT)
+        for target in list_targets():
+            if target.name in {"json", "python"}:
+                assert export_model(stuck, target.name)
+                continue
+            with pytest.raises(MotionError) as caught:
+                export_model(stuck, target.name)
+            assert caught.value.code in {"absurd_number", "wrong_vehicle"}
+    assert caught.value.where == "wheel_radius.k"
 
 
 def test_other_targets_and_vehicles_are_one_clear_error() -> None:

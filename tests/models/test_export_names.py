@@ -1,0 +1,190 @@
+"""In the files of all targets names from logs and model files are data, and absurd numbers are refused."""
+
+from __future__ import annotations
+
+import math
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import pytest
+from exported_files import CAR, FIT, HUSKY, make
+from exported_texts import HOSTILE, READERS
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from msgspec import structs
+from verbs import run_verb
+
+from pipeline.core import SlipError
+from pipeline.export import export_model, list_targets, read_current
+from pipeline.models import Model, ModelFile, find_effect, format_model
+from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.models.model_file import parse_model
+from pipeline.run import MotionError
+
+if TYPE_CHECKING:
+    from pipeline.sources import Vehicle
+
+HARMLESS = "Yard robot 7"
+NAMES = st.one_of(
+    st.sampled_from(HOSTILE),
+    st.text(max_size=30),
+    st.text(alphabet="-'\"\\\n\r{}<>!#: \x00\u2028aNx", max_size=12),
+)
+VEHICLES = {"differential": HUSKY, "ackermann": CAR}
+
+
+def rename(vehicle: Vehicle, name: str) -> Vehicle:
+    fields = {field: getattr(vehicle, field) for field in vehicle.__struct_fields__}
+    return type(vehicle)(**fields | {"name": name, "id": name})
+
+
+def make_named(kind: str, name: str) -> ModelFile:
+    """A model that has the name wherever a log or a model file can put one."""
+    effects = [
+        find_effect("drive_lag")(tau=0.2),
+        find_effect("wheel_radius")(k=0.97),
+        find_effect("body_speed_limit")(limit=0.9),
+    ]
+    if kind == "ackermann":
+        effects.append(find_effect("steering_offset")(o=0.02))
+    wind = FormulaEffect("a---é", {"v_y": "k * v0"}, (make_parameter("k", "1", (-1.0, 1.0)),), k=0.1)
+    fit = {
+        **FIT,
+        "input": name,
+        "runs": [{"run": name, "terrain": name, "driven_speed_mps": 1.5, "driven_yaw_rate_radps": 1.0}],
+        "undecided": [["drive_lag", name]],
+        "unless": [{"parameter": "wheel_radius.k", "effect": name, "value": 0.98}],
+        name or "empty": name,
+    }
+    known = {"wheel_radius.k": (0.96, 0.98), "a---é.k": (0.0, 0.2), "body_speed_limit.limit": (0.8, 1.0)}
+    return make(
+        *effects, wind, vehicle=rename(VEHICLES[kind], name), fit=fit, intervals=known, note=name,
+        warnings=(name,),
+    )  # fmt: skip
+
+
+GAINS = {
+    "speed_to_erpm_gain": 4614.0,
+    "steering_angle_to_servo_gain": -1.2135,
+    "steering_angle_to_servo_offset": 0.5304,
+}
+KINDS = {"autoware": {"ackermann"}, "vesc": {"ackermann"}}
+TARGETS = [
+    (target.name, kind)
+    for target in list_targets()
+    for kind in KINDS.get(target.name, ("differential", "ackermann"))
+]
+
+
+@pytest.mark.parametrize(("target", "kind"), TARGETS)
+@settings(max_examples=25)
+@given(name=NAMES)
+def test_a_name_is_data_in_the_files_of_all_targets(target: str, kind: str, name: str) -> None:
+    check_name(target, kind, name)
+
+
+@pytest.mark.parametrize(("target", "kind"), TARGETS)
+def test_names_that_were_made_to_break_out_are_data(target: str, kind: str) -> None:
+    for name in HOSTILE:
+        check_name(target, kind, name)
+
+
+def check_name(target: str, kind: str, name: str) -> None:
+    shape, names = READERS[target](export_model(make_named(kind, name), target, GAINS))
+    plain, known = READERS[target](export_model(make_named(kind, HARMLESS), target, GAINS))
+    assert shape == plain
+    assert [HARMLESS if one == name else one for one in names] == known
+    assert HARMLESS in known
+
+
+def is_text(name: str) -> bool:
+    """Whether a name is valid Unicode, which all that logs and model files hold is, and not empty."""
+    return bool(name) and not any("\ud800" <= one <= "\udfff" for one in name)
+
+
+@given(name=NAMES.filter(is_text))
+@settings(max_examples=60)
+def test_a_name_comes_back_from_a_model_file(name: str) -> None:
+    text = format_model(make_named("differential", name))
+    assert tomllib.loads(text)["vehicle"]["name"] == name
+    again = parse_model(text, Path("m.toml"))
+    assert (again.model.vehicle.name, again.note) == (name, name)
+    assert format_model(again) == text
+    assert READERS["python"](export_model(again, "python"))[1] == [name]
+
+
+GEOMETRY = (
+    "wheel_radius_m",
+    "track_width_m",
+    "wheelbase_m",
+    "base_to_rear_axle_m",
+    "mass_kg",
+    "max_speed_mps",
+    "max_yaw_rate_radps",
+    "max_steering_rad",
+    "controller_track_multiplier",
+)
+ABSURD = (math.nan, math.inf, -math.inf, 1e300, -1e300)
+
+
+def list_absurd(kind: str) -> list[ModelFile]:
+    """The model with one number that no robot has, in every place that has one."""
+    file = make_named(kind, HARMLESS)
+    vehicle = file.model.vehicle
+    files = [
+        replace(file, model=Model(structs.replace(vehicle, **{key: value}), file.model.effects))
+        for key in GEOMETRY
+        for value in (*ABSURD, *((-1.0, 0.0, 1e-300) if key != "base_to_rear_axle_m" else ()))
+    ]
+    wide = (make_parameter("k", "1", (-math.inf, math.inf)),)
+    wild = [FormulaEffect("wild", {"v_y": "k * v0"}, wide, k=value) for value in (1e300, -1e300)]
+    files += [replace(file, model=file.model + effect) for effect in wild]
+    (run,) = file.list_fitted("runs")
+    files += [
+        replace(file, fit={**file.fit, "runs": [{**run, key: value}]})
+        for key in ("driven_speed_mps", "driven_yaw_rate_radps")
+        for value in (*ABSURD, -1.0)
+    ]
+    return files
+
+
+@pytest.mark.parametrize(("target", "kind"), TARGETS)
+def test_absurd_numbers_are_refused_in_one_line(target: str, kind: str) -> None:
+    for file in list_absurd(kind):
+        with pytest.raises(SlipError) as caught:
+            export_model(file, target, GAINS)
+        assert caught.value.code in {"absurd_number", "implausible_geometry"}
+        assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("value", [*ABSURD, -0.1])
+def test_absurd_errors_are_refused_before_a_covariance_is_made(value: float) -> None:
+    file = make_named("differential", HARMLESS)
+    ladder = [{"effects": [], "velocity_rms": [0.3, value, 0.4]}]
+    with pytest.raises(MotionError, match="velocity_rms"):
+        export_model(replace(file, fit={**file.fit, "ladder": ladder}), "robot_localization")
+
+
+@pytest.mark.parametrize("text", ["nan", "inf", "-inf", "1e300"])
+def test_absurd_numbers_of_the_robots_own_file_are_refused(tmp_path: Path, text: str) -> None:
+    yaml_text = text.replace("inf", ".inf").replace("nan", ".nan").replace("1e300", "1.0e+300")
+    files = {"px4": f"1\t1\tRO_MAX_THR_SPEED\t{text}\t9\n", "vesc": f"speed_to_erpm_gain: {yaml_text}\n"}
+    for target, content in files.items():
+        path = tmp_path / target
+        path.write_text(content, encoding="utf-8")
+        with pytest.raises(MotionError, match="not a plausible number"):
+            export_model(make(vehicle=CAR), target, GAINS | read_current(path, target))
+
+
+def test_nothing_is_written_of_an_absurd_model(tmp_path: Path) -> None:
+    model, out = tmp_path / "m.toml", tmp_path / "out.yaml"
+    text = '[vehicle]\npreset = "husky_a200"\nmass_kg = 1e300\n'
+    for content in (text, text.replace("1e300", "inf"), text.replace("1e300", "-5")):
+        model.write_text(content, encoding="utf-8")
+        said = run_verb("model", "export", model, "--to", "nav2", "--file", out)
+        assert said.returncode != 0
+        assert len(said.stderr.splitlines()) == 1
+        assert "mass_kg" in said.stderr
+        assert not out.exists()
