@@ -144,7 +144,7 @@ bench-diagnose: $(VENV)/.ready-dev ## CPU time of a diagnosis and where it goes 
 bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and two processes [ARGS="--rounds 5"]
 	$(BIN)/python benchmarks/batch.py $$ARGS
 
-damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files and runs deleted and swapped: detected or not
+damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files deleted, added and swapped: detected or not
 	$(BIN)/python benchmarks/damage_results.py $$ARGS
 
 bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time and memory [ARGS="--runs 300"]

@@ -4,8 +4,9 @@
 
 Results of two short simulated logs, one of them analyzed twice, with reports, pools and a comparison. Each
 change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
-and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Unlisted*
-counts what verify tells without calling it damage: nothing says what the file should be.
+and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Said*
+counts what verify tells without calling it damage. Left out is what no manifest names: files over all runs,
+whole runs that are deleted, and in a bucket manifests that are, since it has no link to a run's results.
 """
 
 from __future__ import annotations
@@ -25,8 +26,7 @@ from pipeline.job import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store import verification as room
-from pipeline.store.files import MANIFEST, do_nothing
-from pipeline.store.listing import entry_name
+from pipeline.store.files import do_nothing, hash_bytes
 from pipeline.store.mirror import Mirror
 
 if TYPE_CHECKING:
@@ -49,25 +49,25 @@ class Table:
 
     def __init__(self) -> None:
         self.changes: Counter[str] = Counter()
-        self.unlisted: Counter[str] = Counter()
+        self.said: Counter[str] = Counter()
         self.missed: Counter[str] = Counter()
 
     def count(self, kind: str, found: room.Examination, before: room.Examination) -> None:
         self.changes[kind] += 1
         if found.problems:
             return
-        self.unlisted[kind] += found.unlisted != before.unlisted
-        self.missed[kind] += found.unlisted == before.unlisted
+        self.said[kind] += found.unchecked != before.unchecked
+        self.missed[kind] += found.unchecked == before.unchecked
 
     def show(self, title: str) -> None:
-        print(f"\n{title:<44}{'changes':>9}{'noticed':>9}{'unlisted':>10}{'not noticed':>13}")
+        print(f"\n{title:<44}{'changes':>9}{'noticed':>9}{'said':>10}{'not noticed':>13}")
         for kind, count in self.changes.items():
-            noticed = count - self.unlisted[kind] - self.missed[kind]
-            print(f"{kind:<44}{count:>9}{noticed:>9}{self.unlisted[kind]:>10}{self.missed[kind]:>13}")
+            noticed = count - self.said[kind] - self.missed[kind]
+            print(f"{kind:<44}{count:>9}{noticed:>9}{self.said[kind]:>10}{self.missed[kind]:>13}")
         print(
             f"{'all':<44}{self.changes.total():>9}"
-            f"{self.changes.total() - self.unlisted.total() - self.missed.total():>9}"
-            f"{self.unlisted.total():>10}{self.missed.total():>13}",
+            f"{self.changes.total() - self.said.total() - self.missed.total():>9}"
+            f"{self.said.total():>10}{self.missed.total():>13}",
             flush=True,
         )
 
@@ -98,7 +98,7 @@ class Remembering:
     def hash(self, name: str) -> str:
         if name not in self._hashes:
             data = self.read(name)
-            self._hashes[name] = "" if data is None else room.hash_bytes(data)
+            self._hashes[name] = "" if data is None else hash_bytes(data)
         return self._hashes[name]
 
     def locate(self, name: str) -> Path:
@@ -127,7 +127,7 @@ def make_results(folder: Path, address: str | None) -> Path:
 def name_kind(name: str, current: set[str]) -> str:
     """What a file of the results is."""
     parts = name.split("/")
-    kinds = {"batch": "notes on logs", "identities": "notes on identities", "listed": "entries of the list"}
+    kinds = {"batch": "notes on logs", "identities": "notes on identities"}
     if parts[0] in kinds:
         return kinds[parts[0]]
     if len(parts) == 1:
@@ -156,8 +156,8 @@ def flip_bytes(files: Remembering, names: list[str], current: set[str], every: i
 class Exchange:
     """Files deleted, cut, and put in the place of others, and what was noticed of it."""
 
-    def __init__(self, files: Remembering, names: list[str], current: set[str]) -> None:
-        self.table = Table()
+    def __init__(self, files: Remembering, names: list[str], current: set[str], *, in_bucket: bool) -> None:
+        self.table, self._in_bucket = Table(), in_bucket
         self._files, self._names, self._current = files, names, current
         self._before = room.examine_files(files)
 
@@ -168,9 +168,6 @@ class Exchange:
         homes = sorted({name.rpartition("/")[0] for name in self._names if name.endswith("/manifest.json")})
         for home in homes:
             inside = self._list(home)
-            self._judge("runs: deleted", dict.fromkeys(inside))
-            entry = entry_name(f"{home}/{MANIFEST}")
-            self._judge("runs: deleted with their entry", dict.fromkeys([*inside, entry]))
             for folder in {name.rpartition("/")[0] for name in inside} - {home}:
                 self._judge("generations: one more file", {f"{folder}/more.parquet": b"x"})
             for other in homes:
@@ -184,7 +181,8 @@ class Exchange:
         self._judge(f"{kind}: cut", {name: whole[: len(whole) // 2]})
         # A note may go, or be that of another name, at any time: it costs a look at the log.
         if not kind.startswith("notes"):
-            self._judge(f"{kind}: deleted", {name: None})
+            if not (self._in_bucket and kind == "manifests"):
+                self._judge(f"{kind}: deleted", {name: None})
             for other in self._names:
                 if name_kind(other, self._current) == kind:
                     self._judge(f"{kind}: copied over", {other: whole})
@@ -220,14 +218,14 @@ def run(every: int, *, in_bucket: bool) -> int:
         source: room.Files = room.DiskFiles(out) if address is None else Mirror(address, out)
         files = Remembering(source)
         current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
-        names = list_contents(files)
         found = room.examine_files(files)
+        names = [name for name in list_contents(files) if name not in found.unchecked]
         print(f"{'object store' if in_bucket else 'folder'}: {len(names)} files, ", end="")
         print(f"{sum(len(files.read(name) or b'') for name in names)} bytes; ", end="")
-        print(f"unchanged: {len(found.problems)} problems, {len(found.unlisted)} unlisted")
+        print(f"unchanged: {len(found.problems)} problems, {len(found.unchecked)} unchecked")
         one = flip_bytes(files, names, current, every)
         one.show(f"changed bytes (of tables, pages: every {every}.)")
-        other = Exchange(files, names, current).try_all()
+        other = Exchange(files, names, current, in_bucket=in_bucket).try_all()
         other.show("files and runs")
         return one.missed.total() + other.missed.total() + len(found.problems)
     finally:

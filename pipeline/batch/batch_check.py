@@ -4,30 +4,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 
-from pipeline.batch.batch_plan import POOLED, forget_pools, measure_results
+from pipeline.batch.batch_plan import forget_pools, measure_results
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.core import SlipError
 from pipeline.job.run_results import UPLOADS
 from pipeline.logs import LogError, hash_log, locate_recorded
-from pipeline.store import Store, StoreError
-from pipeline.store.files import MANIFEST
-from pipeline.store.listing import KEY_MARK, REGISTER, entry_name, is_run_manifest
+from pipeline.store import RUNS, Store, StoreError
+from pipeline.store.checksums import parse_manifest
+from pipeline.store.files import MANIFEST, Manifest
 from pipeline.store.mirror import Mirror
-from pipeline.store.names import Sample, Tally, encode_run
-from pipeline.store.seals import parse_manifest
+from pipeline.store.names import Sample, Tally, check_home, encode_run
 from pipeline.store.verification import DiskFiles, Examination, Problem
 
-_UNSEALED = "without the right key its integrity cannot be checked"
-_LEFT = {
-    "left_out": "find out who made it, and remove it",
-    "not_sealed": _UNSEALED,
-    "other_key": _UNSEALED,
-    KEY_MARK: _UNSEALED,
-}
-"""Text for files that only the user can repair, by code or name."""
 _UNREADABLE = ("manifest_damaged", "name_clash")
-_VERBS = {"comparison": "slip compare", "trend": "slip fleet trend", "map": "slip fleet map"}
-"""Command that makes the files over all runs, by the start of their name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,8 +25,8 @@ class Repair:
 
     Attributes:
         subject: a run, or the name of a file in the results.
-        action: ``queued``: the next batch over its log makes it again; ``listed``: added to the list;
-            ``removed``: it was unusable; ``lost``: it cannot be made again; ``left``: see ``what``.
+        action: ``queued``: the next batch over its log makes it again; ``removed``: it was unusable;
+            ``lost``: it cannot be made again; ``left``: see ``what``.
         what: one sentence without a full stop.
     """
 
@@ -81,59 +70,22 @@ class _Repairer:
         problems = self._examination.problems
         for problem in problems:
             if not problem.home:
-                yield self._repair_mark(problem) or self._repair_file(problem)
+                yield self._repair_file(problem)
         of_runs = sorted((each for each in problems if each.home), key=lambda each: each.home)
         for home, some in groupby(of_runs, key=lambda each: each.home):
             yield self._repair_run(home, list(some))
-        for name in self._examination.unlisted if self._examination.seal == "none" else ():
-            if is_run_manifest(name) or "/" not in name:
-                self._target.put_on_list(name)
-                yield Repair(subject=name, action="listed", what="it is on the list as it is")
 
     def _repair_file(self, problem: Problem) -> Repair:
         name = problem.path.relative_to(self._store.root).as_posix()
-        remains = _LEFT.get(KEY_MARK if name == KEY_MARK else problem.code)
-        if remains is not None:
-            return Repair(subject=name, action="left", what=remains)
-        if name == REGISTER:
-            # The list entry first: an unlisted register is not renewed meanwhile.
-            for each in (entry_name(REGISTER), REGISTER):
-                self._target.remove(each)
-            what = "the next `slip batch` makes it again from the remaining entries"
-            return Repair(subject=name, action="removed", what=what)
-        if problem.code in {"list_damaged", "note_damaged"}:
-            self._target.remove(name)
-            forget_pools(self._store)
-            return Repair(subject=name, action="removed", what="no result is lost")
-        if name in POOLED:
-            forget_pools(self._store)
-            return Repair(subject=name, action="queued", what="the next `slip batch` makes it again")
-        verb = next((verb for start, verb in _VERBS.items() if name.startswith(start)), "slip batch")
-        if problem.code == "file_missing":
-            self._target.remove(entry_name(name))
-            what = f"it is off the list; `{verb}` makes it again"
-            return Repair(subject=name, action="removed", what=what)
-        return Repair(subject=name, action="left", what=f"`{verb}` makes it again")
-
-    def _repair_mark(self, problem: Problem) -> Repair | None:
-        """List the mark of the sealing key again, if it is present and only its entry is missing."""
-        is_mark = problem.path == self._store.root / KEY_MARK
-        codes = {each.code for each in self._examination.problems if each.path == problem.path}
-        if not is_mark or self._examination.seal != "checked" or codes != {"not_listed"}:
-            return None
-        self._target.put_on_list(KEY_MARK)
-        return Repair(subject=KEY_MARK, action="listed", what="it names the key; it is on the list as it is")
+        if problem.code == "left_out":
+            return Repair(subject=name, action="left", what="find out who made it, and remove it")
+        self._target.remove(name)
+        forget_pools(self._store)
+        return Repair(subject=name, action="removed", what="no result is lost")
 
     def _repair_run(self, home: str, problems: Sequence[Problem]) -> Repair:
         subject = problems[0].run
         codes = {problem.code for problem in problems}
-        if codes == {"not_listed"} and self._examination.seal != "none":
-            codes.add("not_sealed")
-        if codes == {"not_listed"}:
-            self._target.put_on_list(f"{home}/{MANIFEST}")
-            return Repair(
-                subject=subject, action="listed", what="all its files are intact; it is on the list unchanged"
-            )
         remains = _explain_remains(codes)
         if remains:
             return Repair(subject=subject, action="left", what=remains)
@@ -143,38 +95,42 @@ class _Repairer:
         except LogError as error:
             return Repair(subject=subject, action="left", what=f"its log is at {log}: {error.what}")
         if location is None or not (location.is_file() or location.is_dir()):
-            return self._give_up(subject, home, codes, log)
+            why = f"its log {log} is gone" if log else "its log is not known"
+            return Repair(subject=subject, action="lost", what=f"it cannot be made again: {why}")
         self._queue(home, codes)
         return Repair(subject=subject, action="queued", what=f"the next batch over {log} makes it again")
 
-    def _give_up(self, subject: str, home: str, codes: set[str], log: str) -> Repair:
-        why = f"its log {log} is gone" if log else "its log is not known"
-        if codes == {"run_missing"}:
-            self._target.remove(entry_name(f"{home}/{MANIFEST}"))
-            why = f"{why}; it is off the list"
-        return Repair(subject=subject, action="lost", what=f"it cannot be made again: {why}")
-
     def _queue(self, home: str, codes: set[str]) -> None:
-        name = f"{home}/{MANIFEST}"
+        manifest = self._read_manifest(home)
         if codes & set(_UNREADABLE):
             # No reader can use it, and no writer can replace it.
-            self._target.remove(name)
-        elif "run_missing" not in codes:
-            data = self._files.read(name)
-            if data is not None:
-                self._store.ask_again(parse_manifest(data, self._store.root / home))
+            self._target.remove(f"{home}/{MANIFEST}")
+        elif manifest is not None:
+            self._store.ask_again(manifest)
 
     def _find_log(self, home: str) -> str:
-        name = f"{home}/{MANIFEST}"
-        entry = self._examination.entries.get(name)
-        return (entry.log if entry is not None else "") or self._logs.get(home, "")
+        """Recorded place of the log of a run: by the notes of batches, else by its own manifest."""
+        manifest = self._read_manifest(home)
+        log = "" if manifest is None else str(manifest.part("log").get("path") or "")
+        return self._logs.get(home) or log
+
+    def _read_manifest(self, home: str) -> Manifest | None:
+        """Manifest in the folder of a run; None if there is none, or none of that run."""
+        try:
+            data = self._files.read(f"{home}/{MANIFEST}")
+            manifest = None if data is None else parse_manifest(data, self._store.root / home)
+            if manifest is not None:
+                check_home(manifest.run, self._store.root / home, top=self._store.root / RUNS)
+        except (StoreError, OSError):
+            return None
+        return manifest
 
 
 def _explain_remains(codes: set[str]) -> str:
     """Text for a run that needs no repair, or cannot be repaired; empty otherwise."""
     if "manifest_too_new" in codes:
         return "a newer version wrote it: use that one"
-    if not codes <= {"old_generation", "not_listed", "extra_file"}:
+    if not codes <= {"old_generation", "extra_file"}:
         return ""
     if "extra_file" in codes:
         return "all that was written is intact; remove the files that were not written with it"
@@ -229,11 +185,6 @@ class Verification:
         return self.examination.problems
 
     @property
-    def unlisted(self) -> tuple[str, ...]:
-        """Names in the results without a list entry: written before there was a list."""
-        return self.examination.unlisted
-
-    @property
     def is_clean(self) -> bool:
         """Whether nothing is damaged."""
         return not self.files and not self.logs
@@ -261,7 +212,7 @@ def verify_results(
         sample: sample of the files and logs to read; None for all.
 
     Raises:
-        StoreError: the results cannot be written, or the key cannot be read.
+        StoreError: the results cannot be written.
     """
     examination = (mirror or store).examine(sample)
     repairs = repair_results(store, examination, mirror, follow_remote=follow_remote) if repair else ()

@@ -14,7 +14,7 @@ import msgspec
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.core import SlipError
-from pipeline.core.untrusted import walk_files
+from pipeline.core.untrusted import read_bounded, walk_files
 from pipeline.job import Options, run_results
 from pipeline.job.keys import VERSIONS, hash_json, name_plainly
 from pipeline.logs import LogError, hash_log, to_location
@@ -56,7 +56,7 @@ class BasisHasher:
         known = self._contents.get(file)
         if known is None:
             try:
-                known = hashlib.sha256(file.read_bytes()).hexdigest()
+                known = hashlib.sha256(read_bounded(file)).hexdigest()
             except OSError as error:
                 known = f"unreadable: {error.errno}"
             self._contents[file] = known
@@ -392,7 +392,6 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     refresh_pools(mirror.store)
     for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
         mirror.push_file(name)
-    mirror.push_register()
 
 
 def _hash_runs(store: Store) -> str:

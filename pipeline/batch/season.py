@@ -38,7 +38,6 @@ from pipeline.batch.executors import SCHEMES, LocalExecutor, open_cluster
 from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError
 from pipeline.store import Store
-from pipeline.store.listing import KEY_MARK
 from pipeline.store.mirror import Mirror
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
@@ -283,8 +282,6 @@ def run_batch(request: Request, watch: Watch, work: Callable[[Task], Report] = w
         mirror.pull_index()
     listed = find_recordings(request.targets, settle_s=request.settle_s)
     store.check_writable()
-    if mirror is not None:
-        mirror.push_file(KEY_MARK)
     ledger = Ledger(store, mirror)
     workforce = _Workforce(request, work, most=len(listed.recordings))
     try:

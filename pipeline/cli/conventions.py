@@ -234,25 +234,8 @@ def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
 
 Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]
 
-KeyFile: TypeAlias = Annotated[
-    Path | None, Parameter(name="--key", help="file with the key that signs the results (or SLIP_KEY_FILE)")
-]
-
 All: TypeAlias = Annotated[bool, Parameter(name="--all", negative=())]
 """Whether to show the whole summary, or only the verdict, the main effects and the remaining error."""
-
-
-def use_key(path: Path | None) -> None:
-    """Write and verify results with a key from here on, also in processes that this one starts.
-
-    Raises:
-        StoreError: ``bad_key_file``.
-    """
-    if path is not None:
-        from pipeline.store.seals import KEY_VARIABLE, read_key  # noqa: PLC0415 - only where there is a key
-
-        read_key(path)
-        os.environ[KEY_VARIABLE] = str(path.absolute())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -290,7 +273,6 @@ class Choices:
         ),
     ] = None
     results: Results = Path("results")
-    key: KeyFile = None
 
 
 def build_options(choices: Choices) -> Options:
@@ -298,9 +280,7 @@ def build_options(choices: Choices) -> Options:
 
     Raises:
         BatchError: ``bad_size``.
-        StoreError: ``bad_key_file``.
     """
-    use_key(choices.key)
     return Options(
         max_inflated=None if choices.max_inflated is None else _parse_size(choices.max_inflated),
         out=choices.results,

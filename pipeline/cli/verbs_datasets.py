@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.conventions import KeyFile, Results, format_value, open_results, print_result, use_key
+from pipeline.cli.conventions import Results, format_value, open_results, print_result
 from pipeline.core import INPUT_WORDS, SlipError, format_part
 from pipeline.job import FigureFormat
 
@@ -39,7 +39,6 @@ def compare(  # noqa: D417 - arguments document themselves
     as_published: bool = False,
     causes: bool = False,
     figures: FigureFormat | None = None,
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -59,7 +58,6 @@ def compare(  # noqa: D417 - arguments document themselves
     from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    use_key(key)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     if causes:
@@ -189,7 +187,6 @@ def draw(  # noqa: D417 - arguments document themselves
         PositiveFloat | None, Parameter(help="side of a cell of --terrain [m] (default: 2)")
     ] = None,
     figures: FigureFormat | None = None,
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -207,7 +204,6 @@ def draw(  # noqa: D417 - arguments document themselves
     from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    use_key(key)
     if terrain:
         others = {
             "--deployments": deployments is not None,

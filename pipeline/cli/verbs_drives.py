@@ -16,7 +16,6 @@ from pipeline.cli.conventions import (
     FAILED,
     LOSSY,
     Choices,
-    KeyFile,
     Results,
     TrustCode,
     build_options,
@@ -69,7 +68,6 @@ def plan(  # noqa: D417 - the runs document themselves
     config: Path | None = None,
     results: Results = Path("results"),
     folder: Path = Path("plan"),
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -98,8 +96,8 @@ def plan(  # noqa: D417 - the runs document themselves
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    options = build_options(Choices(vehicle=vehicle, config=config, results=results, key=key))
-    said = spell_choices(Choices(results=results, key=key))
+    options = build_options(Choices(vehicle=vehicle, config=config, results=results))
+    said = spell_choices(Choices(results=results))
     at_work = runs[0] if runs else str(check or vehicle or "plan")
     try:
         names = list(runs or [])

@@ -16,7 +16,6 @@ from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     Choices,
-    KeyFile,
     Results,
     TrustCode,
     build_options,
@@ -28,7 +27,6 @@ from pipeline.cli.conventions import (
     print_result,
     show_progress,
     summarize_error,
-    use_key,
 )
 from pipeline.cli.model_runs import open_model
 from pipeline.core import SlipError, suffix_unit
@@ -62,7 +60,6 @@ def check(  # noqa: D417 - the arguments document themselves
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
     results: Results = Path("results"),
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -92,7 +89,7 @@ def check(  # noqa: D417 - the arguments document themselves
         from pipeline.store import Store  # noqa: PLC0415 - heavy
 
         bounds = None if limits is None else read_limits(limits)
-        options = build_options(Choices(results=results, key=key))
+        options = build_options(Choices(results=results))
         known = _open_known(before, trust_code=trust_code)
         silent = quiet or json or (to is not None and file is None)
         with ExitStack() as stack:
@@ -220,7 +217,6 @@ def build_fleet() -> App:
 def fit(  # noqa: D417 - the results folder documents itself
     results: Results = Path("results"),
     *,
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -230,14 +226,12 @@ def fit(  # noqa: D417 - the results folder documents itself
     Writes fleet.json, fleet.parquet and fleet.html.
 
     Args:
-        key: file with the key that signs the results (or SLIP_KEY_FILE).
         json: print one JSON object.
         quiet: print nothing.
     """
     from pipeline.job.prediction import fit_results, summarize_fleet, write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    use_key(key)
     store = Store(results)
     model, keys = fit_results(store)
     path = write_fleet(store, model, keys)
@@ -398,7 +392,6 @@ def trend(  # noqa: D417 - arguments document themselves
     limit: Annotated[
         tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above")
     ] = (),
-    key: KeyFile = None,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -428,7 +421,6 @@ def trend(  # noqa: D417 - arguments document themselves
         )
     limits = dict(map(_read_limit, limit))
     check_limits(limits)
-    use_key(key)
     store = Store(results)
     names = tuple(name.strip() for name in by.split(",") if name.strip())
     followed = follow_trend(store, names, threshold=threshold, limits=limits)

@@ -35,7 +35,6 @@ from pipeline.cli.conventions import (
     FAILED,
     LOSSY,
     Choices,
-    KeyFile,
     Results,
     build_options,
     format_state,
@@ -46,7 +45,6 @@ from pipeline.cli.conventions import (
     print_note,
     print_result,
     summarize_error,
-    use_key,
 )
 from pipeline.core import PACKAGE, SlipError, measure_memory, read_version, slip_command
 
@@ -233,7 +231,6 @@ def schedule(  # noqa: D417 - arguments document themselves
 def serve(  # noqa: D417 - the results folder documents itself
     results: Results = Path("results"),
     *,
-    key: KeyFile = None,
     port: int = 8321,
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
@@ -249,7 +246,6 @@ def serve(  # noqa: D417 - the results folder documents itself
     `Authorization: Bearer TOKEN`.
 
     Args:
-        key: file with the key that signs the results (or SLIP_KEY_FILE).
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.
@@ -272,7 +268,6 @@ def serve(  # noqa: D417 - the results folder documents itself
         if open_browser:
             _open_browser(whole)
 
-    use_key(key)
     if not is_loopback(host):
         print_note(
             f"slip: {host} can be reached from the network: whoever has the token, or reads it on its way, "

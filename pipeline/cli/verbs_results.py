@@ -1,4 +1,4 @@
-"""Commands on results: status, verify, explain, query, seal."""
+"""Commands on results: status, verify, explain, query."""
 
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from cyclopts.types import PositiveFloat
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
-    KeyFile,
     Results,
     choose_limit,
     format_state,
@@ -31,7 +30,6 @@ from pipeline.cli.conventions import (
     print_result,
     show_progress,
     summarize_error,
-    use_key,
 )
 from pipeline.core import INPUT_WORDS, THREAD_VARIABLES, SlipError, python_command, shorten
 
@@ -42,6 +40,8 @@ if TYPE_CHECKING:
     from pipeline.store.names import Sample
 
 _HINT = "Ask for less at once"
+_NAMED = 8
+"""Maximum number of files without a checksum that are named: those over all runs of one folder."""
 
 
 def build_results() -> App:
@@ -49,7 +49,7 @@ def build_results() -> App:
     from pipeline.cli.verbs_log import stage  # noqa: PLC0415 - only for this command
 
     app = App(name="results", help="Check, explain and query a folder of results.")
-    for command in (status, verify, explain, query, stage, seal):
+    for command in (status, verify, explain, query, stage):
         app.command(command)
     return app
 
@@ -237,7 +237,6 @@ def verify(  # noqa: D417 - arguments document themselves
     follow_remote: bool = False,
     sample: str | None = None,
     seed: str | None = None,
-    key: KeyFile = None,
     repair: bool = False,
     json: bool = False,
     quiet: bool = False,
@@ -247,7 +246,7 @@ def verify(  # noqa: D417 - arguments document themselves
     Args:
         logs: read the logs, too.
         follow_remote: also read remote logs (s3://) whose address is known from the results alone.
-        sample: read only a random share of files and logs, for example 5%, and the entries of all runs.
+        sample: read only a random share of files and logs, for example 5%, and the manifests of all runs.
         seed: seed of the sample (default: another one every day).
         repair: mark what can be recomputed, for the next batch over its log.
         json: print one JSON object.
@@ -255,7 +254,6 @@ def verify(  # noqa: D417 - arguments document themselves
     """
     from pipeline.batch.batch_check import verify_results  # noqa: PLC0415 - only for this verb
 
-    use_key(key)
     drawn = parse_sample(sample, seed)
     opened = open_results(results)
     store = opened.open_store()
@@ -312,9 +310,8 @@ def _check_as_json(verification: Verification, *, repair: bool) -> dict[str, obj
         "logs": logs,
         "gone": gone,
         "remote": remote,
-        "seal": verification.examination.seal,
         "read": {"files": asdict(verification.examination.files), "logs": asdict(verification.read_logs)},
-        "unlisted": list(verification.unlisted),
+        "unchecked": list(verification.examination.unchecked),
     }
     return answer | ({"repairs": [asdict(each) for each in verification.repairs]} if repair else {})
 
@@ -323,7 +320,10 @@ def _format_check(verification: Verification) -> list[str]:
     lines = [f"{verification.checked} runs checked"]
     files, read_logs = verification.examination.files, verification.read_logs
     is_sample = (files.looked_at, read_logs.looked_at) != (files.all, read_logs.all)
-    read = "all files that were read" if is_sample or verification.remote else "all files"
+    unchecked = verification.examination.unchecked
+    read = "all other files" if unchecked else "all files"
+    if is_sample or verification.remote:
+        read = "all files that were read"
     if is_sample:
         lines.append(
             f"sample   {files.looked_at} of {files.all} files and "
@@ -335,16 +335,10 @@ def _format_check(verification: Verification) -> list[str]:
     lines += [f"remote   {problem.path} ({problem.run})" for problem in verification.remote]
     if verification.remote:
         lines.append("These addresses are known from the results alone; --follow-remote reads them.")
-    if verification.examination.seal == "not_checked":
-        lines.append("The results are sealed with a key; --key FILE checks the seal.")
     lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in verification.repairs]
-    if verification.examination.seal != "none":
-        lines += [f"unlisted {name}: slip did not write it with the key" for name in verification.unlisted]
-    elif verification.unlisted and not verification.repairs:
-        lines.append(
-            f"{len(verification.unlisted)} files were written before there was a list of them: "
-            "`slip results verify --repair` adds them."
-        )
+    if unchecked:
+        more = f" and {len(unchecked) - _NAMED} more" if len(unchecked) > _NAMED else ""
+        lines.append(f"no checksum covers {', '.join(unchecked[:_NAMED])}{more}")
     if verification.is_clean:
         lines.append(f"{read} are unchanged")
     else:
@@ -356,26 +350,6 @@ def _format_check(verification: Verification) -> list[str]:
             )
         lines += ["Copy changed logs from their origin."] if verification.logs else []
     return lines
-
-
-def seal(  # noqa: D417 - arguments document themselves
-    results: Results = Path("results"), *, key: KeyFile = None, json: bool = False, quiet: bool = False
-) -> int:
-    """Seal existing results with a key.
-
-    Refused where a key seals them already, or where a file is damaged.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    use_key(key)
-    opened = open_results(results)
-    store = opened.open_store()
-    (opened.mirror or store).seal()
-    runs = sum(1 for _ in store.manifests())
-    content = {"results": str(results), "runs": runs, "sealed": True}
-    return print_result(content, lambda: [f"{results}: sealed, {runs} runs"], json=json, quiet=quiet)
 
 
 def explain(  # noqa: D417 - arguments document themselves

@@ -1,7 +1,8 @@
-"""Bounded reading of untrusted names, JSON objects, TOML files and folders; texts as safe CSV."""
+"""Bounded reading of untrusted names, small files, JSON objects, TOML and folders; texts as safe CSV."""
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import os
@@ -294,10 +295,44 @@ def walk_files(top: Path, skip: Callable[[Path, str], None]) -> Iterator[os.DirE
         yield from files
 
 
+MOST_BYTES: Final = 32 * 2**20
+"""Maximum size of a note, manifest, settings file or page that is read whole [bytes]: twenty times a report.
+Parsed, a JSON text takes up to twenty times as much memory."""
+TOO_LARGE: Final = f"it has more than {MOST_BYTES // 2**20} MB, more than any such file that slip writes"
+
+
+def read_bounded(path: Path) -> bytes:
+    """The content of a file that is small unless somebody tampered with it.
+
+    Raises:
+        OSError: it cannot be read; ``EFBIG``, it is larger than `MOST_BYTES`, and is not read whole.
+    """
+    with path.open("rb") as file:
+        content = file.read(MOST_BYTES + 1)
+    if len(content) > MOST_BYTES:
+        raise too_large(path)
+    return content
+
+
+def read_bounded_text(path: Path) -> str:
+    """The content of such a file as text.
+
+    Raises:
+        OSError: as `read_bounded`.
+        UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_bounded(path).decode()
+
+
+def too_large(path: Path) -> OSError:
+    """The error for a file that is larger than `MOST_BYTES`."""
+    return OSError(errno.EFBIG, TOO_LARGE, str(path))
+
+
 def read_object(path: Path) -> dict[str, object]:
     """The object in a file; empty if there is none or it cannot be read."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_bounded(path))
     except (OSError, ValueError, RecursionError):
         return {}
     return content if isinstance(content, dict) else {}

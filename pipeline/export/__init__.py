@@ -21,6 +21,7 @@ from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
 from pipeline.core import INPUT_WORDS, guess_names, make_plain, suffix_unit
+from pipeline.core.untrusted import read_bounded_text
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
@@ -102,7 +103,7 @@ def read_current(path: Path, name: str) -> Current:
         hint = f"Omit --current; it is for {' and '.join(correcting)}."
         raise MotionError("no_current_parameters", what, where=str(path), hint=hint)
     try:
-        return target.read_current(path.read_text(encoding="utf-8"))
+        return target.read_current(read_bounded_text(path))
     except (OSError, UnicodeDecodeError) as error:
         raise MotionError(
             "parameters_unreadable", f"cannot be read: {error}", where=str(path), hint="Check the file."

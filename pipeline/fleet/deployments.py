@@ -8,7 +8,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.core import naming_os_errors
-from pipeline.core.untrusted import format_csv, unquote_formulas
+from pipeline.core.untrusted import format_csv, read_bounded_text, unquote_formulas
 from pipeline.fleet import ComparisonError, Measure
 from schemas import Deployments
 
@@ -240,7 +240,7 @@ def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
         ComparisonError: ``bad_deployment``; ``bad_deployments``: it breaks the schema, or its key exists.
     """
     try:
-        content = tomllib.loads(entry.read_text(encoding="utf-8"))
+        content = tomllib.loads(read_bounded_text(entry))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         what = f"the deployment cannot be read: {error}"
         hint = "Write one line `column = value` for each column known; key, year and drive are needed"

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, cast
 import msgspec
 
 from pipeline.core import SlipError, read_version
-from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.core.untrusted import PathError, read_bounded, read_bounded_text, resolve_inside
 from pipeline.job import FIGURES, INPUTS, STAGES, FigureFormat, Options
 from pipeline.job.keys import (
     LogSetup,
@@ -78,7 +78,7 @@ def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
         key: key of its generation.
     """
     try:
-        preview = msgspec.json.decode(locate_plan(results, run, PREVIEW).read_bytes(), type=_Preview)
+        preview = msgspec.json.decode(read_bounded(locate_plan(results, run, PREVIEW)), type=_Preview)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return {}
     address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
@@ -135,7 +135,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         current = generation.previous
         if current is None or current.key != manifest.key or REPORT not in current.files:
             return None
-        page = current.path(REPORT).read_text(encoding="utf-8")
+        page = read_bounded_text(current.path(REPORT))
         for table in current.tables:
             generation.reuse_table(table)
         new = {REPORT, *(f"{QUARANTINE}{table}.parquet" for table in current.tables)}

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import NORMAL_95, finite_or_none, format_share, guess_names, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, require_finite
+from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
@@ -82,7 +82,7 @@ def read_limits(path: Path) -> Limits:
         JobError: ``bad_limits``: it does not exist, or a key or value in it is wrong.
     """
     try:
-        tree = parse_toml(path.read_text(encoding="utf-8"))
+        tree = parse_toml(read_bounded_text(path))
         require_finite(tree)
         limits = msgspec.convert(tree, Limits)
     except OSError as error:

@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.core import NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.core.arrays import Floats
+from pipeline.core.untrusted import read_bounded
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
@@ -367,7 +368,7 @@ def read_baseline(path: Path) -> Baseline:
     """
     hint = "Keep one anew: slip check BEFORE AFTER --keep FILE."
     try:
-        stored = msgspec.json.decode(path.read_bytes(), type=_StoredBaseline)
+        stored = msgspec.json.decode(read_bounded(path), type=_StoredBaseline)
     except OSError as error:
         what = f"the baseline cannot be read ({error.strerror})"
         raise JobError("bad_baseline", what, where=str(path), hint=hint) from error

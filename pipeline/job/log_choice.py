@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -124,15 +125,12 @@ def _list_events(columns: TopicColumns) -> Iterator[tuple[str, str, float]]:
                 yield node, name, float(value)
 
 
-def _read(index: LogIndex, wanted: list[Wanted]) -> list[TopicColumns]:
+def _read(index: LogIndex, wanted: list[Wanted]) -> Sequence[TopicColumns]:
     """Read small topics, skipping unreadable ones, which the main reading of the log reports."""
-    columns: list[TopicColumns] = []
-    for one in wanted:
-        try:
-            columns += read_topics(index, [one], sha256="unused").topics
-        except LogError:
-            continue
-    return columns
+    try:
+        return read_topics(index, wanted, sha256="unused", skip_unfit=True).topics
+    except LogError:
+        return ()
 
 
 UNKNOWN_VEHICLE = "unknown"
@@ -241,6 +239,10 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
+    if len(rivals) >= MOST_POSES:
+        rivals, finding = _leave_out_poses(index, rivals)
+        sources = replace(sources, others={**sources.others, "pose": tuple(rivals)})
+        chosen = replace(chosen, sources=sources, findings=(*chosen.findings, finding))
     fits = (
         problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
     )
@@ -250,6 +252,25 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     if problem is None or not fits:
         return _release_columns(chosen)
     return _fit_vehicle(chosen, configuration, problem, known, where)
+
+
+MOST_POSES = 40
+"""Maximum number of poses whose content is compared: each costs a reading of the drive's topics, too, and the
+platforms of `pipeline/simulate/platforms` record at most ten."""
+_NAMED = 5
+"""Maximum number of topics that a finding names."""
+
+
+def _leave_out_poses(index: LogIndex, rivals: Sequence[PoseSource]) -> tuple[list[PoseSource], Finding]:
+    """The rivals of the pose with most messages, in their order, and a finding on the others."""
+    messages = Counter[str]()
+    for channel in index.channels:
+        messages[channel.topic] += channel.message_count or 0
+    fullest = set(sorted(rivals, key=lambda rival: -messages[rival.topic])[: MOST_POSES - 1])
+    count = len(rivals) + 1
+    text = f"{count} topics or frames hold poses: the {MOST_POSES} with most messages were compared"
+    finding = Finding("poses_left_out", "warning", text, where="pose", count=count - MOST_POSES)
+    return [rival for rival in rivals if rival in fullest], finding
 
 
 def _may_be_odometry(pose: PoseSource | None) -> bool:
@@ -315,34 +336,43 @@ def _asks_sideways(index: LogIndex, vehicle: Vehicle, sources: Sources) -> bool:
     """Whether a platform that is also built with such wheels is commanded to move sideways."""
     if not vehicle.sideways_preset or sources.command is None:
         return False
-    return find_sideways_share(_read_command(index, sources.command), sources.command) > 0.0
+    return find_sideways_share(_read_commands(index, [sources.command]), sources.command) > 0.0
 
 
 def _leave_out_silent(
     index: LogIndex, configuration: Configuration, vehicle: Vehicle
 ) -> tuple[Sequence[ChannelInfo], Sources, list[Finding]]:
     """Channels and topics of every role without unreadable text commands, and findings on those excluded."""
-    channels, findings = list(index.channels), list[Finding]()
-    while True:
-        sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
-        if sources.command is None or not _is_silent(index, sources.command):
-            return channels, sources, findings
-        topic = sources.command.signals[0].topic
-        text = f"no message of {topic} is a readable command: the topic was left out"
-        findings.append(Finding("no_readable_text", "warning", text, where=topic))
-        channels = [channel for channel in channels if channel.topic != topic]
+    channels = list(index.channels)
+    sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
+    chosen = sources.command
+    if chosen is None or chosen.reason == CONFIGURED or not _is_text(index, chosen):
+        return channels, sources, []
+    others = [one for one in sources.others.get("command", ()) if isinstance(one, DriveSource)]
+    texts = [one for one in (chosen, *others) if _is_text(index, one)]
+    readable = {
+        columns.topic for columns in _read_commands(index, texts) if with_texts(columns).log_time.size
+    }
+    if chosen.signals[0].topic in readable:
+        return channels, sources, []
+    silent = list(dict.fromkeys(one.signals[0].topic for one in texts))
+    silent = [topic for topic in silent if topic not in readable]
+    named = ", ".join(silent[:_NAMED]) + (f" and {len(silent) - _NAMED} more" if silent[_NAMED:] else "")
+    left_out = "the topic was" if len(silent) == 1 else "the topics were"
+    text = f"no message of {named} is a readable command: {left_out} left out"
+    left = set(silent)
+    channels = [channel for channel in channels if channel.topic not in left]
+    sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
+    return channels, sources, [Finding("no_readable_text", "warning", text, where=silent[0])]
 
 
-def _is_silent(index: LogIndex, command: DriveSource) -> bool:
-    """Whether a command that was not configured is a text topic without any readable command."""
-    if command.reason == CONFIGURED or find_type(index.types[command.signals[0].topic]).text is None:
-        return False
-    return not any(with_texts(columns).log_time.size for columns in _read_command(index, command))
+def _is_text(index: LogIndex, command: DriveSource) -> bool:
+    return find_type(index.types[command.signals[0].topic]).text is not None
 
 
-def _read_command(index: LogIndex, command: DriveSource) -> Sequence[TopicColumns]:
-    wanted = list_wanted(Sources(command, None, None, None, None), index.types)
-    return read_topics(index, wanted, sha256="unused").topics
+def _read_commands(index: LogIndex, commands: Sequence[DriveSource]) -> Sequence[TopicColumns]:
+    each = (list_wanted(Sources(command, None, None, None, None), index.types) for command in commands)
+    return read_topics(index, [wanted for some in each for wanted in some], sha256="unused").topics
 
 
 def _apply_controller(

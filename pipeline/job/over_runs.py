@@ -10,6 +10,7 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
+from pipeline.core.untrusted import read_bounded
 from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
@@ -419,7 +420,7 @@ def update_trend(store: Store) -> None:
     if not path.is_file():
         return
     try:
-        asked = json.loads(path.read_text(encoding="utf-8"))["asked"]
+        asked = json.loads(read_bounded(path))["asked"]
         limits = {str(name): float(value) for name, value in asked["limits"].items()}
         by = [str(name) for name in asked["by"]]
         threshold = float(asked["threshold"])

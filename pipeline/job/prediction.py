@@ -14,6 +14,7 @@ import polars as pl
 
 from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none, guess_names, pick
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
+from pipeline.core.untrusted import read_bounded
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
 from pipeline.fleet import UNKNOWN
@@ -130,7 +131,7 @@ def read_fleet(store: Store) -> dict[str, object]:
     if not path.is_file():
         raise JobError("no_fleet", "no fleet model was fitted to these results", where=str(path), hint=hint)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_bounded(path))
         known = set(content["keys"])
         notes = list(content["notes"])
     except (OSError, ValueError, KeyError, TypeError) as error:

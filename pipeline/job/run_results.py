@@ -14,16 +14,24 @@ import msgspec
 import polars as pl
 
 from pipeline.core import PACKAGE, SlipError, read_version
-from pipeline.core.untrusted import PathError, mapping_in, number_in, objects_in, read_object, resolve_inside
+from pipeline.core.untrusted import (
+    PathError,
+    mapping_in,
+    number_in,
+    objects_in,
+    read_bounded,
+    read_object,
+    resolve_inside,
+)
 from pipeline.job import INPUTS, JobError
 from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
 from pipeline.job.work import Work, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.reading import list_wanted
 from pipeline.store import JSON, Manifest, Store, StoreError
+from pipeline.store.checksums import load_manifest
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
-from pipeline.store.seals import load_manifest
 
 if TYPE_CHECKING:
     from pipeline.estimation import Recording
@@ -451,7 +459,7 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
         return diagnosis
     try:
         path = locate_beside(results, "diagnoses", manifest.run, ".json")
-        stored = msgspec.json.decode(path.read_bytes(), type=_StoredDiagnosis)
+        stored = msgspec.json.decode(read_bounded(path), type=_StoredDiagnosis)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
     if stored.key != _key_of(manifest) or LINES not in stored.diagnosis:

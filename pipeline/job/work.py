@@ -12,6 +12,7 @@ import polars as pl
 from pipeline.core import SlipError, naming_os_errors, pick
 from pipeline.core.arrays import Floats
 from pipeline.core.compute import return_freed_memory
+from pipeline.core.untrusted import read_bounded
 from pipeline.job import STAGES, JobError, Options
 from pipeline.job.keys import EXTRACTED, TABLES, LogSetup
 from pipeline.logs import LogData, Loss, read_topics
@@ -42,7 +43,7 @@ def hash_model(path: Path | None) -> str | None:
     with naming_os_errors(
         JobError, "model_not_found", "the model file cannot be read", where=path, hint=hint
     ):
-        content = path.read_bytes()
+        content = read_bounded(path)
     from pipeline.models import read_model  # noqa: PLC0415 - heavy
 
     return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()

@@ -290,6 +290,9 @@ def _format_error(error: Exception) -> str:
 _MAX_BYTES: Final = 1 << 30
 """Maximum size of a table [bytes]: that of an IMU at 400 Hz in eight hours."""
 
+_MAX_LINES: Final = 12_000_000
+"""Maximum number of lines of a table: those of an IMU at 400 Hz in eight hours."""
+
 _KEPT_NS: Final = 1_000
 """Resolution of times [ns]: a double resolves seconds since 1970 to about one microsecond."""
 
@@ -445,16 +448,15 @@ class _Rows:
 
 def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
     if source.size > _MAX_BYTES:
-        what = (
-            f"the table holds {source.size / 1e6:,.0f} MB, and no more than {_MAX_BYTES / 1e6:,.0f} are read"
-        )
-        raise LogError("too_large", what, where=source.name, hint="Cut it into several recordings")
-    text = source.read_at(0, source.size).decode("utf-8-sig", "replace")
+        raise _too_large(source, source.size / 1e6, _MAX_BYTES / 1e6, "MB")
+    content = bytes(source.read_at(0, source.size))
+    count = content.count(b"\n")
+    if count > _MAX_LINES:
+        raise _too_large(source, count, _MAX_LINES, "lines")
     losses: list[Loss] = []
-    lines = text.splitlines()
-    if lines and not text.endswith("\n"):
+    *lines, last = content.decode("utf-8-sig", "replace").split("\n")
+    if last:
         # A cut number may be read as a different number.
-        lines.pop()
         losses.append(Loss("truncated", f"the last line of {table.path} has no end and is left out"))
     separator = None if table.columns else ","
     names = table.columns
@@ -475,6 +477,11 @@ def _read_rows(source: ByteSource, table: TextTable) -> _Rows:
         losses.append(Loss("damaged_record", f"{count} lines of {table.path} cannot be read"))
     columns = dict(zip(table.wanted, values[good].T, strict=True))
     return _Rows(at[good].astype(np.int64) * _KEPT_NS, columns, losses)
+
+
+def _too_large(source: ByteSource, size: float, most: float, unit: str) -> LogError:
+    what = f"the table holds {size:,.0f} {unit}, and no more than {most:,.0f} are read"
+    return LogError("too_large", what, where=source.name, hint="Cut it into several recordings")
 
 
 def _parse_lines(lines: Sequence[str], separator: str | None, places: Sequence[int]) -> Floats:

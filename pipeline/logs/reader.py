@@ -143,6 +143,7 @@ def read_topics(
     *,
     threads: int | None = None,
     sha256: str | None = None,
+    skip_unfit: bool = False,
 ) -> LogData:
     """Read topics of a recording.
 
@@ -151,6 +152,7 @@ def read_topics(
         wanted: topics and fields.
         threads: number of chunks inflated at once; by default as many as this process may use.
         sha256: hash of the recording if known; otherwise it is computed in parallel with reading.
+        skip_unfit: whether a topic without the wanted fields is left out instead of an error.
 
     Raises:
         LogError: as ``open_log``; ``topic_not_found``, ``field_not_found``. A topic in an unsupported
@@ -160,7 +162,7 @@ def read_topics(
     workers = threads or usable_threads()
     losses: dict[Loss, None] = dict.fromkeys(index.losses)
     notes = list(index.notes)
-    jobs = _choose_channels(index, wanted, losses, notes)
+    jobs = _choose_channels(index, wanted, losses, notes, skip_unfit=skip_unfit)
     coverage, walked = Coverage(), 0
     with ExitStack() as stack:
         sources = [stack.enter_context(open_source(part.path, part.version)) for part in index.parts]
@@ -234,7 +236,12 @@ class _Job:
 
 
 def _choose_channels(
-    index: LogIndex, wanted: Iterable[Wanted], losses: dict[Loss, None], notes: list[str]
+    index: LogIndex,
+    wanted: Iterable[Wanted],
+    losses: dict[Loss, None],
+    notes: list[str],
+    *,
+    skip_unfit: bool,
 ) -> dict[int, _Job]:
     """Decoders of the wanted channels by the recording's channel number."""
     jobs: dict[int, _Job] = {}
@@ -257,7 +264,7 @@ def _choose_channels(
                     text = f"{info.message_count} messages of {topic}: {error.what}"
                     losses[Loss(error.code, text, start_ns=index.start_ns, end_ns=index.end_ns)] = None
         unfit = [error for error in errors if error.code != "unsupported_encoding"]
-        if unfit and len(errors) == len(infos):
+        if unfit and len(errors) == len(infos) and not skip_unfit:
             raise unfit[0]
         notes += [f"{topic} has several channels; {error.what} in one of them" for error in unfit]
     return jobs

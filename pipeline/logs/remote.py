@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import re
 import stat
@@ -14,6 +15,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
+from pipeline.core.untrusted import MOST_BYTES, too_large
 from pipeline.logs.records import LogError
 
 if TYPE_CHECKING:
@@ -283,6 +285,17 @@ class RemotePath(PosixPath):
             child = type(self)(_add_scheme(self, str(info["name"])))
             if child.match(pattern):
                 yield child
+
+    def open(self, mode: str = "rb", *_: object, **__: object) -> io.BytesIO:  # type: ignore[override]
+        """Content of a small object, such as a configuration.
+
+        Raises:
+            OSError: it cannot be read, or is larger than `MOST_BYTES`.
+        """
+        del mode
+        if cast("int", self.look()["size"]) > MOST_BYTES:
+            raise too_large(self)
+        return io.BytesIO(self.read_bytes())
 
     def read_bytes(self) -> bytes:
         """Content of the object."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core import SlipError, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, require_finite
+from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
 from pipeline.models.catalogue import (
     EffectClass,
     find_effect,
@@ -172,7 +172,7 @@ def read_text(path: Path) -> str:
         MotionError: the file is missing or cannot be read.
     """
     try:
-        return path.read_text(encoding="utf-8")
+        return read_bounded_text(path)
     except FileNotFoundError:
         what = "there is no such model file"
         hint = f"Make one: slip model new {path.name} --vehicle husky_a200."

@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core import format_share
 from pipeline.core.arrays import Floats
-from pipeline.core.untrusted import TomlError, parse_toml
+from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text
 from pipeline.estimation import RunDiagnosis
 from pipeline.logs.writer import LogWriter
 from pipeline.models import format_value
@@ -102,7 +102,7 @@ def read_promises(path: Path) -> Promised:
     """
     file = path / _NAMES[0] if path.is_dir() else path
     try:
-        promised = msgspec.convert(parse_toml(file.read_text(encoding="utf-8")), Promised)
+        promised = msgspec.convert(parse_toml(read_bounded_text(file)), Promised)
     except OSError as error:
         what = f"the plan cannot be read ({error.strerror})"
     except TomlError as error:
@@ -294,8 +294,7 @@ def find_likeness(asked: Floats, seen: Floats) -> float:
 
 
 def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
-    with path.open(encoding="utf-8", newline="") as file:
-        names, *rows = csv.reader(file)
+    names, *rows = csv.reader(read_bounded_text(path).splitlines())
     _, speed, turn = np.array(rows, dtype=np.float64).T
     if names[-1].startswith("steering"):
         _, _, turn = vehicle.kinematics.asked({"speed": speed, "steering": turn}, vehicle)

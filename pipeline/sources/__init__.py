@@ -13,7 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core import guess_names, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, require_finite
+from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
 from pipeline.sources.candidates import (
     CONFIGURED,
     DriveForm,
@@ -160,7 +160,7 @@ def _name_line(where: str, source: Path | None, steps: list[str], value: str) ->
 def _find_line(source: Path, names: list[str], value: str) -> int | None:
     """Number of the line that sets a key, or opens its section; None if it cannot be located."""
     try:
-        lines = source.read_text(encoding="utf-8").splitlines()
+        lines = read_bounded_text(source).splitlines()
     except (OSError, UnicodeDecodeError):
         return None
     if not names:
@@ -317,7 +317,7 @@ def read_toml(path: Path) -> dict[str, object]:
         ConfigurationError: the file is missing, unreadable or not TOML (with the line).
     """
     try:
-        tree = parse_toml(path.read_text(encoding="utf-8"))
+        tree = parse_toml(read_bounded_text(path))
         require_finite(tree)
     except FileNotFoundError:
         raise ConfigurationError(

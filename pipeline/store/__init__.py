@@ -8,35 +8,25 @@ the new ones, never a mix, and the next writer cleans up. Rows that break a cont
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.core.untrusted import read_bounded_text
 from pipeline.store import files
-from pipeline.store.files import JSON, MANIFEST, MARKER, Manifest, hash_bytes, hash_file, hold_lock
-from pipeline.store.generation import STEPS, Generation, point_latest, remove_orphans
-from pipeline.store.listing import (
-    KEY_MARK,
-    LIST,
-    REGISTER,
-    LogIdentities,
-    LogSighting,
+from pipeline.store.checksums import AGAIN_NOTES, LOG_NOTES, Notes, encode_manifest, load_manifest
+from pipeline.store.files import (
+    JSON,
+    MANIFEST,
+    MARKER,
+    Manifest,
     Partition,
-    changed_since_sealed,
-    encode_mark,
-    entry_name,
-    is_run_manifest,
-    make_entry,
-    not_sealed,
-    parse_entry,
-    renew_register,
-    replace_listed,
-    require_key,
-    require_unsealed,
-    see_log,
+    hash_bytes,
+    hold_lock,
 )
+from pipeline.store.generation import STEPS, Generation, point_latest, remove_orphans
+from pipeline.store.identities import LogIdentities, LogSighting, see_log
 from pipeline.store.names import (
     QUARANTINE,
     Sample,
@@ -50,7 +40,6 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-from pipeline.store.seals import AGAIN_NOTES, LOG_NOTES, Key, Notes, encode_manifest, find_key, load_manifest
 
 if TYPE_CHECKING:
     import polars as pl
@@ -158,19 +147,15 @@ class Store:
         with self._lock_run(run) as home:
             previous = self.manifest(run)
             is_asked_again = previous is not None and self.is_asked_again(previous)
-            if previous is not None and not is_asked_again:
-                self._require_sealed(home)
             with name_disk_errors(home):
                 files.remove_leftovers(home)
                 remove_orphans(home, previous)
             generation = Generation(
                 run=run,
                 key=key,
-                root=self.root,
                 home=home,
                 previous=previous,
                 keeps_previous=previous is not None and not is_asked_again,
-                key_of_results=self._key,
                 watch=self._watch,
             )
             try:
@@ -240,7 +225,7 @@ class Store:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""
         from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
 
-        return examine_files(DiskFiles(self.root), key=self._key, sample=sample)
+        return examine_files(DiskFiles(self.root), sample=sample)
 
     def ask_again(self, manifest: Manifest) -> None:
         """Have a run made again by whoever analyzes its log next; until then readers keep its results."""
@@ -251,48 +236,14 @@ class Store:
         note = self.notes(AGAIN_NOTES).read(manifest.run)
         return note is not None and note.get("folder") == manifest.folder.name
 
-    def put_on_list(self, name: str) -> None:
-        """Have a manifest, or a file over all runs, on the list as it is.
-
-        Raises:
-            StoreError: ``locked``, or the disk refuses.
-        """
-        path = join_inside(self.root, name)
-        with self._lock(path.parent), name_disk_errors(path):
-            manifest = load_manifest(path.parent) if is_run_manifest(name) else None
-            entry = make_entry(name, hash_file(path), manifest=manifest)
-            files.make_folder(join_inside(self.root, LIST))
-            files.replace_file(join_inside(self.root, entry_name(name)), entry.encode(self._key))
-
-    def seal(self) -> None:
-        """Seal results that no key seals with the key, as they are.
-
-        Raises:
-            StoreError: ``no_key``, ``sealed_already``, ``not_whole``; or the disk refuses.
-        """
-        from pipeline.store.verification import DiskFiles, seal_entries  # noqa: PLC0415 - rarely needed
-
-        with self._lock_folder(self.root), name_disk_errors(self.root):
-            key = require_unsealed(self._read(KEY_MARK), self._key, str(self.root))
-            on_disk = DiskFiles(self.root)
-            for name, data in seal_entries(on_disk, key):
-                files.replace_file(join_inside(self.root, name), data, durable=False)
-            files.sync_files([self.root / LIST])
-            self._renew_register()
-            # Last: killed before, the results are as little sealed as they were.
-            self._replace(self.root / KEY_MARK, encode_mark(key))
-            self._renew_register()
-
     def remove(self, name: str) -> None:
-        """Remove a file that nobody can use any more: a damaged manifest, entry or note.
+        """Remove a file that nobody can use any more: a damaged manifest or note.
 
         Raises:
             StoreError: ``locked``, or the disk refuses.
         """
         path = join_inside(self.root, name)
-        with self._lock(path.parent if is_run_manifest(name) else self.root), name_disk_errors(path):
-            if name.startswith(f"{LIST}/"):
-                self._renew_register(without=name)
+        with self._lock(path.parent if path.name == MANIFEST else self.root), name_disk_errors(path):
             path.unlink(missing_ok=True)
 
     def prune(self, keep: int) -> tuple[Path, ...]:
@@ -326,12 +277,11 @@ class Store:
         valid, broken = checked.encode()
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"
         with self._lock(self.root), name_disk_errors(self.root):
-            self._replace(self.root / f"{name}.parquet", valid)
-            if broken is not None or quarantine.exists():
-                if broken is None:
-                    self._renew_register(without=entry_name(quarantine.name))
-                self._replace(quarantine, broken)
-            self._renew_register()
+            files.replace_file(self.root / f"{name}.parquet", valid)
+            if broken is None:
+                quarantine.unlink(missing_ok=True)
+            else:
+                files.replace_file(quarantine, broken)
         return checked.report
 
     def write_results_text(self, name: str, text: str) -> Path:
@@ -345,12 +295,11 @@ class Store:
         with self._lock(self.root), name_disk_errors(path):
             files.make_folder(path.parent)
             files.remove_leftovers(path.parent)
-            self._replace(path, text.encode())
-            self._renew_register()
+            files.replace_file(path, text.encode())
         return path
 
     def edit_results_text(self, name: str, edit: Callable[[str], str]) -> None:
-        """Edit a text of the whole results; one that is not as it was written stays as it is.
+        """Edit a text of the whole results, if it is there and is one.
 
         Raises:
             StoreError: as `write_results_text`.
@@ -358,10 +307,14 @@ class Store:
         check_file_name(name)
         path = join_inside(self.root, name)
         with self._lock(self.root), name_disk_errors(path):
-            data = self._read_written(name)
-            if data is not None and (edited := edit(data.decode(errors="replace")).encode()) != data:
-                self._replace(path, edited)
-                self._renew_register()
+            if not path.is_file():
+                return
+            try:
+                text = read_bounded_text(path)
+            except UnicodeDecodeError:
+                return
+            if (edited := edit(text)) != text:
+                files.replace_file(path, edited.encode())
 
     def notes(self, folder: str) -> Notes:
         """Small notes beside the results, in a folder of their own."""
@@ -410,76 +363,12 @@ class Store:
 
     @contextmanager
     def _lock(self, folder: Path) -> Iterator[None]:
-        """Hold the lock of a folder; nobody writes without the key that seals the results."""
-        key = self._key
-        if not require_key(self._read(KEY_MARK), key, str(self.root)) and key is not None:
-            self._begin_sealed(key)
-        with self._lock_folder(folder):
-            yield
-
-    @contextmanager
-    def _lock_folder(self, folder: Path) -> Iterator[None]:
         with name_disk_errors(folder):
             files.make_folder(folder)
         with hold_lock(folder / LOCK, patience_s=self._patience_s):
             with name_disk_errors(folder):
                 files.remove_leftovers(folder)
             yield
-
-    @cached_property
-    def _key(self) -> Key | None:
-        return find_key()
-
-    def _begin_sealed(self, key: Key) -> None:
-        """Say of results that are about to begin that a key seals them."""
-        with self._lock_folder(self.root):
-            # Another writer may have begun them meanwhile.
-            if require_key(self._read(KEY_MARK), key, str(self.root)):
-                return
-            if (self.root / LIST).exists() or (self.root / RUNS).exists():
-                raise not_sealed(str(self.root))
-            with name_disk_errors(self.root):
-                self._replace(self.root / KEY_MARK, encode_mark(key))
-
-    def _require_sealed(self, home: Path) -> None:
-        """Refuse to build on a run that somebody without the key has written.
-
-        Raises:
-            StoreError: ``not_sealed``.
-        """
-        if self._key is None:
-            return
-        if self._read_written((home / MANIFEST).relative_to(self.root).as_posix()) is not None:
-            return
-        raise changed_since_sealed(str(home))
-
-    def _read(self, name: str) -> bytes | None:
-        """The content of a file by its name in the results; None where there is none."""
-        path = join_inside(self.root, name)
-        with name_disk_errors(path):
-            try:
-                return path.read_bytes()
-            except (FileNotFoundError, NotADirectoryError):
-                return None
-
-    def _read_written(self, name: str) -> bytes | None:
-        """The content of a file that is as it was written, with the key if there is one; else None."""
-        data, entry = self._read(name), self._read(entry_name(name))
-        with suppress(ValueError):
-            listed = parse_entry(entry or b"", entry_name(name))
-            if listed.is_sealed_with(self._key) and data and hash_bytes(data) in listed.sha256:
-                return data
-        return None
-
-    def _replace(self, path: Path, data: bytes | None, manifest: Manifest | None = None) -> None:
-        replace_listed(self.root, path, data, manifest, key=self._key)
-
-    def _renew_register(self, *, without: str = "") -> None:
-        """Bring the register up to date; only under the lock of the results folder."""
-        names = (f"{LIST}/{path.name}" for path in (self.root / LIST).glob("*.json"))
-        data = renew_register(self._read, names, key=self._key, without=without)
-        if data is not None:
-            self._replace(self.root / REGISTER, data)
 
     def _prune_run(self, run: str, home: Path, keep: int) -> list[Path]:
         manifest = self.manifest(run)
@@ -490,8 +379,7 @@ class Store:
             doomed = [home / name for name in manifest.earlier[keep:]]
             # First the manifest forgets them: killed in between, they are orphans for the next writer.
             shorter = replace(manifest, earlier=manifest.earlier[:keep])
-            self._require_sealed(home)
-            self._replace(home / MANIFEST, encode_manifest(shorter), shorter)
+            files.replace_file(home / MANIFEST, encode_manifest(shorter))
             for folder in doomed:
                 if folder.exists():
                     files.remove_folder(folder)

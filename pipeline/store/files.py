@@ -21,11 +21,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TypeAlias
 
-from pipeline.core.untrusted import walk_files
+from pipeline.core.untrusted import read_bounded, walk_files
 from pipeline.store.names import (
     NOT_AS_WRITTEN,
     QUARANTINE,
     StoreError,
+    date_runs,
     file_missing,
     join_inside,
     name_damage,
@@ -408,7 +409,7 @@ class Manifest:
         """
         path = self.path(name)
         try:
-            data = path.read_bytes()
+            data = read_bounded(path)
             content = json.loads(data) if hash_bytes(data) == self.files[path.name].sha256 else None
         except FileNotFoundError as error:
             raise file_missing(path) from error
@@ -444,6 +445,35 @@ class Manifest:
             "key": self.key,
             "folder": str(self.folder),
         }
+
+
+@dataclass(frozen=True, kw_only=True)
+class Partition:
+    """The part of the runs that a question is about; what is not said is not asked.
+
+    Attributes:
+        vehicle: id of the vehicle.
+        terrain: name of the terrain.
+        dataset: name of the dataset.
+        day: date of the run, ``2026-07-31``; a beginning such as ``2026-07`` stands for all in it.
+    """
+
+    vehicle: str | None = None
+    terrain: str | None = None
+    dataset: str | None = None
+    day: str | None = None
+
+    def select(self, manifests: Sequence[Manifest]) -> tuple[Manifest, ...]:
+        """The runs that belong to it."""
+        days = date_runs({one.run: one.start_ns for one in manifests}).days
+        wanted = {"vehicle": self.vehicle, "terrain": self.terrain, "dataset": self.dataset}
+        asked = {name: value for name, value in wanted.items() if value is not None}
+        begins = self.day or ""
+        return tuple(
+            one
+            for one in manifests
+            if asked.items() <= one.summarize(None).items() and (days[one.run] or "").startswith(begins)
+        )
 
 
 def hash_bytes(data: bytes) -> str:

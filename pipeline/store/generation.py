@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.store import files
+from pipeline.store.checksums import encode_manifest, encode_marker, load_manifest
 from pipeline.store.files import (
     JSON,
     MANIFEST,
@@ -22,7 +23,6 @@ from pipeline.store.files import (
     remove_folder,
     temporary_beside,
 )
-from pipeline.store.listing import Replacement
 from pipeline.store.names import (
     QUARANTINE,
     StoreError,
@@ -32,7 +32,6 @@ from pipeline.store.names import (
     join_inside,
     name_disk_errors,
 )
-from pipeline.store.seals import Key, encode_manifest, encode_marker, load_manifest
 
 if TYPE_CHECKING:
     import polars as pl
@@ -110,19 +109,15 @@ class Generation:
         *,
         run: str,
         key: str,
-        root: Path,
         home: Path,
         previous: Manifest | None,
         keeps_previous: bool,
-        key_of_results: Key | None,
         watch: Callable[[str], None],
     ) -> None:
         self.run = run
         self.key = key
         self.previous = previous
         self._keeps_previous = keeps_previous
-        self._key_of_results = key_of_results
-        self._root = root
         self._home = home
         self._watch = watch
         self._folder = files.temporary_beside(home / key)
@@ -240,20 +235,18 @@ class Generation:
         self._require_open()
         with name_disk_errors(self._home):
             manifest = self._make_manifest(details)
-            data, key = encode_manifest(manifest), self._key_of_results
-            replacement = Replacement(self._root, self._home / MANIFEST, data, manifest, key=key)
-            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes(), key))
+            data = encode_manifest(manifest)
+            self._draft(self._folder / MARKER, encode_marker(self.run, manifest.hashes()))
             folders = sorted(path for path in self._folder.rglob("*") if path.is_dir())
-            files.sync_files([*self._drafts, replacement.draft(), *folders, self._folder])
+            files.sync_files([*self._drafts, *folders, self._folder])
             self._watch("folder_synced")
             self._folder.rename(manifest.folder)
             self._folder = manifest.folder
-            replacement.announce()
-            # One after the other: the disk takes the second name together with the first.
             files.sync_folder(self._home)
-            files.sync_folder(replacement.folder)
             self._watch("folder_renamed")
-            replacement.replace(when_written=lambda: self._watch("manifest_written"))
+            files.replace_file(
+                self._home / MANIFEST, data, when_written=lambda: self._watch("manifest_written")
+            )
             self._watch("manifest_replaced")
         self._is_open = False
         point_latest(self._home, manifest.folder.name)

@@ -17,31 +17,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.core.untrusted import MOST_BYTES, TOO_LARGE
 from pipeline.store import RUNS, Store
+from pipeline.store.checksums import LOG_NOTES, decode_checked, encode_checked, encode_manifest, load_manifest
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_bytes, make_folder, replace_file
-from pipeline.store.listing import (
-    ABSENT,
-    KEY_MARK,
-    LIST,
-    REGISTER,
-    encode_mark,
-    entry_name,
-    is_run_manifest,
-    make_entry,
-    renew_register,
-    require_unsealed,
-)
 from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
-from pipeline.store.seals import (
-    LOG_NOTES,
-    encode_manifest,
-    find_key,
-    load_manifest,
-    parse_manifest,
-    seal,
-    unseal,
-)
-from pipeline.store.verification import SEEN, Examination, examine_files, seal_entries
+from pipeline.store.verification import ABSENT, SEEN, Examination, examine_files
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
@@ -66,7 +47,6 @@ class Mirror:
         self.store = Store(folder or _default_folder(self.address))
         self._objects = _open_objects(self.address)
         self._prefix = self.address.partition("://")[2]
-        self._key = find_key()
 
     def pull_index(self) -> None:
         """Fetch what tells what there is: manifests, notes on logs, tables over all runs.
@@ -88,14 +68,9 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         home = f"{RUNS}/{encode_run(run)}"
-        mark = self.read(KEY_MARK)
-        if mark is not None:
-            self._put(KEY_MARK, mark)
-        with self._name_errors():
-            try:
-                data = self._objects.cat_file(self._address_of(f"{home}/{MANIFEST}"))
-            except FileNotFoundError:
-                return
+        data = self.read(f"{home}/{MANIFEST}")
+        if data is None:
+            return
         self._put(f"{home}/{MANIFEST}", data)
         manifest = load_manifest(self.store.root / home)
         if manifest is not None:
@@ -129,7 +104,7 @@ class Mirror:
                 locate = path.relative_to(self.store.root).as_posix()
                 if there.get(locate, {}).get("size") != path.stat().st_size:
                     self._objects.pipe_file(self._address_of(locate), path.read_bytes())
-            self._publish(f"{home}/{MANIFEST}", encode_manifest(manifest), manifest)
+            self._objects.pipe_file(self._address_of(f"{home}/{MANIFEST}"), encode_manifest(manifest))
 
     def push_file(self, name: str) -> None:
         """Publish a file over all runs, if the mirror has it.
@@ -140,18 +115,7 @@ class Mirror:
         path = join_inside(self.store.root, name)
         if path.exists():
             with self._name_errors():
-                self._publish(name, path.read_bytes())
-
-    def push_register(self) -> None:
-        """Publish which entries the list has by now.
-
-        Raises:
-            StoreError: as `pull_index`.
-        """
-        with self._name_errors():
-            data = renew_register(self.read, self._list(LIST), key=self._key)
-            if data is not None:
-                self._publish(REGISTER, data)
+                self._objects.pipe_file(self._address_of(name), path.read_bytes())
 
     def push_note(self, name: str) -> None:
         """Publish a note on a log.
@@ -179,7 +143,7 @@ class Mirror:
             home = manifest.folder.parent.relative_to(self.store.root).as_posix()
             named = {manifest.folder.name, *manifest.earlier}
             with self._name_errors():
-                self._publish(f"{home}/{MANIFEST}", encode_manifest(manifest), manifest)
+                self._objects.pipe_file(self._address_of(f"{home}/{MANIFEST}"), encode_manifest(manifest))
                 inside = [(name, name.removeprefix(f"{home}/").split("/")) for name in self._list(home)]
                 doomed = [name for name, parts in inside if len(parts) > 1 and parts[0] not in named]
                 if doomed:
@@ -193,33 +157,7 @@ class Mirror:
         Raises:
             StoreError: as `pull_index`.
         """
-        return examine_files(self, key=self._key, sample=sample)
-
-    def put_on_list(self, name: str) -> None:
-        """As `Store.put_on_list`.
-
-        Raises:
-            StoreError: as `pull_index`.
-        """
-        data = self.read(name)
-        if data is not None:
-            manifest = parse_manifest(data, self._hold(name).parent) if is_run_manifest(name) else None
-            self._publish(name, data, manifest)
-
-    def seal(self) -> None:
-        """As `Store.seal`.
-
-        Raises:
-            StoreError: as `pull_index` and `Store.seal`.
-        """
-        key = require_unsealed(self.read(KEY_MARK), self._key, self.address)
-        for name, data in seal_entries(self, key):
-            with self._name_errors():
-                self._objects.pipe_file(self._address_of(name), data)
-        with self._name_errors():
-            self._publish(KEY_MARK, encode_mark(key))
-        self.push_register()
-        self.pull_index()
+        return examine_files(self, sample=sample)
 
     def remove(self, name: str) -> None:
         """As `Store.remove`.
@@ -243,13 +181,15 @@ class Mirror:
             return self._list()
 
     def read(self, name: str) -> bytes | None:
-        """The content of an object; None when there is none.
+        """The content of a small object, such as a manifest or a note; None when there is none.
 
         Raises:
-            StoreError: as `pull_index`.
+            StoreError: as `pull_index`; ``too_large``.
         """
         with self._name_errors():
             try:
+                if self._objects.size(self._address_of(name)) > MOST_BYTES:
+                    raise self._too_large(name)
                 content: bytes = self._objects.cat_file(self._address_of(name))
             except FileNotFoundError:
                 return None
@@ -261,21 +201,15 @@ class Mirror:
         Raises:
             StoreError: as `pull_index`.
         """
-        data = self.read(name)
-        return ABSENT if data is None else hash_bytes(data)
+        with self._name_errors():
+            try:
+                return hash_bytes(self._objects.cat_file(self._address_of(name)))
+            except FileNotFoundError:
+                return ABSENT
 
     def locate(self, name: str) -> Path:
         """Where an object stands, or would stand, in the mirror."""
         return self.store.root / name
-
-    def _publish(self, name: str, data: bytes, manifest: Manifest | None = None) -> None:
-        """Replace an object that is on the list, as `Replacement` replaces a file."""
-        before, new = self.hash(name), hash_bytes(data)
-        entry = self._address_of(entry_name(name))
-        if before != new:
-            self._objects.pipe_file(entry, make_entry(name, new, before, manifest=manifest).encode(self._key))
-            self._objects.pipe_file(self._address_of(name), data)
-        self._objects.pipe_file(entry, make_entry(name, new, manifest=manifest).encode(self._key))
 
     def _list(self, under: str = "") -> dict[str, Mapping[str, object]]:
         """What the store says of the objects under a prefix, by their names in the results."""
@@ -296,7 +230,7 @@ class Mirror:
     def _fetch_changed(self, listed: Mapping[str, Mapping[str, object]]) -> None:
         seen_file = self.store.root / SEEN
         try:
-            seen = unseal(seen_file.read_bytes())
+            seen = decode_checked(seen_file.read_bytes())
         except (OSError, ValueError):
             seen = {}
         tags = {
@@ -306,17 +240,19 @@ class Mirror:
         changed = [
             name for name, tag in tags.items() if seen.get(name) != tag or not self._hold(name).exists()
         ]
+        for name in changed:
+            if name.endswith(".json") and int(str(listed[name].get("size") or 0)) > MOST_BYTES:
+                raise self._too_large(name)
         if changed or set(seen) - {""} != set(tags):
             self._fetch(dict.fromkeys(changed, ""))
             with name_disk_errors(seen_file):
                 make_folder(self.store.root)
-                replace_file(seen_file, seal({"": "", **tags}))
+                replace_file(seen_file, encode_checked({"": "", **tags}))
 
     def _forget_gone(self, listed: Mapping[str, object]) -> None:
         """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
         notes = (self.store.root / LOG_NOTES).glob("*/*.json")
-        mark = self.store.root / KEY_MARK
-        for path in (*(home / MANIFEST for home in self.store.run_dirs()), *notes, mark):
+        for path in (*(home / MANIFEST for home in self.store.run_dirs()), *notes):
             name = path.relative_to(self.store.root).as_posix()
             if name not in listed:
                 self._hold(name).unlink(missing_ok=True)
@@ -382,6 +318,10 @@ class Mirror:
             yield
         except (OSError, ImportError) as error:
             raise self._unreachable(error) from error
+
+    def _too_large(self, name: str) -> StoreError:
+        hint = "It is not fetched: look at who wrote it, and remove it"
+        return StoreError("too_large", TOO_LARGE, where=self._address_of(name), hint=hint)
 
     def _unreachable(self, error: Exception) -> StoreError:
         return StoreError(

@@ -13,7 +13,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
 
 from pipeline.core import SlipError
-from pipeline.core.untrusted import PathError, may_lead_out, resolve_inside
+from pipeline.core.untrusted import TOO_LARGE, PathError, may_lead_out, resolve_inside
 
 
 class StoreError(SlipError):
@@ -53,6 +53,12 @@ _KNOWN = (
         "not_a_folder",
         "there is a file where the folder of the results, or one in it, should be",
         "Choose another folder with --results, or move the file away",
+    ),
+    (
+        (errno.EFBIG,),
+        "too_large",
+        TOO_LARGE,
+        "It is not read: look at who wrote it, and remove it",
     ),
     (
         (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS),

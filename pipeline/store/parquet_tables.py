@@ -33,8 +33,7 @@ from schemas import Contract, contract_of, list_contracts
 if TYPE_CHECKING:
     from dataframely import FailureInfo
 
-    from pipeline.store.files import Manifest
-    from pipeline.store.listing import Partition
+    from pipeline.store.files import Manifest, Partition
 
 BROKEN_RULES = "broken_rules"
 

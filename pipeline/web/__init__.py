@@ -199,7 +199,7 @@ def _bad(why: str) -> WorkbenchError:
     return WorkbenchError("bad_request", f"the request cannot be read: {why}", hint="Reload the page.")
 
 
-_NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job")
+_NOT_FOUND = ("no_such_run", "no_such_desk", "no_such_job", "no_page")
 
 
 def answer(content: Mapping[str, object], status_code: int = 200) -> Response:

@@ -22,6 +22,7 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
+from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.job.analyze import PREVIEW, REPORT
 from pipeline.job.watch import read_statements
 from pipeline.report import CATALOGUE, PAGES, PLANS, is_page
@@ -326,9 +327,12 @@ class Web:
 
     async def page(self, request: Request) -> Response:
         """A stored page of the results, by its path in their folder, sandboxed from the workbench."""
-        name, root = request.scope["path"].removeprefix("/"), self._sessions.results.resolve()
-        path = (root / name).resolve()
-        if not (is_page(name) and path.is_relative_to(root) and path.is_file()):
+        name = request.scope["path"].removeprefix("/")
+        try:
+            path = resolve_inside(self._sessions.results.resolve(), name)
+        except PathError:
+            path = None
+        if path is None or not (is_page(name) and path.is_file()):
             raise WorkbenchError(
                 "no_page", "the results have no such page", where=name, hint="Open / for the workbench."
             )

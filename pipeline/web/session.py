@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.core import naming_os_errors
+from pipeline.core.untrusted import read_bounded
 from pipeline.job.run_results import locate_beside
 from pipeline.models import Effect, Model, Parameter, format_model, list_effects
 from pipeline.models.catalogue import refuse_taken
@@ -144,7 +145,7 @@ class SessionFile:
     def read(self) -> Session | None:
         """The stored session; None if there is none, or if it is unreadable."""
         try:
-            return msgspec.json.decode(self.path.read_bytes(), type=Session)
+            return msgspec.json.decode(read_bounded(self.path), type=Session)
         except (OSError, ValueError, msgspec.DecodeError, RecursionError):
             return None
 

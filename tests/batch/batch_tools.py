@@ -68,7 +68,7 @@ def read_tables(out: Path) -> dict[str, bytes]:
 
 def is_note(path: Path, out: Path) -> bool:
     inside = path.relative_to(out).parts
-    return inside[0] in {"batch", "identities", "listed"} or "latest" in inside
+    return inside[0] in {"batch", "identities"} or "latest" in inside
 
 
 def start_slip(*arguments: object) -> subprocess.Popen[str]:

@@ -20,7 +20,7 @@ from pipeline.batch.batch_work import Ledger
 from pipeline.cli import main
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store
-from pipeline.store.seals import encode_manifest
+from pipeline.store.checksums import encode_manifest
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -72,7 +72,7 @@ def asked() -> Iterator[tuple[str, list[str]]]:
 
 
 def name_address(out: Path, address: str) -> None:
-    """Have the results of a run name another place of its log, sealed again as a stranger would."""
+    """Have the results of a run name another place of its log, as a stranger would write them."""
     store = Store(out)
     for manifest in store.manifests():
         details = json.loads(json.dumps(manifest.details))
@@ -80,7 +80,6 @@ def name_address(out: Path, address: str) -> None:
         forged = replace(manifest, details=details)
         home = manifest.folder.parent
         (home / "manifest.json").write_bytes(encode_manifest(forged))
-        store.put_on_list((home / "manifest.json").relative_to(out).as_posix())
     for entry in Ledger(store).read_all().values():
         forged_entry = replace(entry, state="failed", log=replace(entry.log, path=address))
         store.notes(LOG_NOTES).write(address, msgspec.to_builtins(forged_entry))

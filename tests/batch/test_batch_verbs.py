@@ -136,8 +136,9 @@ def test_status_verify_and_query_look_without_logs(
     code, text, _ = slip(capsys, "results", "verify", out, "--json")
     found = json.loads(text)
     read = found.pop("read")
-    nothing: dict[str, object] = {key: [] for key in ("files", "logs", "gone", "remote", "unlisted")}
-    assert (code, found) == (0, {"runs": 4, "seal": "none", **nothing})
+    nothing: dict[str, object] = {key: [] for key in ("files", "logs", "gone", "remote")}
+    unchecked = ["datasets.parquet", "index.html"]
+    assert (code, found) == (0, {"runs": 4, "unchecked": unchecked, **nothing})
     assert read["logs"] == {"looked_at": 4, "all": 4}
     assert read["files"]["looked_at"] == read["files"]["all"] > 50
     next(out.rglob("slip.parquet")).write_bytes(b"x")

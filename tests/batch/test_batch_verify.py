@@ -13,7 +13,7 @@ from pipeline.batch.batch_check import verify_results
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.store import Store
+from pipeline.store import LOG_NOTES, Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -31,24 +31,23 @@ def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path:
     out = tmp_path / "out"
     batch(season, out)
     whole = read_tables(out)
-    assert (verify(out).files, verify(out).unlisted) == ((), ())
+    assert verify(out).files == ()
     run_dirs = {name: out / "runs" / "season" / name for name in "abcd"}
     next(run_dirs["a"].glob("*/slip.parquet")).write_bytes(b"x")
     (run_dirs["b"] / "manifest.json").write_text("{")
     shutil.rmtree(run_dirs["c"])
     shutil.copytree(run_dirs["a"], run_dirs["c"], symlinks=True)
-    shutil.rmtree(run_dirs["d"])
-    (out / "datasets.parquet").write_bytes(b"x")
-    next(out.glob("batch/logs/*/*.json")).write_text('{"state": ')
+    (run_dirs["d"] / "manifest.json").unlink()
+    # Its manifest tells the log as well.
+    Store(out).notes(LOG_NOTES).path_of(str(season / "a.mcap")).write_text('{"state": ')
 
     found = verify(out, repair=True)
     assert {(problem.run, problem.code) for problem in found.files} == {
         ("season/a", "file_damaged"), ("season/b", "manifest_damaged"), ("season/c", "name_clash"),
-        ("season/d", "run_missing"), ("", "file_damaged"), ("", "note_damaged"),
+        ("season/d", "run_missing"), ("", "note_damaged"),
     }  # fmt: skip
     actions = {repair.subject: repair.action for repair in found.repairs}
     assert {actions[f"season/{name}"] for name in "abcd"} == {"queued"}
-    assert actions["datasets.parquet"] == "queued"
     assert all(str(season) in repair.what for repair in found.repairs if "season" in repair.subject)
     # What may still be of use is there until something better is.
     assert Store(out).read("season/a", "aggregates").height
@@ -56,7 +55,7 @@ def test_what_is_damaged_is_made_again_by_the_next_batch(season: Path, tmp_path:
     again = batch(season, out)
     assert counts(again) == {"done": 4}
     assert again.problems == ()
-    assert (verify(out).files, verify(out).unlisted) == ((), ())
+    assert verify(out).files == ()
     tables = read_tables(out)
     for name, content in whole.items():
         if name.endswith(("datasets.parquet", "slip.parquet")):
@@ -92,7 +91,7 @@ def test_what_cannot_be_made_again_is_said_and_stays(
     batch(season, out)
     home = out / "runs" / "season"
     (home / "b" / "manifest.json").write_text("{")
-    shutil.rmtree(home / "a")
+    (home / "a" / "manifest.json").unlink()
     for name in "ab":
         (season / f"{name}.mcap").unlink()
     before = {path: path.read_bytes() for path in (home / "b").rglob("*.parquet")}
@@ -112,27 +111,8 @@ def test_what_cannot_be_made_again_is_said_and_stays(
     assert (home / "b" / "manifest.json").exists()
     code, said = ask()
     assert code == 1
-    assert [problem["code"] for problem in said["files"]] == ["manifest_damaged"]
+    assert [problem["code"] for problem in said["files"]] == ["run_missing", "manifest_damaged"]
     assert "repairs" not in said
-
-
-def test_older_results_are_put_on_the_list_when_asked_to(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    batch(season, out)
-    shutil.rmtree(out / "listed")
-    (out / "listed.json").unlink()
-    for path in (out / "runs").rglob("manifest.json"):
-        content = json.loads(path.read_bytes())
-        del content["checksum"]
-        path.write_text(json.dumps(content))
-    found = verify(out)
-    assert found.is_clean
-    assert len(found.unlisted) == 6
-    assert {repair.action for repair in verify(out, repair=True).repairs} == {"listed"}
-    assert (verify(out).files, verify(out).unlisted) == ((), ())
-    assert counts(batch(season, out)) == {"unchanged": 4}
-    (out / "runs" / "season" / "a" / "manifest.json").unlink()
-    assert [problem.code for problem in verify(out).files] == ["run_missing"]
 
 
 def test_logs_in_the_results_of_a_stranger_are_only_files(season: Path, tmp_path: Path) -> None:

@@ -20,9 +20,9 @@ from verbs import run_program, run_verb
 
 from pipeline.core import slip_command
 from pipeline.store import Manifest, Store, StoreError
+from pipeline.store.checksums import encode_manifest
 from pipeline.store.files import MANIFEST
 from pipeline.store.parquet_tables import schema_of
-from pipeline.store.seals import encode_manifest
 
 if TYPE_CHECKING:
     from pathlib import Path

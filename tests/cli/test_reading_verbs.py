@@ -18,7 +18,7 @@ from pipeline.job.keys import Owner, agree_on_vehicle
 from pipeline.simulate import simulate_case
 from pipeline.sources import find_preset
 from pipeline.store import Store
-from pipeline.store.seals import seal, unseal
+from pipeline.store.checksums import decode_checked, encode_checked
 
 
 def slip(*arguments: object) -> int:
@@ -77,11 +77,11 @@ def test_results_that_do_not_tell_a_vehicle_are_one_line(
     place: Path, capsys: pytest.CaptureFixture[str], vehicle: object
 ) -> None:
     path = place / "results" / "runs" / "field" / "wide" / "manifest.json"
-    content = unseal(path.read_bytes())
+    content = decode_checked(path.read_bytes())
     details = content["details"]
     assert isinstance(details, dict)
     told = {**details["vehicle"], **vehicle} if isinstance(vehicle, dict) and vehicle else vehicle
-    path.write_bytes(seal({**content, "details": {**details, "vehicle": told}}))
+    path.write_bytes(encode_checked({**content, "details": {**details, "vehicle": told}}))
     assert slip("diagnose", "field/wide", "--out", place / "results") == 1
     (line,) = capsys.readouterr().err.splitlines()
     assert "do not say which vehicle" in line
@@ -304,7 +304,7 @@ def test_no_verb_that_reads_writes_into_a_stored_run(
 
 
 @pytest.mark.parametrize("before", ["analyzed with it", "without"])
-def test_a_diagnosis_is_searched_once_and_its_model_is_written_from_what_is_stored(
+def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_tables(
     place: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

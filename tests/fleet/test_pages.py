@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from typing import TYPE_CHECKING
 
-import pytest
 from comparison_store import Run, write_run
 
 from pipeline.batch.batch_work import Entry, Ledger
@@ -54,24 +53,6 @@ def test_every_page_links_those_that_are_there_and_all_that_came_since(tmp_path:
         assert all((tmp_path / link).is_file() for link in links_of(tmp_path / page))
     update_datasets(store)
     assert links_of(tmp_path / "index.html") == ["trend.html", "map.html"]
-
-
-@pytest.mark.parametrize("bad", [b"?", b"\xff"])
-def test_a_damaged_page_is_not_signed_again_when_another_is_written(tmp_path: Path, bad: bytes) -> None:
-    store = make_results(tmp_path)
-    write_map(store, draw_up_map(store))
-    page = tmp_path / "map.html"
-    content = page.read_bytes()
-    page.write_bytes(content[:-10] + bad + content[-9:])
-    damaged = page.read_bytes()
-    assert damaged != content
-    problems = store.examine().problems
-    assert [problem.path.name for problem in problems] == ["map.html"]
-    write_trend(store, follow_trend(store, by=("dataset",), threshold=0.1, limits={}))
-    assert page.read_bytes() == damaged
-    assert store.examine().problems == problems
-    write_map(store, draw_up_map(store))
-    assert store.examine().problems == ()
 
 
 def test_a_page_elsewhere_leads_to_the_catalogue_that_is_there(tmp_path: Path) -> None:

@@ -332,7 +332,7 @@ def test_what_is_no_baseline_is_refused(same: Sides, tmp_path: Path, damage: str
     assert raised.value.code == "bad_baseline"
 
 
-def test_every_format_says_the_same(late: Sides) -> None:
+def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides) -> None:
     hostile = "a<b>|`\x1b[31m"
     runs = tuple(replace(one, numbers=replace(one.numbers, run=hostile)) for one in late.after)
     found = compare(replace(late, after=runs))

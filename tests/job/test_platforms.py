@@ -12,11 +12,11 @@ from mcap.writer import Writer
 from platforms import hidden_effects, try_platform
 
 from pipeline.core import SlipError
-from pipeline.job import JobError, Options
+from pipeline.job import JobError, Options, log_choice
 from pipeline.job.analyze import analyze_log
 from pipeline.job.keys import set_up_log
 from pipeline.job.log_choice import Choice, choose
-from pipeline.logs import Wanted, open_log, read_topics
+from pipeline.logs import LogData, Wanted, open_log, read_topics
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.sources import load_configuration
 
@@ -189,25 +189,55 @@ def test_requests_of_another_kind_are_no_commands(tmp_path: Path) -> None:
     assert not ((commands["body_x"] - 0.3).abs() + (commands["body_w"] - 0.5).abs() < 1e-9).any()
 
 
-def rewrite_requests(log: Path, text: bytes) -> None:
-    """Have all requests to the service of a log say a text, filled up with spaces."""
+def rewrite_requests(log: Path, text: bytes, copies: int = 0) -> None:
+    """Have all requests to the service of a log say a text, filled up with spaces; copies are topics, too."""
     out = log.with_suffix(".new")
     with log.open("rb") as source, out.open("wb") as stream:
         reader, writer = make_reader(source), Writer(stream)
         writer.start(reader.get_header().profile)
         channels: dict[int, int] = {}
+        schemas: dict[int, int] = {}
+        more: dict[int, int] = {}
         for schema, channel, message in reader.iter_messages():
             assert schema is not None
             if channel.id not in channels:
                 known = writer.register_schema(schema.name, schema.encoding, schema.data)
+                schemas[schema.id] = known
                 channels[channel.id] = writer.register_channel(channel.topic, channel.message_encoding, known)
             data = message.data
             if channel.topic == "/api/sport/request":
                 data, count = re.subn(rb'{"x"[^}]*}', lambda found: text.ljust(len(found[0])), data)
                 assert count == 1
+                for number in range(copies):
+                    name = f"/copy{number}{channel.topic}"
+                    if number not in more:
+                        more[number] = writer.register_channel(
+                            name, channel.message_encoding, schemas[schema.id]
+                        )
+                    writer.add_message(more[number], message.log_time, data, message.publish_time)
             writer.add_message(channels[channel.id], message.log_time, data, message.publish_time)
         writer.finish()
     out.replace(log)
+
+
+def test_many_services_that_say_no_command_are_read_together_and_said_in_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record("go2_w", tmp_path)
+    log = tmp_path / "run.mcap"
+    rewrite_requests(log, b"not JSON", copies=20)
+    reads: list[int] = []
+
+    def read(*arguments: object, **options: object) -> LogData:
+        reads.append(1)
+        return read_topics(*arguments, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(log_choice, "read_topics", read)
+    chosen = choose(open_log(log), load_configuration(log), {})
+    assert chosen.sources.command is None
+    (text,) = [finding.text for finding in chosen.findings if finding.id == "no_readable_text"]
+    assert "and 16 more is a readable command: the topics were left out" in text
+    assert len(reads) < 10
 
 
 @pytest.mark.parametrize("text", [b"not JSON", b'{"speed": 1}'])

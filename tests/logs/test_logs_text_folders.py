@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,25 @@ def test_a_table_beyond_the_limit_is_refused(session: Path, monkeypatch: pytest.
     monkeypatch.setattr(other_formats, "_MAX_BYTES", 20)
     with pytest.raises(LogError, match="no more than"):
         open_log(session)
+
+
+def test_a_table_of_nothing_but_line_ends_is_refused_before_it_is_cut_into_lines(session: Path) -> None:
+    table = session / "metadata" / "velocity_left.csv"
+    table.write_bytes(b"timestamp,value\n" + b"\n" * 300_000_000)
+    begin = time.process_time()
+    with pytest.raises(LogError, match="300,000,001 lines, and no more than 12,000,000 are read") as caught:
+        open_log(session)
+    assert time.process_time() - begin < 10.0
+    assert caught.value.code == "too_large"
+    assert str(table) in caught.value.where
+
+
+def test_lines_may_end_as_on_windows(session: Path) -> None:
+    table = session / "metadata" / "velocity_left.csv"
+    table.write_bytes(b"timestamp,value\r\n1760456485757616,0\r\n1760456486017763,-1.25\r\n\r\n")
+    assert read(session).topics[0].fields["data"].tolist() == [0.0, -1.25]  # type: ignore[union-attr]
+    table.write_bytes(b"timestamp,value\r\n1760456485757616,0\r\nx,1\r\n")
+    assert read(session).topics[0].fields["data"].tolist() == [0.0]  # type: ignore[union-attr]
 
 
 def test_other_folders_of_tables_are_no_recordings(session: Path) -> None:

@@ -158,7 +158,9 @@ def test_what_is_no_plain_file_is_refused_at_once(model: Path, make: Callable[[P
         read_model(model)
 
 
-def test_the_list_is_the_user_s_alone(model: Path, own_configuration: Path) -> None:
+def test_trusted_code_in_a_list_that_others_may_write_does_not_count(
+    model: Path, own_configuration: Path
+) -> None:
     trust(list_code(model))
     path = own_configuration / "slip" / "trusted_code"
     assert path.stat().st_mode & 0o777 == 0o600

@@ -38,7 +38,7 @@ from pipeline.report.viewer_files import (
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.store import Store, StoreError
-from pipeline.store.seals import encode_manifest
+from pipeline.store.checksums import encode_manifest
 
 ROOT = Path(__file__).parents[2]
 

@@ -91,7 +91,7 @@ def test_a_car_turns_its_wheels_as_far_as_its_description_says(limit: str, large
     ],
     ids=["empty", "text", "no wheels", "entities", "a place that is none", "a circle of links"],
 )
-def test_a_text_that_describes_no_wheels_is_no_description(text: str) -> None:
+def test_a_text_with_entities_or_without_wheels_is_no_description(text: str) -> None:
     assert read_description(text) is None
 
 

@@ -235,3 +235,15 @@ def test_the_cookie_that_follows_links_opens_stored_pages_and_nothing_else(workb
     status, _, body = workbench.request("GET", "/runs/../../report.html", known=False, headers=cookie)
     assert status >= 400
     assert b"not of the results" not in body
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["runs/%00", "runs/a%00/report.html", "plans/%00/plan.html", "runs/%0a/report.html", "runs//report.html",
+     "runs/%2e%2e/%2e%2e/report.html", "runs/%5c../report.html", f"runs/{'x' * 300}/report.html",
+     f"runs/{'x/' * 3000}report.html", "runs/%ff/report.html", "runs/%ed%a0%80/report.html", "runs/nowhere"],
+    ids=lambda name: name[:30],
+)  # fmt: skip
+def test_a_page_that_no_results_can_have_is_not_found(workbench: Workbench, name: str) -> None:
+    status, _, body = workbench.request("GET", f"/{name}")
+    assert (status, json.loads(body)["error"]["code"]) == (404, "no_page")

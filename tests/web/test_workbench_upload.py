@@ -181,7 +181,7 @@ def test_a_size_that_is_none_is_refused(empty: Workbench, length: str) -> None:
     assert not empty.results.exists() or files_below(empty.results) == []
 
 
-def test_a_log_is_deleted_when_it_is_worked_off_and_kept_while_its_vehicle_is_asked_for(
+def test_a_log_named_as_a_path_stays_inside_and_is_deleted_when_it_is_worked_off(
     empty: Workbench, hidden_log: Path, tmp_path: Path
 ) -> None:
     uploads = empty.results / "workbench" / "uploads"

@@ -1,19 +1,16 @@
-"""Checksums and keys that results are sealed with, and the sealed files of a run: its manifest, and notes."""
+"""Small JSON files with a checksum of their own: the manifest of a run, markers of generations, and notes."""
 
 from __future__ import annotations
 
-import hashlib
-import hmac
 import json
 import os
-import stat
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, cast
 
-from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.core.untrusted import PathError, read_bounded, resolve_inside
 from pipeline.store.files import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes, replace_file
 from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
 
@@ -27,7 +24,7 @@ _DIGITS = 64
 _END = b'",'
 
 
-def seal(content: Mapping[str, object], *, indent: int | None = None) -> bytes:
+def encode_checked(content: Mapping[str, object], *, indent: int | None = None) -> bytes:
     """JSON, sorted, with its checksum: the same bytes for the same content.
 
     Args:
@@ -44,7 +41,7 @@ def seal(content: Mapping[str, object], *, indent: int | None = None) -> bytes:
     return _START + hash_bytes(body).encode() + _END + body[1:]
 
 
-def check_seal(data: bytes) -> bool:
+def has_checksum(data: bytes) -> bool:
     """Whether the content of a file carries a checksum.
 
     Returns:
@@ -54,7 +51,7 @@ def check_seal(data: bytes) -> bool:
         ValueError: it is not what was written.
     """
     start, rest = data[: len(_START)], data[len(_START) :]
-    # One changed byte must not make a sealed file one of before there were seals.
+    # One changed byte must not make it a file of before there were checksums.
     if 2 * sum(one == other for one, other in zip(start, _START, strict=False)) < len(_START):
         return False
     body = b"{" + rest[_DIGITS + len(_END) :]
@@ -63,13 +60,13 @@ def check_seal(data: bytes) -> bool:
     return True
 
 
-def unseal(data: bytes) -> dict[str, object]:
-    """The content of a sealed file, or of one of before there were seals.
+def decode_checked(data: bytes) -> dict[str, object]:
+    """The content of a file with a checksum, or of one of before there were checksums.
 
     Raises:
         ValueError: it is not a JSON object, or not what was written.
     """
-    check_seal(data)
+    has_checksum(data)
     try:
         content = json.loads(data.decode())
     except RecursionError as error:
@@ -78,83 +75,6 @@ def unseal(data: bytes) -> dict[str, object]:
         raise ValueError("it is not a JSON object")  # noqa: TRY004 - wrong content, not a wrong call
     content.pop("checksum", None)
     return content
-
-
-KEY_VARIABLE: Final = "SLIP_KEY_FILE"
-"""Names the file of the key, for batches that nobody starts by hand and for their workers."""
-
-LEAST_BYTES: Final = 32
-"""As many as the hash gives: a shorter key would be what is guessed."""
-
-_MOST_BYTES: Final = 1 << 16
-_ID_DIGITS: Final = 16
-
-
-@dataclass(frozen=True)
-class Key:
-    """A secret.
-
-    Attributes:
-        secret: its bytes.
-    """
-
-    secret: bytes = field(repr=False)
-
-    @property
-    def id(self) -> str:
-        """What tells keys apart, and nothing of the secret."""
-        return self.sign({"purpose": "name of a key"})[:_ID_DIGITS]
-
-    def sign(self, content: Mapping[str, object]) -> str:
-        """HMAC-SHA256 (hex) of a JSON object, whatever the order of its keys."""
-        body = json.dumps(content, allow_nan=False, sort_keys=True).encode("ascii")
-        return hmac.new(self.secret, body, hashlib.sha256).hexdigest()
-
-    def holds(self, content: Mapping[str, object], signature: str) -> bool:
-        """Whether a signature is this key's of that content."""
-        return hmac.compare_digest(self.sign(content).encode(), signature.encode("utf-8", "replace"))
-
-
-def read_key(path: Path) -> Key:
-    """The key in a file.
-
-    Raises:
-        StoreError: ``bad_key_file``: it is not there, no file, too short or too long, or others may read it.
-    """
-    try:
-        # Opening a pipe would wait for somebody to write into it.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        with os.fdopen(descriptor, "rb") as file:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                raise _refuse(path, "the key is not a file", "Give the file that holds it")
-            if status.st_mode & 0o077:
-                what = f"others may read the key (mode {stat.S_IMODE(status.st_mode):04o})"
-                raise _refuse(path, what, "chmod 600 it, and use another key if somebody may have read it")
-            secret = file.read(_MOST_BYTES + 1)
-    except OSError as error:
-        what = f"the key cannot be read ({error.strerror})"
-        raise _refuse(path, what, "Make one: openssl rand -out FILE 32 && chmod 600 FILE") from None
-    if not LEAST_BYTES <= len(secret) <= _MOST_BYTES:
-        what = f"the key holds {len(secret)} bytes and not {LEAST_BYTES} to {_MOST_BYTES}"
-        if len(secret) > _MOST_BYTES:
-            what = f"the key holds more than {_MOST_BYTES} bytes"
-        raise _refuse(path, what, "Make one: openssl rand -out FILE 32 && chmod 600 FILE")
-    return Key(secret)
-
-
-def find_key() -> Key | None:
-    """The key that the environment names; None without one.
-
-    Raises:
-        StoreError: as `read_key`.
-    """
-    path = os.environ.get(KEY_VARIABLE)
-    return read_key(Path(path)) if path else None
-
-
-def _refuse(path: Path, what: str, hint: str) -> StoreError:
-    return StoreError("bad_key_file", what, where=str(path), hint=hint)
 
 
 FORMAT = 1
@@ -168,7 +88,9 @@ def encode_manifest(manifest: Manifest) -> bytes:
         StoreError: ``bad_details``, the details hold something JSON has no word for.
     """
     try:
-        return seal({"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1)
+        return encode_checked(
+            {"format": FORMAT, **asdict(manifest), "folder": manifest.folder.name}, indent=1
+        )
     except (TypeError, ValueError) as error:
         hint = "Give texts, finite numbers, lists and mappings with text keys only"
         raise StoreError(
@@ -185,7 +107,7 @@ def load_manifest(home: Path) -> Manifest | None:
         OSError: the file cannot be read.
     """
     try:
-        data = join_inside(home, MANIFEST).read_bytes()
+        data = read_bounded(join_inside(home, MANIFEST))
     except (FileNotFoundError, NotADirectoryError):
         return None
     return parse_manifest(data, home)
@@ -214,7 +136,7 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
                 raise
         if written_in <= FORMAT:
             _check_names(stored)
-            check_seal(data)
+            has_checksum(data)
             folder = resolve_inside(home, stored.folder)
     except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
         said = error.what if isinstance(error, PathError) else " ".join(str(error).split())
@@ -233,33 +155,23 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
     return Manifest(**content | {"folder": folder})
 
 
-def encode_marker(run: str, files: Mapping[str, str], key: Key | None) -> bytes:
+def encode_marker(run: str, files: Mapping[str, str]) -> bytes:
     """What stands in a generation's own folder: its files, for when no manifest names them any more.
 
     Args:
         run: the run.
         files: SHA-256 of the files by name.
-        key: of the results.
     """
-    content = {"run": run, "files": files}
-    return seal(content if key is None else {**content, "signature": key.sign(content)})
+    return encode_checked({"run": run, "files": files})
 
 
-def parse_marker(data: bytes, key: Key | None = None) -> dict[str, str]:
+def parse_marker(data: bytes) -> dict[str, str]:
     """SHA-256 of a generation's files by name, as its marker tells them.
 
-    Args:
-        data: its content.
-        key: that must have sealed it; None asks for none.
-
     Raises:
-        ValueError: the marker is damaged, or not sealed with the key.
+        ValueError: the marker is damaged.
     """
-    content = unseal(data)
-    signature = content.pop("signature", "")
-    if key is not None and not key.holds(content, str(signature)):
-        raise ValueError("it is not sealed with the key")
-    files = content.get("files")
+    files = decode_checked(data).get("files")
     if not isinstance(files, dict) or not all(
         is_file_name(name) and isinstance(sha256, str) for name, sha256 in files.items()
     ):
@@ -296,7 +208,8 @@ def _check_names(stored: _Stored) -> None:
         raise ValueError(f"its key is {stored.key!r}")
 
 
-# Small notes beside the results, one sealed file each: replaced whole, by many at once without waiting.
+# Small notes beside the results, one file with a checksum each: replaced whole, by many at once without
+# waiting.
 #
 # A note may be lost, for example in a power cut, and must then only cost time. What must not be lost belongs
 # into a generation.
@@ -338,7 +251,7 @@ class Notes:
             path = self.path_of(name)
             path.parent.mkdir(parents=True, exist_ok=True)
             # No waiting for the disk: after a power cut an empty note only costs time.
-            replace_file(path, seal(content), durable=False)
+            replace_file(path, encode_checked(content), durable=False)
         except (StoreError, OSError):
             return False
         return True
@@ -374,6 +287,6 @@ class Notes:
 def _load(path: Path) -> dict[str, JSON] | None:
     try:
         # Nothing but a file is opened: a pipe would be waited for.
-        return cast("dict[str, JSON]", unseal(path.read_bytes())) if path.is_file() else None
+        return cast("dict[str, JSON]", decode_checked(read_bounded(path))) if path.is_file() else None
     except (OSError, ValueError):
         return None

@@ -1,17 +1,20 @@
-"""What changed, went, or was put in the place of something else is noticed; a kill is none of these."""
+"""What changed in a run, went from it or was added is noticed by its manifest; a kill is none of these."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import tracemalloc
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import pytest
 from store_samples import make_slip, read_seed, write_generation
 
+from pipeline.core.untrusted import MOST_BYTES
 from pipeline.store import Store
-from pipeline.store.listing import LIST, entry_name
+from pipeline.store.checksums import decode_checked, encode_checked
 from pipeline.store.names import Sample
 
 if TYPE_CHECKING:
@@ -42,7 +45,8 @@ def list_files(root: Path) -> list[Path]:
 
 
 def is_held(path: Path) -> bool:
-    return path.name != ".lock"
+    """Whether a checksum covers a file: those over all runs are made of the runs again."""
+    return path.name not in {".lock", "comparison.html"}
 
 
 def test_a_changed_byte_is_noticed_wherever_it_is(filled: Store) -> None:
@@ -57,15 +61,14 @@ def test_a_changed_byte_is_noticed_wherever_it_is(filled: Store) -> None:
     assert filled.examine().problems == ()
 
 
-def test_a_file_that_went_is_noticed_or_said_to_be_unlisted(filled: Store) -> None:
+def test_a_file_that_went_from_a_run_is_noticed(filled: Store) -> None:
     for path in filter(is_held, list_files(filled.root)):
         if "batch" in path.parts:
             # A note may go at any time, which costs a look at the log.
             continue
         whole = path.read_bytes()
         path.unlink()
-        found = filled.examine()
-        assert found.problems or found.unlisted, path.relative_to(filled.root)
+        assert filled.examine().problems, path.relative_to(filled.root)
         path.write_bytes(whole)
     assert filled.examine().problems == ()
 
@@ -76,12 +79,12 @@ def home_of(store: Store, run: str) -> Path:
     return manifest.folder.parent
 
 
-def delete_run(store: Store) -> None:
-    shutil.rmtree(home_of(store, RUN))
+def delete_manifest_of(store: Store, run: str) -> None:
+    (home_of(store, run) / "manifest.json").unlink()
 
 
 def delete_manifest(store: Store) -> None:
-    (home_of(store, RUN) / "manifest.json").unlink()
+    delete_manifest_of(store, RUN)
 
 
 def copy_another_run_over_it(store: Store) -> None:
@@ -104,15 +107,6 @@ def swap_two_manifests(store: Store) -> None:
     other.write_bytes(contents[0])
 
 
-def put_the_manifest_of_another_folder_there(store: Store) -> None:
-    elsewhere = Store(store.root.parent / "elsewhere")
-    write_generation(elsewhere, RUN, "old", 1)
-    write_generation(elsewhere, RUN, "new", 7)
-    home = home_of(store, RUN)
-    shutil.rmtree(home)
-    shutil.copytree(home_of(elsewhere, RUN), home, symlinks=True)
-
-
 def delete_an_old_generation(store: Store) -> None:
     shutil.rmtree(home_of(store, RUN) / "old")
 
@@ -126,41 +120,6 @@ def swap_two_tables(store: Store) -> None:
 
 def swap_two_markers(store: Store) -> None:
     shutil.copy(home_of(store, RUN) / "new" / ".generation", home_of(store, OTHER) / "key" / ".generation")
-
-
-def delete_the_pool(store: Store) -> None:
-    (store.root / "comparison.html").unlink()
-
-
-def put_an_entry_in_the_place_of_another(store: Store) -> None:
-    one, other, *_ = sorted((store.root / LIST).iterdir())
-    shutil.copy(one, other)
-
-
-def delete_the_entry_of_a_page(store: Store) -> None:
-    (store.root / entry_name("comparison.html")).unlink()
-
-
-def delete_the_entry_of_a_run(store: Store) -> None:
-    (store.root / entry_name(f"runs/{RUN}/manifest.json")).unlink()
-
-
-def delete_a_page_and_its_entry(store: Store) -> None:
-    delete_the_entry_of_a_page(store)
-    delete_the_pool(store)
-
-
-def delete_a_run_and_its_entry(store: Store) -> None:
-    delete_the_entry_of_a_run(store)
-    delete_run(store)
-
-
-def delete_the_register(store: Store) -> None:
-    (store.root / "listed.json").unlink()
-
-
-def delete_the_entry_of_the_register(store: Store) -> None:
-    (store.root / entry_name("listed.json")).unlink()
 
 
 def delete_a_marker(store: Store) -> None:
@@ -186,28 +145,18 @@ def add_a_file_to_an_old_generation(store: Store) -> None:
 
 
 CHANGES = {
-    delete_the_entry_of_a_page: "not_listed",
-    delete_the_entry_of_a_run: "not_listed",
-    delete_a_page_and_its_entry: "file_missing",
-    delete_a_run_and_its_entry: "run_missing",
-    delete_the_register: "file_missing",
-    delete_the_entry_of_the_register: "not_listed",
     delete_a_marker: "file_missing",
     add_a_file: "extra_file",
     add_an_empty_file_to_a_folder_of_its_own: "extra_file",
     add_a_link: "extra_file",
     add_a_file_to_an_old_generation: "old_generation",
-    delete_run: "run_missing",
     delete_manifest: "run_missing",
     copy_another_run_over_it: "name_clash",
     swap_two_runs: "name_clash",
     swap_two_manifests: "name_clash",
-    put_the_manifest_of_another_folder_there: "manifest_swapped",
     delete_an_old_generation: "old_generation",
     swap_two_tables: "file_damaged",
     swap_two_markers: "file_damaged",
-    delete_the_pool: "file_missing",
-    put_an_entry_in_the_place_of_another: "list_damaged",
 }
 
 
@@ -225,15 +174,6 @@ def test_an_extra_file_is_named_and_stays(filled: Store) -> None:
     assert (problem.run, problem.home) == (RUN, f"runs/{RUN}")
 
 
-def test_an_entry_that_went_stays_missed_after_the_next_writing(filled: Store) -> None:
-    delete_a_run_and_its_entry(filled)
-    filled.write_results_text("trend.html", "x")
-    assert [problem.code for problem in filled.examine().problems] == ["run_missing"]
-    # What the user has taken off the list is not missed.
-    filled.remove(entry_name(f"runs/{RUN}/manifest.json"))
-    assert filled.examine().problems == ()
-
-
 def test_a_sample_draws_its_share_and_looks_at_every_run(filled: Store) -> None:
     whole = filled.examine()
     assert whole.files.looked_at == whole.files.all > 12
@@ -247,21 +187,10 @@ def test_a_sample_draws_its_share_and_looks_at_every_run(filled: Store) -> None:
     noticed = [bool(filled.examine(Sample(0.3, f"day {day}")).problems) for day in range(60)]
     assert 6 < sum(noticed) < 32
     none = Sample(0.0, "")
-    shutil.rmtree(home_of(filled, OTHER))
+    delete_manifest_of(filled, OTHER)
     assert [problem.code for problem in filled.examine(none).problems] == ["run_missing"]
     next(home_of(filled, RUN).glob("new/slip.parquet")).unlink()
     assert "file_missing" in {problem.code for problem in filled.examine(none).problems}
-
-
-def test_the_manifest_of_before_put_back_is_noticed(store: Store) -> None:
-    path = write_generation(store, RUN, "old", 1).folder.parent / "manifest.json"
-    before = path.read_bytes()
-    write_generation(store, RUN, "new", 2)
-    path.write_bytes(before)
-    assert read_seed(store, RUN) == 1
-    assert [problem.code for problem in store.examine().problems] == ["manifest_swapped"]
-    write_generation(store, RUN, "new", 3)
-    assert store.examine().problems == ()
 
 
 def test_results_that_are_being_written_are_not_damaged(store: Store, start_writer: StartWriter) -> None:
@@ -270,26 +199,20 @@ def test_results_that_are_being_written_are_not_damaged(store: Store, start_writ
     looks = 0
     while any(writer.poll() is None for writer in writers):
         found = store.examine()
-        assert (found.problems, found.unlisted) == ((), ())
+        assert (found.problems, found.unchecked) == ((), ())
         looks += 1
     assert [writer.returncode for writer in writers] == [0, 0]
     assert looks > 5
 
 
-def test_a_run_from_other_results_is_not_on_the_list(store: Store, tmp_path: Path) -> None:
-    elsewhere = Store(tmp_path / "elsewhere")
-    write_generation(elsewhere, RUN, "k", 1)
-    write_generation(store, OTHER, "k", 2)
-    shutil.copytree(home_of(elsewhere, RUN), store.root / "runs" / RUN, symlinks=True)
-    assert [(problem.run, problem.code) for problem in store.examine().problems] == [(RUN, "not_listed")]
-    store.put_on_list(f"runs/{RUN}/manifest.json")
-    assert store.examine().problems == ()
+def test_pages_over_all_runs_are_said_to_have_no_checksum(filled: Store) -> None:
+    (filled.root / "comparison.html").write_text("another")
+    found = filled.examine()
+    assert (found.problems, found.unchecked) == ((), ("comparison.html",))
 
 
 def make_old(root: Path) -> None:
-    """Results as they were before there were checksums and a list."""
-    shutil.rmtree(root / LIST)
-    (root / "listed.json").unlink()
+    """Results as they were before there were checksums."""
     for path in (*root.rglob("manifest.json"), *root.glob("batch/**/*.json")):
         content = json.loads(path.read_bytes())
         if content.pop("checksum", None):
@@ -298,25 +221,51 @@ def make_old(root: Path) -> None:
         path.write_bytes(b"")
 
 
-def test_results_of_before_there_was_a_list_are_not_damaged(filled: Store) -> None:
+def test_results_of_before_there_were_checksums_are_not_damaged(filled: Store) -> None:
     make_old(filled.root)
     found = filled.examine()
     assert found.problems == ()
-    assert set(found.unlisted) == {
-        "comparison.html", f"runs/{RUN}/manifest.json", f"runs/{OTHER}/manifest.json",
-        f"runs/{RUN}/old/.generation",
-    }  # fmt: skip
+    assert found.unchecked == ("comparison.html", f"runs/{RUN}/old/.generation")
     assert filled.notes("batch/logs").read("log") == {"state": "done"}
     assert read_seed(filled, RUN) == 2
 
     write_generation(filled, RUN, "next", 4)
-    filled.write_results_text("comparison.html", "new")
     filled.prune(0)
     found = filled.examine()
-    assert (found.problems, found.unlisted) == ((), (f"runs/{OTHER}/manifest.json",))
+    assert (found.problems, found.unchecked) == ((), ("comparison.html",))
     path = filled.root / "runs" / OTHER / "key" / "summary.json"
     path.write_text("x")
     assert [problem.code for problem in filled.examine().problems] == ["file_damaged"]
+
+
+def seal_as_before(root: Path) -> None:
+    """Results as older versions left them: a list, the mark of a key, and signatures in markers."""
+    names = [*(f"runs/{run}/manifest.json" for run in (RUN, OTHER)), "comparison.html"]
+    (root / "listed").mkdir()
+    for number, name in enumerate(names):
+        entry = {"log": "", "path": name, "run": "", "sha256": ["0" * 64], "signature": "1" * 64}
+        (root / "listed" / f"{number:032x}.json").write_bytes(encode_checked(entry))
+    (root / "listed.json").write_bytes(encode_checked({"entries": {}}))
+    (root / "sealed.json").write_bytes(encode_checked({"key": "0" * 16}))
+    for path in root.rglob(".generation"):
+        path.write_bytes(encode_checked({**decode_checked(path.read_bytes()), "signature": "1" * 64}))
+
+
+def test_results_that_were_listed_and_sealed_are_read_verified_and_written(filled: Store) -> None:
+    seal_as_before(filled.root)
+    assert filled.examine().problems == ()
+    assert filled.examine().unchecked == ("comparison.html",)
+    assert read_seed(filled, RUN) == 2
+    (home_of(filled, RUN) / "old" / "summary.json").write_text("x")
+    (home_of(filled, OTHER) / "key" / "summary.json").write_text("x")
+    codes = {problem.run: problem.code for problem in filled.examine().problems}
+    assert codes == {RUN: "old_generation", OTHER: "file_damaged"}
+
+    for run in (RUN, OTHER):
+        write_generation(filled, run, "next", 4)
+    filled.prune(0)
+    assert filled.examine().problems == ()
+    assert read_seed(filled, OTHER) == 4
 
 
 def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(store: Store) -> None:
@@ -328,15 +277,13 @@ def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(sto
     assert store.examine().problems == ()
 
 
-def test_a_table_of_results_with_broken_rows_is_on_the_list_with_them(store: Store) -> None:
+def test_a_table_of_results_has_the_rows_that_broke_its_contract_last(store: Store) -> None:
     store.write_results_table("slip", make_slip(RUN, 1))
-    assert store.examine().unlisted == ()
     broken = make_slip(RUN, 1).with_columns(modulus=-1.0)
     store.write_results_table("slip", broken)
     assert (store.root / "quarantine_slip.parquet").exists()
     store.write_results_table("slip", make_slip(RUN, 2))
     assert not (store.root / "quarantine_slip.parquet").exists()
-    assert store.examine().problems == store.examine().unlisted == ()
 
 
 def test_a_note_that_was_changed_is_none(store: Store) -> None:
@@ -347,3 +294,23 @@ def test_a_note_that_was_changed_is_none(store: Store) -> None:
     path.write_bytes(path.read_bytes().replace(b'"size": 1', b'"size": 2'))
     assert notes.read("log") is None
     assert [problem.code for problem in store.examine().problems] == ["note_damaged"]
+
+
+def test_a_huge_note_is_none_and_is_not_read_whole(store: Store) -> None:
+    write_generation(store, RUN, "k", 1)
+    notes = store.notes("batch/logs")
+    notes.write("log", {"state": "done"})
+    manifest = home_of(store, RUN) / "manifest.json"
+    for path in (notes.path_of("log"), manifest):
+        os.truncate(path, 2 * 2**30)
+    tracemalloc.start()
+    assert notes.read("log") is None
+    assert list(notes.read_all()) == []
+    (error,) = store.survey().errors
+    found = store.examine()
+    assert tracemalloc.get_traced_memory()[1] < 4 * MOST_BYTES
+    tracemalloc.stop()
+    assert error.code == "too_large"
+    assert f"{manifest}: it has more than 32 MB" in str(error)
+    assert {problem.code for problem in found.problems} == {"note_damaged", "manifest_damaged"}
+    assert all("it has more than 32 MB" in problem.what for problem in found.problems)
