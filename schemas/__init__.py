@@ -120,10 +120,12 @@ def drive_is_complete() -> pl.Expr:
 class Table(dy.Schema):
     """Columns that every table has: which run a row belongs to.
 
-    The table is called as the class, in small letters.
+    The table is called as the class, in small letters. ``FACTS`` names numbers of the whole table, which stand
+    in the metadata of its file.
     """
 
     VERSION: ClassVar[int]
+    FACTS: ClassVar[Mapping[str, str]] = {}
 
     run = dy.String(metadata={"description": "run the row belongs to"})
     dataset = dy.String(metadata={"description": "runs of one vehicle on one terrain"})
@@ -144,6 +146,11 @@ class Contract:
     name: str
     version: int
     schema: type[Table]
+
+    @property
+    def facts(self) -> Mapping[str, str]:
+        """Numbers of the whole table in its file's metadata, with their descriptions; names end in the unit."""
+        return self.schema.FACTS
 
     def metadata_of(self, column: str) -> dict[str, str]:
         """Unit, frame and description of a column; absent ones are left out."""

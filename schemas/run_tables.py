@@ -231,7 +231,13 @@ class Velocities(Table):
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
+    FACTS: ClassVar[Mapping[str, str]] = {
+        "length_scale_m": "L, which turns yaw rate into speed in the moduli",
+        "wheel_radius_m": "r, radius of the wheels",
+        "track_width_m": "b, between the left and the right wheels; absent where it is unknown",
+        "wheelbase_m": "l, between the axles; absent where it is unknown",
+    }
 
     input = schemas.source()
     t = schemas.seconds()
@@ -254,7 +260,11 @@ class Slip(Table):
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
-    model_x = schemas.body("m/s", "velocity forward of the model given with --model", nullable=True)
+    model_x = schemas.body(
+        "m/s",
+        "velocity forward of the model: that of --model, else that of the diagnosis; null without one",
+        nullable=True,
+    )
     model_y = schemas.body("m/s", "velocity to the left of that model", nullable=True)
     model_w = schemas.body("rad/s", "yaw rate of that model", nullable=True)
     residual_modulus = schemas.body(
@@ -303,7 +313,7 @@ class Aggregates(Table):
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip speed")
     median_residual_modulus = schemas.optional(
-        "m/s", "median slip speed of the residual of the model given with --model"
+        "m/s", "median modulus of the residual of the model, see table slip"
     )
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")
