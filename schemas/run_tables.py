@@ -161,7 +161,7 @@ class Alignments(Table):
     latency_spread = schemas.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = schemas.number("s", "time in which the localization contradicts the wheels")
     recorded_modulus_command = schemas.optional(
-        "m/s", "median slip speed (L = 1 m) from commands as recorded, before any correction"
+        "m/s", "median slip modulus (L = 1 m) from commands as recorded, before any correction"
     )
     recorded_modulus_measured = schemas.optional("m/s", "the same from wheel encoders")
 
@@ -295,7 +295,7 @@ class Windows(Table):
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
-    rms_modulus = schemas.bounded("m/s", "root mean square of the slip speed", 0.0)
+    rms_modulus = schemas.bounded("m/s", "root mean square of the slip modulus", 0.0)
     window_norm = schemas.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
 
 
@@ -311,7 +311,7 @@ class Aggregates(Table):
     subset = schemas.choice(SUBSETS, "all samples, or only transitory or steady ones")
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
-    median_modulus = schemas.optional("m/s", "median slip speed")
+    median_modulus = schemas.optional("m/s", "median slip modulus")
     median_residual_modulus = schemas.optional(
         "m/s", "median modulus of the residual of the model, see table slip"
     )
@@ -327,7 +327,7 @@ class Aggregates(Table):
     duration = schemas.optional("s", "time of the samples")
     height_rate = schemas.optional("m/s", "height variation per second")
     largest_kinetic_energy = schemas.optional("J", "largest 1/2 m v^2; null without a mass")
-    length_scale = schemas.number("m", "L that turns yaw rate into speed in the slip speed")
+    length_scale = schemas.number("m", "L that turns yaw rate into speed in the slip modulus")
 
 
 KINDS = ("rung", "floor")

@@ -297,7 +297,7 @@ def _make_recording(
 
 
 def read_length_scale(manifest: Manifest) -> float:
-    """Length scale of the slip speed that a run was analyzed with [m]."""
+    """Length scale of the slip modulus that a run was analyzed with [m]."""
     scale = manifest.part("configuration", "slip").get("length_scale_m")
     return float(scale) if isinstance(scale, int | float) else 1.0
 

@@ -162,7 +162,7 @@ class Live:
     Attributes:
         duration_s: duration of the log.
         distance_m: driven distance.
-        slip_mps: median slip speed over the last `RECENT_S`, by input.
+        slip_mps: median slip modulus over the last `RECENT_S`, by input.
         error_mps: median residual speed of the last model over the last `RECENT_S`, by input.
         events: events: ``id``, ``text``, ``t_start``, ``t_end``.
         problem: reason why there is no slip yet; empty if there is.

@@ -297,7 +297,7 @@ def test_a_planted_sentence_is_found_where_it_would_be_shown(tmp_path: Path) -> 
         "not observable in this log: slope_drift",
         "there is no run with a date",
         "the compression is no longer supported",
-        "median slip speed 0.594 m/s from commands",
+        "median slip modulus 0.594 m/s from commands",
         "detectable change 0.33; spread between runs 0.034 (default)",
         "the pose jumped 2 times: the run is split there",
     ],

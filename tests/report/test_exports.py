@@ -88,6 +88,21 @@ def test_the_official_reader_finds_what_the_tables_hold(source: ExportSource, de
     assert {"/slip/velocity/model", "/slip/predicted_path", "/slip/trail", "/slip/segment"} <= set(found)
 
 
+def test_what_the_model_leaves_is_its_distance_from_the_measured_velocity(derived: Path) -> None:
+    found = read_officially(derived)
+    measured, model = (
+        {
+            time: (twist.linear.x, twist.linear.y, twist.angular.z)
+            for time, twist in ((time, message.twist) for time, message in found[f"/slip/velocity/{kind}"])  # type: ignore[attr-defined]
+        }
+        for kind in ("measured", "model")
+    )
+    left = {time: message.data for time, message in found["/slip/residual_modulus"]}  # type: ignore[attr-defined]
+    assert left.keys() == model.keys()
+    own = {time: float(np.linalg.norm(np.subtract(model[time], measured[time]))) for time in model}
+    assert left == pytest.approx(own, abs=1e-12)
+
+
 def test_another_reader_finds_the_same(derived: Path) -> None:
     official = read_officially(derived)
     counts: dict[str, int] = {}
