@@ -278,7 +278,7 @@ def test_layouts_name_only_topics_of_the_derived_log(
     plots = [panel for name, panel in layout["configById"].items() if name.startswith("Plot")]
     drawn = {line["value"].split(".")[0] for plot in plots for line in plot["paths"]}
     assert drawn <= topics
-    assert len(drawn) == 6
+    assert len(drawn) == 7
     panels = json.dumps(layout["layout"])
     assert all(name in panels for name in layout["configById"])
     tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
