@@ -176,7 +176,9 @@ def show(rows: list[Row]) -> None:
             end="",
         )
     print()
-    for place, what in enumerate(("median slip modulus of the slip [m/s]", "error over 2 s of the prior [m]")):
+    for place, what in enumerate(
+        ("median slip modulus of the slip [m/s]", "error over 2 s of the prior [m]")
+    ):
         print(f"\n{what}: expected, was")
         held = 0
         for row in rows:

@@ -20,8 +20,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-HERE = Path(__file__).parent
-sys.path[:0] = [str(HERE), str(HERE / "hidden")]
+sys.path.insert(0, str(Path(__file__).parent / "hidden"))
 
 import numpy as np
 from json_lines import read_rows
@@ -36,11 +35,24 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
 
-CATEGORIES = ("single", "small", "sets", "equipped", "cars", "natural", "late", "joint", "empty", "odd", "poor")
+HERE = Path(__file__).parent
+CATEGORIES = (
+    "single",
+    "small",
+    "sets",
+    "equipped",
+    "cars",
+    "natural",
+    "late",
+    "joint",
+    "empty",
+    "odd",
+    "poor",
+)
 LOGS_EACH = 44
 _FIRST_SEED, _SEEDS_A_VERSION = 1_200_000, 1000
 _PUBLISHED = {
-    # Paper, section V: tile and snow as printed; ice 3.6 times snow and 5 % below gravel, from which the two follow.
+    # Tile and snow as printed; ice is 3.6 times snow and 5 % below gravel, from which these two follow.
     "husky_wheels-deflated_tile_2023_12_12_16h16": ("Husky tile", 1.716, False),
     "husky_snow_boreal": ("Husky snow", 2.76, False),
     "warthog_gravel_1": ("Warthog gravel", 10.5, True),
@@ -116,7 +128,9 @@ def measure_rivals(source: str) -> Callable[[Asked], dict[str, object]]:
 
     def measure(asked: Asked) -> dict[str, object]:
         rows = asked.folder / f"rivals_{source}.jsonl"
-        run_beside("rivals.py", "--results", str(asked.folder / "rivals"), "--input", source, "--rows", str(rows))
+        run_beside(
+            "rivals.py", "--results", str(asked.folder / "rivals"), "--input", source, "--rows", str(rows)
+        )
         return {
             "command": f"make measure ARGS=rivals_{source}",
             "versions": {"diagnosis": list_versions()["diagnosis"]},
@@ -139,9 +153,12 @@ def measure_paper(asked: Asked) -> dict[str, object]:
     ]
     named = {str(row["name"]): row for row in rows}
     ratios = [
-        {"name": name, "paper": paper, **divide(named[above], named[below])} for name, above, below, paper in _RATIOS
+        {"name": name, "paper": paper, **divide(named[above], named[below])}
+        for name, above, below, paper in _RATIOS
     ]
-    stages = {name: version for name, version in list_versions().items() if name in {"extract", "align", "slip"}}
+    stages = {
+        name: version for name, version in list_versions().items() if name in {"extract", "align", "slip"}
+    }
     return {"command": "make measure ARGS=paper", "versions": stages, "rows": rows, "ratios": ratios}
 
 
@@ -175,7 +192,9 @@ def write_measured(name: str, content: Mapping[str, object]) -> None:
     about = {"command": content["command"], "commit": read_version(), "date": f"{datetime.now(UTC):%Y-%m-%d}"}
     text = json.dumps(about | dict(content), indent=1)
     item = r'(?:"[^"\[\]]*"|-?[\d.]+(?:e-?\d+)?)'
-    short = re.sub(rf"\[\s+({item}(?:,\s+{item})*)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text)
+    short = re.sub(
+        rf"\[\s+({item}(?:,\s+{item})*)\s+\]", lambda found: f"[{' '.join(found[1].split())}]", text
+    )
     (MEASURED / f"{name}.json").write_text(short + "\n", encoding="utf-8")
 
 
@@ -190,7 +209,9 @@ MEASUREMENTS: dict[str, tuple[bool, Callable[[Asked], dict[str, object]]]] = {
 
 def main() -> int:
     """Measure what is asked for, one after the other."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("names", nargs="*", help=f"which: {', '.join(MEASUREMENTS)} (default: all)")
     parser.add_argument("--jobs", type=int, default=2, help="logs at a time")
     parser.add_argument("--logs", type=int, default=LOGS_EACH, help="drawn logs of each category")

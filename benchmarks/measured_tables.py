@@ -71,7 +71,11 @@ def name_origin(data: Data) -> str:
 
 def make_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """A table in Markdown."""
-    return [f"| {' | '.join(head)} |", "| --- " * len(head) + "|", *(f"| {' | '.join(row)} |" for row in rows)]
+    return [
+        f"| {' | '.join(head)} |",
+        "| --- " * len(head) + "|",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
 
 
 KINDS = (
@@ -92,18 +96,21 @@ def render_accuracy(data: Data) -> list[str]:
     for words, names in KINDS:
         there = [rows[name] for name in names if name in rows]
         if there:
-            counted, exact, narrowed = (sum(row[key] for row in there) for key in ("counted", "exact", "narrowed"))
+            counted, exact, narrowed = (
+                sum(row[key] for row in there) for key in ("counted", "exact", "narrowed")
+            )
             more = f", in {narrowed - exact} more undecided" if narrowed > exact else ""
             table.append((words, f"{exact} of {counted}{more}"))
     held, whole = (sum(one[key] for one in data["intervals"]) for key in ("held", "of"))
     odd = rows["odd"]
+    alike, missed = odd["narrowed"] - odd["exact"], odd["counted"] - odd["narrowed"]
     return [
         *make_table(("test logs", "exactly the hidden effects named"), table),
         "",
-        f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain the true value",
-        f"in {held} of {whole} cases. Physics outside the catalogue has no name: of {odd['counted']} logs with such",
-        f"physics {odd['exact']} are flagged as unexplained in the right channel, {odd['narrowed'] - odd['exact']} more get the",
-        f"names of known effects that are like it, {odd['counted'] - odd['narrowed']} are not noticed or misnamed.",
+        f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain the",
+        f"true value in {held} of {whole} cases. Physics outside the catalogue has no name: of {odd['counted']}",
+        f"logs with such physics {odd['exact']} are flagged as unexplained in the right channel, {alike} more get",
+        f"names of known effects that are like it, and {missed} are not noticed, or misnamed.",
     ]
 
 
@@ -117,8 +124,12 @@ def render_wins(*inputs: Data) -> list[str]:
     """How often the best model of the literature is better or worse than the named physics."""
     rows = []
     for place, words in PLACES.items():
-        there = [find_section(data, place, metric)["wins"]["literature"] for data in inputs for metric in METRICS]
-        rows.append((words, *(f"{better} better, {worse} worse of {count}" for better, worse, count in there)))
+        there = [
+            find_section(data, place, metric)["wins"]["literature"] for data in inputs for metric in METRICS
+        ]
+        rows.append(
+            (words, *(f"{better} better, {worse} worse of {count}" for better, worse, count in there))
+        )
     head = [f"{words}: {metric}" for words in INPUTS.values() for metric in METRICS]
     return make_table(("fitted to", *head), rows)
 
@@ -128,7 +139,9 @@ def render_learned(data: Data) -> list[str]:
     rows = []
     for group in list(GROUPS)[1:]:
         counts = [find_section(data, "in the run", metric)["wins"][group] for metric in METRICS]
-        rows.append((GROUPS[group], *(f"{better} better, {worse} worse of {n}" for better, worse, n in counts)))
+        rows.append(
+            (GROUPS[group], *(f"{better} better, {worse} worse of {n}" for better, worse, n in counts))
+        )
     return make_table(("from commands, held out in the run", *METRICS), rows)
 
 
@@ -144,8 +157,9 @@ def render_errors(data: Data) -> list[str]:
         parts.append(f"{metric} error falls to {low} to {high} % (median {median} %)")
     count = len(section["rows"])
     return [
-        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the {parts[0]} of that of the",
-        f"ideal model, the {parts[1]}, but rarely to the noise floor, which the verdict states.",
+        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the",
+        f"{parts[0]} of that of the ideal model, the {parts[1]},",
+        "but rarely to the noise floor, which the verdict states.",
     ]
 
 
@@ -156,8 +170,8 @@ def render_section(section: Data) -> list[str]:
     lines += [*make_table(section["head"], section["rows"]), ""] if section["rows"] else []
     for group, (better, worse, count) in section["wins"].items():
         lines.append(
-            f"- {title}: {GROUPS[group]} is better than the named physics on {better} of {count}, worse on {worse}, "
-            f"not significantly different on {count - better - worse}."
+            f"- {title}: {GROUPS[group]} is better than the named physics on {better} of {count}, "
+            f"worse on {worse}, not significantly different on {count - better - worse}."
         )
     gone = ", ".join(f"{format_percent(share)} with {name}" for name, share in section["gone"].items())
     lines.append(f"- {title}: of the ideal model's error are gone, in the median, {gone}.")
@@ -180,31 +194,22 @@ def render_place(place: str, data: Data) -> list[str]:
 
 def render_paper(data: Data) -> list[str]:
     """Medians and ratios of the paper beside those of this program."""
-    lines = make_table(
-        ("deployment", "paper", "this program, 95 % interval of the run", "reproduced"),
-        (
-            (
-                row["name"],
-                f"{'about ' if row['derived'] else ''}{row['paper']:g}",
-                f"{row['value']:#.3g} [{row['low']:#.3g}, {row['high']:#.3g}]",
-                judge(row["paper"], row["value"], row["low"], row["high"]),
-            )
-            for row in data["rows"]
-        ),
-    )
-    lines += [""] + make_table(
-        ("ratio", "paper", "this program", "reproduced"),
-        (
-            (
-                row["name"],
-                f"{row['paper']:g}",
-                f"{row['value']:.2f} [{row['low']:.2f}, {row['high']:.2f}]",
-                judge(row["paper"], row["value"], row["low"], row["high"]),
-            )
-            for row in data["ratios"]
-        ),
-    )
-    return lines
+    medians = [
+        (row["name"], f"{'about ' if row['derived'] else ''}{row['paper']:g}", *describe_row(row))
+        for row in data["rows"]
+    ]
+    ratios = [(row["name"], f"{row['paper']:g}", *describe_row(row)) for row in data["ratios"]]
+    return [
+        *make_table(("median", "paper", "this program, 95 % interval of the run", "reproduced"), medians),
+        "",
+        *make_table(("ratio", "paper", "this program", "reproduced"), ratios),
+    ]
+
+
+def describe_row(row: Data) -> tuple[str, str]:
+    """A value with its interval, and whether the paper's is in it."""
+    value, low, high = (row[key] for key in ("value", "low", "high"))
+    return f"{value:#.3g} [{low:#.3g}, {high:#.3g}]", judge(row["paper"], value, low, high)
 
 
 def judge(paper: float, value: float, low: float, high: float) -> str:

@@ -319,7 +319,11 @@ def summarize(rows: Sequence[Row], metric: str) -> dict[str, object]:
         shares = [round(share, 4) for share in held if isinstance(share, float)]
         if shares:
             bands[name] = shares
-    return {"wins": wins, "gone": {name: round(float(share), 4) for name, share in gone.items()}, "bands": bands}
+    return {
+        "wins": wins,
+        "gone": {name: round(float(share), 4) for name, share in gone.items()},
+        "bands": bands,
+    }
 
 
 def main() -> None:

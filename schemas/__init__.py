@@ -120,8 +120,8 @@ def drive_is_complete() -> pl.Expr:
 class Table(dy.Schema):
     """Columns that every table has: which run a row belongs to.
 
-    The table is called as the class, in small letters. ``FACTS`` names numbers of the whole table, which stand
-    in the metadata of its file.
+    The table is called as the class, in small letters. ``FACTS`` names numbers of the whole table, which
+    stand in the metadata of its file.
     """
 
     VERSION: ClassVar[int]
@@ -149,7 +149,7 @@ class Contract:
 
     @property
     def facts(self) -> Mapping[str, str]:
-        """Numbers of the whole table in its file's metadata, with their descriptions; names end in the unit."""
+        """Numbers of the whole table in its file's metadata, described; their names end in the unit."""
         return self.schema.FACTS
 
     def metadata_of(self, column: str) -> dict[str, str]:

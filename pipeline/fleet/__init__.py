@@ -272,7 +272,9 @@ class Measure:
 
 
 MEASURES = {
-    "slip": Measure("median_modulus", "slip modulus", "m/s", "the published measure; fast vehicles look worse"),
+    "slip": Measure(
+        "median_modulus", "slip modulus", "m/s", "the published measure; fast vehicles look worse"
+    ),
     "relative": Measure(
         "relative_slip", "relative slip", "1", "slip modulus over ideal speed, while the vehicle should move"
     ),

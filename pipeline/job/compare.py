@@ -214,9 +214,9 @@ NOT_VALID = (
 
 
 ABOUT_UNIT = (
-    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), in m/s; "
-    "the paper prints the same number in m^2 rad/s^3, the product of the units of its three components, which is the "
-    "unit of no norm"
+    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), "
+    "in m/s; the paper prints the same number in m^2 rad/s^3, the product of the units of its three "
+    "components, which is the unit of no norm"
 )
 
 

@@ -94,8 +94,8 @@ def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
 def diagnose_work(work: Work) -> dict[str, JSON] | None:
     """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
-    Table `slip` is given the model that was judged, unless one was named with ``--model``; without a diagnosis
-    it has none.
+    Table `slip` is given the model that was judged, unless one was named with ``--model``; without a
+    diagnosis it has none.
 
     Returns:
         The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None if it

@@ -317,7 +317,9 @@ class Watch:
             with suppress(SlipError):
                 length = setup.configuration.slip.length_scale_m
                 file = read_model(self._model)
-                slip, _ = add_model(slip, tables, file, aligned.vehicle, length=length, where=str(self._model))
+                slip, _ = add_model(
+                    slip, tables, file, aligned.vehicle, length=length, where=str(self._model)
+                )
         offset = (made.start_ns - self._log.start_ns) * 1e-9
         self._take(speeds, slip, offset)
         self._note_events(aligned.findings, offset)

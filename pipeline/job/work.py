@@ -364,7 +364,9 @@ class Work:
         samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
         findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
         model = None if self.options.model is None else self.options.model.name
-        return StageOutcome((*made.findings, *findings, *checks.run_checks(samples, vehicle)), {"model": model})
+        return StageOutcome(
+            (*made.findings, *findings, *checks.run_checks(samples, vehicle)), {"model": model}
+        )
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Add the velocity of the given model to table `slip`; without a model it stays unchanged."""

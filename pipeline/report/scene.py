@@ -424,7 +424,10 @@ class Scene:
 
     @cached_property
     def modulus_lines(self) -> Thinned | None:
-        """Slip modulus over time, long: ``t value series``, null where a line breaks; `model`: what it leaves."""
+        """Slip modulus over time, long: ``t value series``, null where a line breaks.
+
+        The series `model` is what the model leaves.
+        """
         left = [] if self.main_residual is None else [(self.main_residual, "residual_modulus", "model")]
         return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()] + left)
 

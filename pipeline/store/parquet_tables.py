@@ -253,11 +253,11 @@ def read_facts(path: Path) -> dict[str, float]:
 def _annotate(contract: Contract, schema: pa.Schema, facts: Mapping[str, float]) -> pa.Schema:
     fields = []
     described = _annotate_columns(contract)
-    for field in schema:
-        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else described[field.name]
+    for column in schema:
+        ours = _ABOUT_BROKEN_RULES if column.name == BROKEN_RULES else described[column.name]
         # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
-        theirs = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        fields.append(field.with_metadata(theirs | dict(ours)))
+        theirs = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+        fields.append(column.with_metadata(theirs | dict(ours)))
     about = {"contract": contract.name, "contract_version": str(contract.version)}
     return pa.schema(fields, metadata=about | {name: repr(float(value)) for name, value in facts.items()})
 

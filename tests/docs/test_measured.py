@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import pytest
-
-ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
 import measured_tables as tables
+import pytest
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
+ROOT = Path(__file__).parents[2]
 FILES = sorted(tables.MEASURED.glob("*.json"))
 
 
 def test_the_pages_say_what_was_measured() -> None:
-    places = [found["name"] for page in tables.PAGES for found in tables.BLOCK.finditer(page.read_text("utf-8"))]
+    places = [
+        found["name"] for page in tables.PAGES for found in tables.BLOCK.finditer(page.read_text("utf-8"))
+    ]
     assert set(places) == set(tables.RENDERERS)
     for page in tables.PAGES:
         text = page.read_text(encoding="utf-8")
-        assert text.count("<!-- measured:") == text.count("<!-- /measured -->") == len(tables.BLOCK.findall(text))
+        assert (
+            text.count("<!-- measured:")
+            == text.count("<!-- /measured -->")
+            == len(tables.BLOCK.findall(text))
+        )
         assert tables.fill_page(text) == text, f"{page.relative_to(ROOT)}: make docs-tables"
 
 

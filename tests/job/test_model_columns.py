@@ -48,7 +48,9 @@ def test_the_model_that_was_judged_stands_beside_the_measurement(known: Outcome)
 
     for name in ("command", "measured"):
         part = slip.filter(pl.col("input") == name, ~pl.col("suspect")).drop_nulls(COLUMNS)
-        model, measured = (part.select(f"{kind}_{axis}" for axis in "xyw").to_numpy() for kind in ("model", "v"))
+        model, measured = (
+            part.select(f"{kind}_{axis}" for axis in "xyw").to_numpy() for kind in ("model", "v")
+        )
         length = known.summary["length_scale_m"]
         own = np.sqrt(np.sum(((model - measured) * (1.0, 1.0, length)) ** 2, axis=1))
         assert part["residual_modulus"].to_numpy() == pytest.approx(own, abs=1e-9)
@@ -86,9 +88,7 @@ def test_the_model_velocity_is_that_of_its_physics(known: Outcome) -> None:
     assert checked > 1000
 
 
-def test_a_new_look_and_the_results_as_a_whole_keep_it(
-    known: Outcome, log: Path, tmp_path: Path
-) -> None:
+def test_a_new_look_and_the_results_as_a_whole_keep_it(known: Outcome, log: Path, tmp_path: Path) -> None:
     results = next(folder for folder in known.manifest.folder.parents if (folder / "runs").is_dir())
     before = known.manifest.read("slip")
     count = before.height - before["model_x"].null_count()
@@ -107,13 +107,18 @@ def test_a_new_look_and_the_results_as_a_whole_keep_it(
     assert exported["residual_modulus [m/s]"].to_list() == before["residual_modulus"].to_list()
 
 
-def test_without_a_diagnosis_there_is_no_model(log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_diagnosis_there_is_no_model(
+    log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     plain = analyze(log, tmp_path, diagnosis=False)
     assert plain.manifest.read("slip")["model_x"].null_count() == plain.manifest.read("slip").height
 
     diagnosed = analyze(log, tmp_path)
     assert diagnosed.computed == ("diagnosis",)
-    assert diagnosed.manifest.read("slip")["model_x"].null_count() < 0.02 * diagnosed.manifest.read("slip").height
+    assert (
+        diagnosed.manifest.read("slip")["model_x"].null_count()
+        < 0.02 * diagnosed.manifest.read("slip").height
+    )
     # The generation before stays as it was.
     assert plain.manifest.read("slip")["model_x"].null_count() == plain.manifest.read("slip").height
 
@@ -121,7 +126,9 @@ def test_without_a_diagnosis_there_is_no_model(log: Path, tmp_path: Path, monkey
     monkeypatch.setattr("pipeline.job.run_results.VERSION", 10_000)
     without = analyze(log, tmp_path, diagnosis=False, report=True)
     assert "diagnosis.json" not in without.manifest.files
-    assert without.manifest.read("slip")["residual_modulus"].null_count() == without.manifest.read("slip").height
+    assert (
+        without.manifest.read("slip")["residual_modulus"].null_count() == without.manifest.read("slip").height
+    )
     assert without.summary["by_input"]["command"]["median_residual_modulus"] is None
 
 
