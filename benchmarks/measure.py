@@ -79,8 +79,8 @@ def measure_accuracy(asked: Asked) -> dict[str, object]:
     first = _FIRST_SEED + _SEEDS_A_VERSION * list_versions()["diagnosis"]
     seeds = f"{first}-{first + asked.logs}"
     out = asked.folder / "scores.jsonl"
-    run_beside("hidden/play.py", "--category", ",".join(CATEGORIES), "--seeds", seeds, "--jobs", str(asked.jobs),
-               "--out", str(out), "--resume")  # fmt: skip
+    drawn = ("--category", ",".join(CATEGORIES), "--seeds", seeds)
+    run_beside("hidden/play.py", *drawn, "--jobs", str(asked.jobs), "--out", str(out), "--resume")
     wanted = range(first, first + asked.logs)
     records = [one for one in read_records([out]).values() if one.job.seed in wanted]
     return {

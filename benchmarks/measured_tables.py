@@ -103,14 +103,14 @@ def render_accuracy(data: Data) -> list[str]:
             table.append((words, f"{exact} of {counted}{more}"))
     held, whole = (sum(one[key] for one in data["intervals"]) for key in ("held", "of"))
     odd = rows["odd"]
-    alike, missed = odd["narrowed"] - odd["exact"], odd["counted"] - odd["narrowed"]
+    flagged, alike, missed = odd["exact"], odd["narrowed"] - odd["exact"], odd["counted"] - odd["narrowed"]
     return [
         *make_table(("test logs", "exactly the hidden effects named"), table),
         "",
         f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain the",
-        f"true value in {held} of {whole} cases. Physics outside the catalogue has no name: of {odd['counted']}",
-        f"logs with such physics {odd['exact']} are flagged as unexplained in the right channel, {alike} more get",
-        f"names of known effects that are like it, and {missed} are not noticed, or misnamed.",
+        f"true value in {held} of {whole} cases. Physics outside the catalogue has no name: of",
+        f"{odd['counted']} logs with such physics {flagged} are flagged as unexplained in the right channel,",
+        f"{alike} more get names of known effects that are like it, {missed} are not noticed, or misnamed.",
     ]
 
 
