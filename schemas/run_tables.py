@@ -313,9 +313,7 @@ class Aggregates(Table):
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip modulus")
-    median_residual_modulus = schemas.optional(
-        "m/s", "median modulus of the residual of the model, see table slip"
-    )
+    median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")
     rms_y = schemas.optional("m/s", "root mean square of g_y")

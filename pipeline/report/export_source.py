@@ -150,7 +150,8 @@ class ExportSource:
     @property
     def length_scale_m(self) -> float:
         """Length scale L of the moduli [m]."""
-        return float(self.manifest.part("configuration", "slip").get("length_scale_m", 1.0))
+        scale = self.manifest.part("configuration", "slip").get("length_scale_m")
+        return float(scale) if isinstance(scale, int | float) else 1.0
 
     @cached_property
     def shift_ns(self) -> int:

@@ -428,8 +428,8 @@ class Scene:
 
         The series `model` is what the model leaves.
         """
-        left = [] if self.main_residual is None else [(self.main_residual, "residual_modulus", "model")]
-        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()] + left)
+        residual = [] if self.main_residual is None else [(self.main_residual, "residual_modulus", "model")]
+        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()] + residual)
 
     def component_lines(self, component: str) -> Thinned | None:
         """Velocities of `x`, `y` or `w` over time, long: ``t value series``, null where a line breaks."""

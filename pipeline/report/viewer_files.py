@@ -129,8 +129,8 @@ def _write_model(
     velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
     _write_twist(writer, source, MODEL, velocity, "v")
     scale = np.array([1.0, 1.0, source.length_scale_m])
-    left = (predicted.velocity - frame.select("v_x", "v_y", "v_w").to_numpy()) * scale
-    modulus = np.linalg.norm(left, axis=1)
+    residual = (predicted.velocity - frame.select("v_x", "v_y", "v_w").to_numpy()) * scale
+    modulus = np.linalg.norm(residual, axis=1)
     known = np.isfinite(modulus)
     times = source.log_times(frame["stamp"].to_numpy()[known])
     writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})
