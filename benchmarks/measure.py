@@ -50,6 +50,7 @@ CATEGORIES = (
     "poor",
 )
 LOGS_EACH = 44
+_PATIENCE_S = 900
 _FIRST_SEED, _SEEDS_A_VERSION = 1_200_000, 1000
 _PUBLISHED = {
     # Tile and snow as printed; ice is 3.6 times snow and 5 % below gravel, from which these two follow.
@@ -80,9 +81,15 @@ def measure_accuracy(asked: Asked) -> dict[str, object]:
     seeds = f"{first}-{first + asked.logs}"
     out = asked.folder / "scores.jsonl"
     drawn = ("--category", ",".join(CATEGORIES), "--seeds", seeds)
-    run_beside("hidden/play.py", *drawn, "--jobs", str(asked.jobs), "--out", str(out), "--resume")
+    patience = ("--time-out", str(_PATIENCE_S), "--jobs", str(asked.jobs))
+    run_beside("hidden/play.py", *drawn, *patience, "--out", str(out), "--resume")
     wanted = range(first, first + asked.logs)
     records = [one for one in read_records([out]).values() if one.job.seed in wanted]
+    if late := sum(one.outcome == "timeout" for one in records):
+        # A busy machine says nothing of the diagnosis.
+        raise SystemExit(
+            f"accuracy: {late} logs took longer than {_PATIENCE_S} s; the same command plays them again"
+        )
     return {
         "command": "make measure ARGS=accuracy",
         "versions": {"diagnosis": list_versions()["diagnosis"]},
