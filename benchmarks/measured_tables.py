@@ -12,6 +12,7 @@ import argparse
 import json
 import re
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,7 +25,10 @@ BLOCK = re.compile(r"(<!-- measured: (?P<name>[^>]*?) -->\n)(?P<text>.*?)(<!-- /
 ALLOWED_VERSIONS = 1
 """Versions by which a table may be older than the program: a mend does not ask for hours of measurement."""
 
-INPUTS = {"command": "from commands", "measured": "from measured wheels"}
+WIDTH = 100
+"""Columns of a line of README."""
+
+INPUTS = {"command": "commands", "measured": "wheels"}
 PLACES = {
     "in the run": "the run itself, held out",
     "same ground": "another run of the same ground",
@@ -63,10 +67,15 @@ def find_outdated(data: Data, present: Mapping[str, int]) -> list[str]:
     ]
 
 
-def name_origin(data: Data) -> str:
+def name_origin(data: Data) -> list[str]:
     """The sentence below a table: command, commit, date and versions."""
-    versions = ", ".join(f"{name} {version}" for name, version in data["versions"].items())
-    return f"Measured at {data['commit']} ({data['date']}; version of {versions}) by `{data['command']}`."
+    versions = ", ".join(f"{name} version {version}" for name, version in data["versions"].items())
+    return fold(f"Measured by `{data['command']}` at {data['commit']} ({data['date']}; {versions}).")
+
+
+def fold(text: str) -> list[str]:
+    """Text in lines of a page."""
+    return textwrap.wrap(text, WIDTH, break_long_words=False, break_on_hyphens=False)
 
 
 def make_table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -107,10 +116,13 @@ def render_accuracy(data: Data) -> list[str]:
     return [
         *make_table(("test logs", "exactly the hidden effects named"), table),
         "",
-        f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain the",
-        f"true value in {held} of {whole} cases. Physics outside the catalogue has no name: of",
-        f"{odd['counted']} logs with such physics {flagged} are flagged as unexplained in the right channel,",
-        f"{alike} more get names of known effects that are like it, {missed} are not noticed, or misnamed.",
+        *fold(
+            f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain "
+            f"the true value in {held} of {whole} cases. Physics outside the catalogue has no name: of "
+            f"{odd['counted']} logs with such physics {flagged} are flagged as unexplained in the right "
+            f"channel, {alike} more get names of known effects that are like it, {missed} are not noticed, "
+            "or misnamed."
+        ),
     ]
 
 
@@ -124,14 +136,16 @@ def render_wins(*inputs: Data) -> list[str]:
     """How often the best model of the literature is better or worse than the named physics."""
     rows = []
     for place, words in PLACES.items():
-        there = [
-            find_section(data, place, metric)["wins"]["literature"] for data in inputs for metric in METRICS
-        ]
-        rows.append(
-            (words, *(f"{better} better, {worse} worse of {count}" for better, worse, count in there))
-        )
-    head = [f"{words}: {metric}" for words in INPUTS.values() for metric in METRICS]
-    return make_table(("fitted to", *head), rows)
+        for source, data in zip(INPUTS.values(), inputs, strict=True):
+            there = [find_section(data, place, metric)["wins"]["literature"] for metric in METRICS]
+            rows.append((words, source, *map(count_wins, there)))
+    return make_table(("fitted to", "fed", *METRICS), rows)
+
+
+def count_wins(wins: Sequence[int]) -> str:
+    """How often a model is better and worse, and of how many."""
+    better, worse, count = wins
+    return f"{better} better, {worse} worse of {count}"
 
 
 def render_learned(data: Data) -> list[str]:
@@ -139,9 +153,7 @@ def render_learned(data: Data) -> list[str]:
     rows = []
     for group in list(GROUPS)[1:]:
         counts = [find_section(data, "in the run", metric)["wins"][group] for metric in METRICS]
-        rows.append(
-            (GROUPS[group], *(f"{better} better, {worse} worse of {n}" for better, worse, n in counts))
-        )
+        rows.append((GROUPS[group], *map(count_wins, counts)))
     return make_table(("from commands, held out in the run", *METRICS), rows)
 
 
@@ -156,11 +168,10 @@ def render_errors(data: Data) -> list[str]:
         low, high, median = (f"{100.0 * share:.0f}" for share in (shares[0], shares[-1], middle))
         parts.append(f"{metric} error falls to {low} to {high} % (median {median} %)")
     count = len(section["rows"])
-    return [
-        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the",
-        f"{parts[0]} of that of the ideal model, the {parts[1]},",
-        "but rarely to the noise floor, which the verdict states.",
-    ]
+    return fold(
+        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the {parts[0]} "
+        f"of that of the ideal model, the {parts[1]}, but rarely to the noise floor, which the verdict states."
+    )
 
 
 def render_section(section: Data) -> list[str]:
@@ -240,7 +251,7 @@ def fill_page(text: str) -> str:
     def fill(found: re.Match[str]) -> str:
         names, render = RENDERERS[found["name"]]
         sources = [read_measured(name) for name in names]
-        lines = [*render(*sources), "", *map(name_origin, sources)]
+        lines = [*render(*sources), "", *(line for source in sources for line in name_origin(source))]
         return "".join((found[1], "\n", "\n".join(lines), "\n\n", found[4]))
 
     return BLOCK.sub(fill, text)
