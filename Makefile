@@ -20,9 +20,9 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 .PHONY: ablate analyze audit batch bench bench-analyze bench-bags bench-batch bench-check bench-constants \
 	bench-diagnose bench-export \
 	bench-fleet bench-reader bench-real bench-terrain bench-workbench bench-writer browser check clean compare \
-	damage damage-results damage-season detection docs docs-outputs events few-shot fleets format fuzz help \
+	damage damage-results damage-season detection docs docs-outputs docs-tables events few-shot fleets format fuzz help \
 	hidden-effect hidden-effect-baselines hidden-effect-score hidden-table inject inspect learned-bands live-replay lock \
-	late-starts log-seconds map mysteries check-again run-spreads pictures plan-compare plan-game platforms \
+	late-starts log-seconds map measure mysteries check-again run-spreads pictures plan-compare plan-game platforms \
 	pose-ages reveal rivals samples screenshots serve \
 	test \
 	test-long trend twin watch-replay wheel
@@ -81,6 +81,12 @@ format: $(VENV)/.ready-dev ## format the code
 docs: $(VENV)/.ready-dev ## the handbook as pages that need no network, in build/docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet --config-file docs/mkdocs.yml
 	@echo "build/docs/index.html"
+
+docs-tables: $(VENV)/.ready-dev ## write what was measured into README and handbook [ARGS=--check]
+	@$(BIN)/python benchmarks/measured_tables.py $$ARGS
+
+measure: $(VENV)/.ready-dev ## measure what README and handbook say, go on where it was stopped, write the tables [ARGS="paper accuracy rivals_command rivals_measured"]
+	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/measure.py $$ARGS
 
 docs-outputs: $(VENV)/.ready-dev ## run every command of the handbook and write its output below it [ARGS=docs/pages/symptoms/late.md]
 	$(BIN)/python docs/tools/blocks.py --write $$ARGS

@@ -6,7 +6,7 @@ terrain of a vehicle, or every run alone, is left out in turn. The model is that
 expect. Printed is its error over 2 s on all that was driven after the first minute, in metres: of the ideal
 model, of the expected numbers (prior), of fits to 5, 20 and 60 s from --begin on with the prior and without,
 and of its own fit to that rest, on stretches held out. Then what `slip fleet predict` expected of the run:
-median slip speed of the slip and error over 2 s, and what they were.
+median slip modulus of the slip and error over 2 s, and what they were.
 """
 
 from __future__ import annotations
@@ -126,7 +126,7 @@ def _judge(task: Task) -> Row:
 
 
 def measure_slip(manifest: Manifest, source: str) -> float:
-    """Median slip speed of a run [m/s]."""
+    """Median slip modulus of a run [m/s]."""
     rows = manifest.read("aggregates").filter(pl.col("subset") == "all", pl.col("input") == source)
     return float(rows["median_modulus"].item())
 
@@ -176,7 +176,9 @@ def show(rows: list[Row]) -> None:
             end="",
         )
     print()
-    for place, what in enumerate(("median slip speed of the slip [m/s]", "error over 2 s of the prior [m]")):
+    for place, what in enumerate(
+        ("median slip modulus of the slip [m/s]", "error over 2 s of the prior [m]")
+    ):
         print(f"\n{what}: expected, was")
         held = 0
         for row in rows:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import time
 from collections.abc import Iterable, Mapping, Sequence
@@ -27,9 +28,10 @@ from pathlib import Path
 
 import numpy as np
 from json_lines import add_row, read_rows
+from measured_tables import render_section
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import SlipError, format_share
+from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
@@ -241,30 +243,32 @@ def list_groups(models: Judged) -> dict[str, list[str]]:
     return {"literature": literature, "learned": learned, **beyond}
 
 
-def print_tables(rows: Sequence[Row]) -> None:
-    """Markdown: a table for each place and metric, and how often who won."""
+def describe_sections(rows: Sequence[Row]) -> list[dict[str, object]]:
+    """Tables by place and metric, as `measured_tables.render_section` shows them."""
+    sections: list[dict[str, object]] = []
     for place in PLACES:
         here = [row for row in rows if row["place"] == place]
-        if not here:
-            continue
-        for metric, words in zip(METRICS, ("position [m]", "heading [deg]"), strict=True):
-            print(f"\n**{place}, {words}**\n")
-            heads = (
-                "recording",
-                "from",
-                IDEAL,
-                NAMED,
-                "best of the literature",
-                "best learned",
-                BEYOND,
-                KEPT,
+        for metric, words in zip(METRICS, ("position", "heading"), strict=True) if here else ():
+            head = ["recording", "from", IDEAL, NAMED, "best of the literature", "best learned", BEYOND, KEPT]
+            cells = [list_cells(row, metric) for row in here]
+            sections.append(
+                {"place": place, "metric": words, "head": head, "rows": cells, **summarize(here, metric)}
             )
-            print(f"| {' | '.join(heads)} |\n|{'---|' * len(heads)}")
-            for row in here:
-                print(f"| {' | '.join(list_cells(row, metric))} |")
-            print()
-            for line in summarize(here, place, words, metric):
-                print(line)
+    return sections
+
+
+def print_tables(rows: Sequence[Row]) -> None:
+    """Markdown: a table for each place and metric, and how often who won."""
+    for section in describe_sections(rows):
+        print(f"\n## {section['place']}\n")
+        print("\n".join(render_section(section)))
+
+
+def name_recording(row: Row) -> str:
+    """A recording in words: its vehicle, its terrain, and the month and day that its name has."""
+    date = re.search(r"_\d{4}_(\d+)_(\d+)_", str(row["run"]))
+    words = [str(row["vehicle"]).partition("_")[0].capitalize(), str(row["terrain"])]
+    return " ".join([*words, *([f"{int(date[1]):02}-{int(date[2]):02}"] if date else [])])
 
 
 def read_error(models: Judged, name: str, metric: str) -> float:
@@ -278,7 +282,7 @@ def show(models: Judged, name: str, metric: str) -> str:
 
 def list_cells(row: Row, metric: str) -> list[str]:
     models = read_models(row)
-    cells = [str(row["run"]), str(row["donor_terrain"]) or "itself"]
+    cells = [name_recording(row), str(row["donor_terrain"]) or "itself"]
     cells += [show(models, name, metric) for name in (IDEAL, NAMED)]
     for names in list_groups(models).values():
         if names:
@@ -290,29 +294,18 @@ def list_cells(row: Row, metric: str) -> list[str]:
     return cells
 
 
-GROUPS = {
-    "literature": "the best model of the literature",
-    "learned": "the best learned model",
-    BEYOND: BEYOND,
-    KEPT: KEPT,
-}
-
-
-def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[str]:
-    lines = []
-    for group, title in GROUPS.items():
+def summarize(rows: Sequence[Row], metric: str) -> dict[str, object]:
+    """How often who is better or worse than the named physics, errors that are gone, and what bands hold."""
+    judged = [read_models(row) for row in rows]
+    wins = {}
+    for group in list_groups(judged[0]):
         marks = [
             mark(models, find_best(models, names, metric), metric)
-            for models in map(read_models, rows)
+            for models in judged
             if (names := list_groups(models)[group])
         ]
         if marks:
-            better, worse = marks.count("+"), marks.count("-")
-            lines.append(
-                f"{place}, {words}: {title} is better than the named physics on {better} of {len(marks)}, "
-                f"worse on {worse}, not significantly different on {len(marks) - better - worse}."
-            )
-    judged = [read_models(row) for row in rows]
+            wins[group] = [marks.count("+"), marks.count("-"), len(marks)]
     gone = {
         name: np.median(
             [1.0 - read_error(one, name, metric) / read_error(one, IDEAL, metric) for one in judged]
@@ -320,16 +313,17 @@ def summarize(rows: Sequence[Row], place: str, words: str, metric: str) -> list[
         for name in (NAMED, BEYOND, KEPT)
         if all(name in one for one in judged)
     }
-    lines.append(
-        f"{place}, {words}: of the ideal model's error are gone, in the median, "
-        f"{', '.join(f'{format_share(share)} with {name}' for name, share in gone.items())}."
-    )
+    bands = {}
     for name in (NAMED, TREES, BEYOND, KEPT) if metric == METRICS[0] else ():
         held = [one[name]["band_holds"] for one in judged if name in one]
-        shares = [format_share(share) for share in held if isinstance(share, float)]
+        shares = [round(share, 4) for share in held if isinstance(share, float)]
         if shares:
-            lines.append(f"{place}: the bands of 95 % of {name} hold {', '.join(shares)} of the errors.")
-    return lines
+            bands[name] = shares
+    return {
+        "wins": wins,
+        "gone": {name: round(float(share), 4) for name, share in gone.items()},
+        "bands": bands,
+    }
 
 
 def main() -> None:

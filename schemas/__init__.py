@@ -120,10 +120,12 @@ def drive_is_complete() -> pl.Expr:
 class Table(dy.Schema):
     """Columns that every table has: which run a row belongs to.
 
-    The table is called as the class, in small letters.
+    The table is called as the class, in small letters. ``FACTS`` names numbers of the whole table, which
+    stand in the metadata of its file.
     """
 
     VERSION: ClassVar[int]
+    FACTS: ClassVar[Mapping[str, str]] = {}
 
     run = dy.String(metadata={"description": "run the row belongs to"})
     dataset = dy.String(metadata={"description": "runs of one vehicle on one terrain"})
@@ -144,6 +146,11 @@ class Contract:
     name: str
     version: int
     schema: type[Table]
+
+    @property
+    def facts(self) -> Mapping[str, str]:
+        """Numbers of the whole table in its file's metadata, described; their names end in the unit."""
+        return self.schema.FACTS
 
     def metadata_of(self, column: str) -> dict[str, str]:
         """Unit, frame and description of a column; absent ones are left out."""
@@ -203,9 +210,9 @@ class Datasets(Table):
     windows = count("2 s windows of all runs", nullable=True)
     distance = optional("m", "distance driven in the samples of all runs")
     duration = optional("s", "time of the samples of all runs")
-    length_scale = optional("m", "L that turns yaw rate into speed in the slip speed")
-    median_modulus = optional("m/s", "median over runs of the runs' median slip speed")
-    low = optional("m/s", "lower end of the 95 % interval of the typical median slip speed")
+    length_scale = optional("m", "L that turns yaw rate into speed in the slip modulus")
+    median_modulus = optional("m/s", "median over runs of the runs' median slip modulus")
+    low = optional("m/s", "lower end of the 95 % interval of the typical median slip modulus")
     high = optional("m/s", "upper end of it")
     interval = text("what the interval says: over runs, or within this run only; empty without one")
     median_window_norm = optional("m/s", "median over runs of the runs' median window norm")
@@ -219,7 +226,7 @@ class Datasets(Table):
     cross_mean_square = optional("m^2/s^2", "twice the mean product of the two parts")
     height_rate = optional("m/s", "height variation per second")
     largest_kinetic_energy = optional("J", "largest 1/2 m v^2 of any run")
-    relative_slip = optional("1", "median slip speed over ideal speed, while it moves")
+    relative_slip = optional("1", "median slip modulus over ideal speed, while it moves")
     slip_energy = optional("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2")
     lost_energy = optional("1", "slip path over path driven: energy lost per metre and mass, over mu g")
     unpredictability = optional("m/s", "held-out RMS slip of a fitted slip model")
@@ -328,12 +335,12 @@ class Features(Table):
     from_results = _text(r"^[0-9A-Za-z_-]{1,80}$", "key of the results: inputs and versions")
     mass = _feature("kg", "mass as configured", 0.01, 1e6)
     inertia = _feature("kg m^2", "yaw inertia of a plate of that mass, as wide as the track", 0.0, 1e8)
-    length_scale = _feature("m", "L that turns yaw rate into speed in the slip speed", 1e-3, 100.0)
+    length_scale = _feature("m", "L that turns yaw rate into speed in the slip modulus", 1e-3, 100.0)
     samples = dy.Int64(min=1, max=10**10, metadata={"description": "time steps"})
     windows = dy.Int64(min=0, max=10**9, nullable=True, metadata={"description": "2 s windows"})
     distance = _feature("m", "distance driven in the samples")
     duration = _feature("s", "time of the samples")
-    median_modulus = _feature("m/s", "median slip speed", 0.0, 1e3, nullable=False)
+    median_modulus = _feature("m/s", "median slip modulus", 0.0, 1e3, nullable=False)
     median_window_norm = _feature("m/s", "median norm of 2 s windows", 0.0, 1e4)
     transitory_median_modulus = _feature("m/s", "after a change of command", 0.0, 1e3)
     steady_median_modulus = _feature("m/s", "away from changes of command", 0.0, 1e3)
@@ -342,7 +349,7 @@ class Features(Table):
     cross_mean_square = _feature("m^2/s^2", "twice the mean product of the two parts", -1e6, 1e6)
     height_rate = _feature("m/s", "height variation per second", 0.0, 1e3)
     largest_kinetic_energy = _feature("J", "largest 1/2 m v^2", 0.0, 1e10)
-    relative_slip = _feature("1", "median slip speed over ideal speed, while it moves", 0.0, 1e6)
+    relative_slip = _feature("1", "median slip modulus over ideal speed, while it moves", 0.0, 1e6)
     slip_energy = _feature("J", "median of 1/2 m |g_xy|^2 + 1/2 I g_w^2", 0.0, 1e12)
     lost_energy = _feature("1", "slip path over path driven: energy per metre and mass over mu g", 0.0, 1e9)
     unpredictability = _feature("m/s", "held-out RMS slip of a fitted slip model", 0.0, 1e3)
@@ -486,7 +493,7 @@ class Cells(Table):
     slip = bounded("1", "share of the ideal motion that was lost, median over crossings", 0.0)
     slip_low = optional("1", "lower quartile of it over crossings; null of a single one")
     slip_high = optional("1", "upper quartile")
-    modulus = bounded("m/s", "slip speed, median over crossings", 0.0)
+    modulus = bounded("m/s", "slip modulus, median over crossings", 0.0)
     energy = optional("J", "kinetic energy of the slip velocity, median; null without a mass")
     lean = optional("rad", "inclination of the vehicle, median; null where it was not measured")
     power = optional("W", "drawn from the battery, median; null where the log does not say")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import dataframely as dy
@@ -161,7 +162,7 @@ class Alignments(Table):
     latency_spread = schemas.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = schemas.number("s", "time in which the localization contradicts the wheels")
     recorded_modulus_command = schemas.optional(
-        "m/s", "median slip speed (L = 1 m) from commands as recorded, before any correction"
+        "m/s", "median slip modulus (L = 1 m) from commands as recorded, before any correction"
     )
     recorded_modulus_measured = schemas.optional("m/s", "the same from wheel encoders")
 
@@ -231,7 +232,13 @@ class Velocities(Table):
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
+    FACTS: ClassVar[Mapping[str, str]] = {
+        "length_scale_m": "L, which turns yaw rate into speed in the moduli",
+        "wheel_radius_m": "r, radius of the wheels",
+        "track_width_m": "b, between the left and the right wheels; absent where it is unknown",
+        "wheelbase_m": "l, between the axles; absent where it is unknown",
+    }
 
     input = schemas.source()
     t = schemas.seconds()
@@ -254,7 +261,11 @@ class Slip(Table):
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
 
-    model_x = schemas.body("m/s", "velocity forward of the model given with --model", nullable=True)
+    model_x = schemas.body(
+        "m/s",
+        "velocity forward of the model: that of --model, else that of the diagnosis; null without one",
+        nullable=True,
+    )
     model_y = schemas.body("m/s", "velocity to the left of that model", nullable=True)
     model_w = schemas.body("rad/s", "yaw rate of that model", nullable=True)
     residual_modulus = schemas.body(
@@ -285,7 +296,7 @@ class Windows(Table):
         "in an incident, or where the localization is at fault; left out of medians and fits"
     )
     samples = dy.Int32(min=1, metadata={"description": "grid steps in the window"})
-    rms_modulus = schemas.bounded("m/s", "root mean square of the slip speed", 0.0)
+    rms_modulus = schemas.bounded("m/s", "root mean square of the slip modulus", 0.0)
     window_norm = schemas.bounded("m/s", "sqrt(40) rms_modulus: the published 2 s window norm", 0.0)
 
 
@@ -301,10 +312,8 @@ class Aggregates(Table):
     subset = schemas.choice(SUBSETS, "all samples, or only transitory or steady ones")
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
-    median_modulus = schemas.optional("m/s", "median slip speed")
-    median_residual_modulus = schemas.optional(
-        "m/s", "median slip speed of the residual of the model given with --model"
-    )
+    median_modulus = schemas.optional("m/s", "median slip modulus")
+    median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")
     rms_y = schemas.optional("m/s", "root mean square of g_y")
@@ -317,7 +326,7 @@ class Aggregates(Table):
     duration = schemas.optional("s", "time of the samples")
     height_rate = schemas.optional("m/s", "height variation per second")
     largest_kinetic_energy = schemas.optional("J", "largest 1/2 m v^2; null without a mass")
-    length_scale = schemas.number("m", "L that turns yaw rate into speed in the slip speed")
+    length_scale = schemas.number("m", "L that turns yaw rate into speed in the slip modulus")
 
 
 KINDS = ("rung", "floor")

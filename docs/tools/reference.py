@@ -173,6 +173,9 @@ def write_tables() -> str:
             f"{escape(about)} Version {contract.version} of the contract.",
             table(("column", "unit", "frame", "type", "what"), rows),
         ]
+        if contract.facts:
+            facts = [(f"`{name}`", escape(what)) for name, what in contract.facts.items()]
+            parts += ["In the metadata of the file:", table(("key", "what"), facts)]
     return "\n\n".join(parts) + "\n"
 
 

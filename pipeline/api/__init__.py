@@ -288,7 +288,7 @@ class Run:
 
     def _repr_html_(self) -> str:
         slip = mapping_in(self.summary, "by_input")
-        keys = {"median slip speed [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
+        keys = {"median slip modulus [m/s]": "median_modulus", "2 s window norm": "median_window_norm"}
         rows = [
             {"slip on": name, **{head: number_in(mapping_in(slip, name), key) for head, key in keys.items()}}
             for name in slip

@@ -210,14 +210,15 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
+    named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
+    medians = _format_medians(by_input, "median_modulus")
     if not everything:
-        medians = _format_medians(by_input, "median_modulus")
-        return [_row("slip", f"median slip speed {medians}")] if medians else []
+        return [_row("slip", f"{named} {medians}")] if medians else []
     shown = [name for name in INPUT_WORDS if name in by_input]
     norms = " | ".join(_number(mapping_in(by_input, name), "median_window_norm") for name in shown)
     lines = [
-        _row("slip", f"median slip speed {_format_medians(by_input, 'median_modulus')}"),
-        _row("", f"with L = {_number(summary, 'length_scale_m')} m; 2 s window norm {norms} m/s"),
+        _row("slip", f"{named} {medians}"),
+        _row("", f"2 s window norm {norms} m/s"),
     ]
     split = mapping_in(summary, "split")
     detail = []

@@ -48,7 +48,7 @@ def compare(  # noqa: D417 - arguments document themselves
     Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
 
     Args:
-        as_published: compare 2 s window norms, as published, in place of median slip speeds.
+        as_published: compare 2 s window norms, as published, in place of median slip moduli.
         causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
             causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
@@ -110,10 +110,9 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
         "dataset", "runs", "median_window_norm"
     )
     rated = answer.intervals.join(datasets, on="dataset").sort("value")
-    label = "as published" if answer.quantity == "published_norm" else "median slip speed"
     width = max([len(name) for name in rated["dataset"]] + [7]) + 1
     lines = [
-        f"slip {INPUT_WORDS[answer.input]}, {label} [m/s]",
+        f"slip {INPUT_WORDS[answer.input]}, {answer.measure} [m/s]",
         "",
         f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]

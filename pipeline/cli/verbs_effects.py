@@ -230,7 +230,7 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
     (run,) = diagnosis.runs
     try:
         keep_diagnosis(results, manifest, {**run.to_json(), LINES: list_lines(run)})
-    except OSError as error:
+    except (OSError, SlipError) as error:
         if not quiet:
             print_note(f"slip: the diagnosis was not saved: {error}")
 

@@ -289,7 +289,7 @@ def _format_number(row: Mapping[str, object]) -> list[str]:
 
 
 _WORDS = (
-    ("median_modulus", "median slip speed", "m/s"),
+    ("median_modulus", "median slip modulus", "m/s"),
     ("t_mrmse_m", "position error over 2 s", "m"),
     ("ideal_t_mrmse_m", "that of the ideal model", "m"),
 )

@@ -90,7 +90,7 @@ class Recording:
             lacks may be absent.
         sha256: of the recording.
         path: of the log.
-        length_scale_m: of the slip speed [m].
+        length_scale_m: of the slip modulus [m].
     """
 
     name: str

@@ -44,7 +44,7 @@ Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]
 
 QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
-"""Mean squares that are apportioned, with their units: slip speed over half a second, 2 s errors."""
+"""Mean squares that are apportioned, with their units: slip modulus over half a second, 2 s errors."""
 
 _ALL_ORDERS = 5
 """Largest number of effects for which all orders are used: 120 orders of 32 sets."""
@@ -124,7 +124,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
 
     Args:
         judgement: the model on its runs.
-        length_scale_m: of the slip speed [m].
+        length_scale_m: of the slip modulus [m].
     """
     problem, fitted = judgement.problem, judgement.fitted
     players: dict[str, set[str]] = {}
@@ -232,7 +232,7 @@ def _sum_stretches(problem: Problem, stretches: Ints, held: HeldOut, length_scal
         problem: the runs.
         stretches: of the 2 s predictions, shape (m,).
         held: errors.
-        length_scale_m: of the slip speed [m].
+        length_scale_m: of the slip modulus [m].
     """
     unit = problem.whole.unit
     squares = np.sum((held.residuals * [1.0, 1.0, length_scale_m]) ** 2, axis=1)

@@ -272,9 +272,11 @@ class Measure:
 
 
 MEASURES = {
-    "slip": Measure("median_modulus", "slip speed", "m/s", "the published measure; fast vehicles look worse"),
+    "slip": Measure(
+        "median_modulus", "slip modulus", "m/s", "the published measure; fast vehicles look worse"
+    ),
     "relative": Measure(
-        "relative_slip", "relative slip", "1", "slip speed over ideal speed, while the vehicle should move"
+        "relative_slip", "relative slip", "1", "slip modulus over ideal speed, while the vehicle should move"
     ),
     "energy": Measure(
         "lost_energy",
@@ -323,7 +325,7 @@ def pool_runs(
     Args:
         runs: one row per run and input, as from `gather_runs`; runs without a group are ignored.
         by: columns that define the groups.
-        within: interval of the median slip speed of single runs by (run, input), for datasets of one run.
+        within: interval of the median slip modulus of single runs by (run, input), for datasets of one run.
         norms_within: the same for the window norm.
     """
     known = runs.filter(pl.col("group").is_not_null()).with_columns(

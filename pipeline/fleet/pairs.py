@@ -420,6 +420,14 @@ class Answer:
     windows: pl.DataFrame
     notes: tuple[str, ...]
 
+    @property
+    def measure(self) -> str:
+        """Name of the compared quantity, its length scale included."""
+        if self.quantity == "published_norm":
+            return "2 s window norm as published (L = 1 m)"
+        (scale,) = self.datasets["length_scale"].drop_nulls().unique().to_list() or (1.0,)
+        return f"median slip modulus (L = {scale:g} m)"
+
 
 @dataclass(frozen=True)
 class Agreement:

@@ -278,10 +278,10 @@ FEWEST_RUNS = 9
 """Minimum number of runs for detecting a step of a series: with eight, even the rarest order has a
 probability of 2 in 70, more than the half of `LEVEL` that all series share; with nine, of 2 in 126."""
 _QUANTITIES = {
-    "median_modulus": "median slip speed",
+    "median_modulus": "median slip modulus",
     "median_window_norm": "median norm of slip over 2 s",
-    "steady_median_modulus": "median steady slip speed",
-    "transitory_median_modulus": "median transitory slip speed",
+    "steady_median_modulus": "median steady slip modulus",
+    "transitory_median_modulus": "median transitory slip modulus",
     "warnings": "number of warnings",
     "suspect share": "share of suspect samples",
 }
@@ -322,7 +322,7 @@ class Alert:
 
 
 def name_quantity(quantity: str) -> str:
-    """Name of the quantity of a series in words, as `median slip speed from commands`."""
+    """Name of the quantity of a series in words, as `median slip modulus from commands`."""
     name, _, source = quantity.partition(" (")
     words = _QUANTITIES.get(name, f"value of the {name}")
     return f"{words} {INPUT_WORDS[source.rstrip(')')]}" if source else words

@@ -39,7 +39,7 @@ from pipeline.logs import LogData, LogError, hash_log, list_files, locate_record
 from pipeline.report import PLANS, lead_to, lead_up
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 from pipeline.store.files import make_folder, replace_file
-from pipeline.store.names import QUARANTINE, encode_run
+from pipeline.store.names import encode_run
 
 if TYPE_CHECKING:
     from pipeline.plan.plan import Plan
@@ -120,7 +120,8 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     from pipeline.report.drive_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
 
     run, results = manifest.run, store.root
-    if store.manifest(run) != manifest:
+    known = store.manifest(run)
+    if known is None or known.key != manifest.key:
         return None
     preview = locate_plan(results, run, PREVIEW)
     make_folder(preview.parent)
@@ -136,11 +137,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         if current is None or current.key != manifest.key or REPORT not in current.files:
             return None
         page = read_bounded_text(current.path(REPORT))
-        for table in current.tables:
-            generation.reuse_table(table)
-        new = {REPORT, *(f"{QUARANTINE}{table}.parquet" for table in current.tables)}
-        for name in [name for name in current.files if name not in new]:
-            generation.reuse_file(name)
+        generation.reuse_all(REPORT)
         generation.write_text(REPORT, show_planned(page, read_preview(results, run, manifest.key)))
         return generation.commit(current.details).path(REPORT)
 

@@ -50,7 +50,7 @@ class Limits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         error: limits of the model's errors over 2 s.
         parameter: limits by ``effect.parameter``, in the parameter's SI unit.
-        slip: limits of the median slip speed by terrain [m/s].
+        slip: limits of the median slip modulus by terrain [m/s].
     """
 
     error: ErrorBounds = ErrorBounds()

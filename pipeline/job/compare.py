@@ -213,6 +213,13 @@ NOT_VALID = (
 )
 
 
+ABOUT_UNIT = (
+    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), "
+    "in m/s; the paper prints the same number in m^2 rad/s^3, the product of the units of its three "
+    "components, which is the unit of no norm"
+)
+
+
 @dataclass(frozen=True)
 class Question:
     """Options of a comparison.
@@ -220,7 +227,7 @@ class Question:
     Attributes:
         by: columns that define a dataset.
         input: input u; None: the command if every run has one, else the measured wheels.
-        as_published: compare the window norms of the published chain instead of the median slip speed.
+        as_published: compare the window norms of the published chain instead of the median slip modulus.
     """
 
     by: tuple[str, ...] = ("dataset",)
@@ -247,7 +254,7 @@ def compare_results(store: Store, question: Question) -> Answer:
     moduli = samples = read_moduli(compared, chosen)
     if question.as_published:
         samples, runs, comments = follow_published_runs(compared, runs)
-        notes += comments
+        notes += [ABOUT_UNIT, *comments]
     elif chosen == "command":
         notes += _doubt_commands(compared)
     missing = sorted(set(compared.manifests) - set(samples))

@@ -269,7 +269,7 @@ class Prediction:
         vehicle: vehicle with the geometry of the newest run.
         t_mrmse_m: error over 2 s of the forecast model [m].
         ideal_t_mrmse_m: error over 2 s of the ideal model [m].
-        median_modulus: median slip speed [m/s].
+        median_modulus: median slip modulus [m/s].
         runs_used: runs whose commands and residuals represent future runs.
         notes: excluded runs with the reasons, and where a forecast for a terrain without runs comes from.
     """

@@ -25,10 +25,11 @@ from pipeline.core.untrusted import (
 )
 from pipeline.job import INPUTS, JobError
 from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
-from pipeline.job.work import Work, stored_keys
+from pipeline.job.work import Work, add_model, remove_model, stored_contexts, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.stages.reading import list_wanted
-from pipeline.store import JSON, Manifest, Store, StoreError
+from pipeline.stages.slip_stage import set_residuals
+from pipeline.store import JSON, Generation, Manifest, Store, StoreError
 from pipeline.store.checksums import load_manifest
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
@@ -101,28 +102,63 @@ def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
 def diagnose_work(work: Work) -> dict[str, JSON] | None:
     """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
+    Table `slip` is given the model that was judged, unless one was named with ``--model``; without a
+    diagnosis it has none.
+
     Returns:
         The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None if it
         neither exists nor is requested.
     """
     generation, key = work.generation, key_diagnosis(work.keys)
     previous = generation.previous
+    content: dict[str, JSON] | None = None
     if previous is not None and has_diagnosis(previous, key) and not work.options.force:
         generation.reuse_file(DIAGNOSIS)
         for table in DIAGNOSED:
             if table in previous.tables:
                 generation.reuse_table(table)
         content = previous.read_json(DIAGNOSIS)
-    elif work.options.diagnosis:
-        work.progress(STAGE)
-        content = _diagnose(work)
-        generation.write_text(DIAGNOSIS, json.dumps(content, indent=1) + "\n")
-        work.computed.append(STAGE)
     else:
+        if work.options.diagnosis:
+            work.progress(STAGE)
+            content = _diagnose(work)
+            generation.write_text(DIAGNOSIS, json.dumps(content, indent=1) + "\n")
+            work.computed.append(STAGE)
+        if work.options.model is None:
+            length = work.setup.configuration.slip.length_scale_m
+            show_model(generation, content or {}, work.vehicle, length)
+    if content is None:
         return None
     work.keys = {**work.keys, STAGE: key}
     work.contexts[STAGE] = {}
     return content
+
+
+def show_model(
+    generation: Generation, diagnosis: Mapping[str, object], vehicle: Vehicle, length: float
+) -> None:
+    """Fill the model columns of table `slip`, and their medians, with the model that a diagnosis judged.
+
+    Args:
+        generation: generation with the tables of all stages.
+        diagnosis: JSON object of the run; where it has no model, the columns become empty.
+        vehicle: vehicle of the run.
+        length: length scale L [m] of the moduli.
+    """
+    slip = generation.read_table("slip")
+    text = diagnosis.get("model")
+    if isinstance(text, str):
+        from pipeline.models.model_file import parse_model  # noqa: PLC0415 - heavy
+
+        tables = {name: generation.read_table(name) for name in generation.table_names if name in _TABLES}
+        file = parse_model(text, Path(DIAGNOSIS))
+        slip, _ = add_model(slip, tables, file, vehicle, length=length, where=generation.run)
+    elif slip["model_x"].null_count() < slip.height:
+        slip = remove_model(slip)
+    else:
+        return
+    generation.replace_table("slip", slip)
+    generation.replace_table("aggregates", set_residuals(generation.read_table("aggregates"), slip))
 
 
 def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
@@ -269,7 +305,7 @@ def _make_recording(
 
 
 def read_length_scale(manifest: Manifest) -> float:
-    """Length scale of the slip speed that a run was analyzed with [m]."""
+    """Length scale of the slip modulus that a run was analyzed with [m]."""
     scale = manifest.part("configuration", "slip").get("length_scale_m")
     return float(scale) if isinstance(scale, int | float) else 1.0
 
@@ -287,9 +323,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
-    by_input = {
-        name: _summarize_input(aggregates, name) for name in aggregates["input"].unique(maintain_order=True)
-    }
+    by_input = _summarize_inputs(aggregates)
     leading = "command" if "command" in by_input else "measured"
     whole = _row(aggregates, leading, "all")
     asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]
@@ -325,6 +359,11 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         **setup.choice.to_json(setup.index.types),
         "findings": list_findings(generation.read_table("findings")),
     }
+
+
+def _summarize_inputs(aggregates: pl.DataFrame) -> dict[str, dict[str, JSON]]:
+    names = aggregates["input"].unique(maintain_order=True)
+    return {name: _summarize_input(aggregates, name) for name in names}
 
 
 def _summarize_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
@@ -470,20 +509,36 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:
     """Store the diagnosis of a run from both inputs, with its lines, for later requests.
 
-    Nothing is stored for a run that is not of these results, as it was analyzed with other options.
+    Table `slip` is given its model, unless the run was analyzed with another one. Nothing is stored for a run
+    that is not of these results, as it was analyzed with other options.
 
     Raises:
         OSError: the results cannot be written.
-        PathError: a link leads out of the results.
+        SlipError: another process writes them, or a link leads out of them.
     """
-    if _is_of(results, manifest):
-        path = locate_beside(results, "diagnoses", manifest.run, ".json")
-        make_folder(path.parent)
-        replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": diagnosis}).encode())
+    if not _is_of(results, manifest):
+        return
+    path = locate_beside(results, "diagnoses", manifest.run, ".json")
+    make_folder(path.parent)
+    replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": diagnosis}).encode())
+    if stored_contexts(manifest)["slip"].get("model") is not None or _SUMMARY not in manifest.files:
+        return
+    with Store(results).open_generation(manifest.run, manifest.key) as generation:
+        current = generation.previous
+        if current is None or current.key != manifest.key:
+            return
+        generation.reuse_all(_SUMMARY)
+        show_model(generation, diagnosis, load_vehicle(current), read_length_scale(current))
+        by_input = _summarize_inputs(generation.read_table("aggregates"))
+        summary = {**current.read_json(_SUMMARY), "by_input": by_input}
+        generation.write_text(_SUMMARY, json.dumps(summary, indent=1) + "\n")
+        generation.commit(current.details)
 
 
 def _is_of(results: Path, manifest: Manifest) -> bool:
-    return "slip" in stored_keys(manifest) and Store(results).manifest(manifest.run) == manifest
+    """Whether the results hold this run as it was analyzed, if with other diagnoses or reports."""
+    current = Store(results).manifest(manifest.run)
+    return "slip" in stored_keys(manifest) and current is not None and current.key == manifest.key
 
 
 def _key_of(manifest: Manifest) -> str:

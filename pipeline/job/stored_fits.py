@@ -268,7 +268,7 @@ Warthog recordings (`make bench-check PART=real`)."""
 _LEAST_SQUARE = 1e-12
 """Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
 _LEAST_SLIP = 1e-6
-"""Lower bound of a slip speed [m/s], to keep its logarithm finite."""
+"""Lower bound of a slip modulus [m/s], to keep its logarithm finite."""
 _RESAMPLES = 200
 """Bootstrap resamples: they give the standard deviation to a twentieth."""
 
@@ -317,7 +317,7 @@ class RunReading:
         sha256: hash of the recording.
         terrain: terrain of the run.
         pace: root mean square ideal speed [m/s]; a yaw rate of 1 rad/s counts as 1 m/s.
-        slip: logarithm of the median slip speed [m/s], and its standard deviation; NaN if unknown.
+        slip: logarithm of the median slip modulus [m/s], and its standard deviation; NaN if unknown.
         fitted: the fit; None for a run from a baseline.
     """
 
@@ -426,7 +426,7 @@ def _compare(errors: Floats, ideal: Floats) -> tuple[float, float]:
 
 
 def measure_slip(table: pl.DataFrame, source: Input) -> tuple[float, float]:
-    """Logarithm of a run's median slip speed [m/s], and its standard deviation by a bootstrap of stretches.
+    """Logarithm of a run's median slip modulus [m/s], and its standard deviation by a bootstrap of stretches.
 
     Args:
         table: table `slip` of the run.

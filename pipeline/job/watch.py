@@ -24,6 +24,7 @@ from pipeline.job.keys import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
+from pipeline.models import read_model
 from pipeline.run import read_drive
 from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
@@ -161,7 +162,7 @@ class Live:
     Attributes:
         duration_s: duration of the log.
         distance_m: driven distance.
-        slip_mps: median slip speed over the last `RECENT_S`, by input.
+        slip_mps: median slip modulus over the last `RECENT_S`, by input.
         error_mps: median residual speed of the last model over the last `RECENT_S`, by input.
         events: events: ``id``, ``text``, ``t_start``, ``t_end``.
         problem: reason why there is no slip yet; empty if there is.
@@ -315,7 +316,10 @@ class Watch:
         if self._model is not None:
             with suppress(SlipError):
                 length = setup.configuration.slip.length_scale_m
-                slip, _ = add_model(slip, tables, self._model, aligned.vehicle, length=length)
+                file = read_model(self._model)
+                slip, _ = add_model(
+                    slip, tables, file, aligned.vehicle, length=length, where=str(self._model)
+                )
         offset = (made.start_ns - self._log.start_ns) * 1e-9
         self._take(speeds, slip, offset)
         self._note_events(aligned.findings, offset)

@@ -1,9 +1,12 @@
 """Execution of the stages of one run, and slip relative to a model."""
 
+from __future__ import annotations
+
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
@@ -26,6 +29,9 @@ from pipeline.stages.trust import gather_samples
 from pipeline.store import JSON, Generation, Manifest, TableReport
 from pipeline.store.parquet_tables import CheckedTable, check_table
 from schemas import contract_of
+
+if TYPE_CHECKING:
+    from pipeline.models import ModelFile
 
 COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
@@ -52,38 +58,37 @@ def hash_model(path: Path | None) -> str | None:
 def add_model(
     slip: pl.DataFrame,
     tables: Mapping[str, pl.DataFrame],
-    path: Path,
+    file: ModelFile,
     vehicle: Vehicle,
     *,
     length: float,
+    where: str,
 ) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
     """Table `slip` with the velocity of a model and the modulus of the residual, and findings on failures.
 
     Args:
-        slip: table `slip`, with empty model columns.
+        slip: table `slip`; what its model columns hold is replaced.
         tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, as far as the log has them.
-        path: the model file.
+        file: the model.
         vehicle: vehicle of the run; the model must be of its kind.
         length: length scale L [m] of the modulus.
+        where: the model's origin, for errors.
 
     Raises:
-        MotionError: the model file is wrong.
         JobError: the model is of another kind of vehicle.
     """
     from pipeline.estimation import Input  # noqa: PLC0415 - heavy
     from pipeline.estimation.problem import predict_at  # noqa: PLC0415 - heavy
-    from pipeline.models import read_model  # noqa: PLC0415 - heavy
     from pipeline.run import load_run  # noqa: PLC0415 - heavy
 
-    file = read_model(path)
-    model = file.model
+    slip, model = remove_model(slip), file.model
     findings = [
         Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings
     ]
     if model.vehicle.kind != vehicle.kind:
         what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
-        raise JobError("wrong_model", what, where=str(path), hint="Give a model of this vehicle.")
-    run = load_run({**tables, "slip": slip}, model.vehicle, name=str(path))
+        raise JobError("wrong_model", what, where=where, hint="Give a model of this vehicle.")
+    run = load_run({**tables, "slip": slip}, model.vehicle, name=where)
     parts = []
     for name in slip["input"].unique(maintain_order=True):
         part = slip.filter(pl.col("input") == name)
@@ -95,13 +100,19 @@ def add_model(
             parts.append(part)
             continue
         columns = [*predicted.T, find_residual_modulus(predicted, part, length=length)]
+        known = np.isfinite(np.stack(columns)).all(axis=0)
         parts.append(
             part.with_columns(
-                pl.Series(column, values).fill_nan(None)
+                pl.Series(column, np.where(known, values, np.nan)).fill_nan(None)
                 for column, values in zip(COLUMNS, columns, strict=True)
             )
         )
     return pl.concat(parts), tuple(findings)
+
+
+def remove_model(slip: pl.DataFrame) -> pl.DataFrame:
+    """Table `slip` with empty model columns."""
+    return slip.with_columns(pl.lit(None, pl.Float64).alias(name) for name in COLUMNS)
 
 
 def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
@@ -210,8 +221,13 @@ class Work:
         self.findings.append(self._identify("findings", frame))
 
     def write(self, table: str, frame: pl.DataFrame) -> TableReport:
-        """Write a table of this run, with the columns that identify the run."""
-        return self.generation.write_table(table, self._identify(table, frame))
+        """Write a table of this run, with the columns that identify the run, and the facts it declares."""
+        facts: dict[str, float] = {}
+        if wanted := contract_of(table).facts:
+            length = self.setup.configuration.slip.length_scale_m
+            known = {"length_scale_m": length, **msgspec.structs.asdict(self.vehicle)}
+            facts = {name: known[name] for name in wanted if known[name] is not None}
+        return self.generation.write_table(table, self._identify(table, frame), facts)
 
     def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
         who = {
@@ -348,20 +364,26 @@ class Work:
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
         samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
         findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
-        return StageOutcome((*made.findings, *findings, *checks.run_checks(samples, vehicle)))
+        model = None if self.options.model is None else self.options.model.name
+        return StageOutcome(
+            (*made.findings, *findings, *checks.run_checks(samples, vehicle)), {"model": model}
+        )
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Add the velocity of the given model to table `slip`; without a model it stays unchanged."""
-        path, configuration = self.options.model, self.setup.configuration
+        path = self.options.model
         if path is None:
             return table, ()
+        from pipeline.models import read_model  # noqa: PLC0415 - heavy
+
         read = {name: self._read(name) for name in TABLES["align"]}
         return add_model(
             table,
             {name: frame for name, frame in read.items() if not frame.is_empty()},
-            path,
+            read_model(path),
             self.vehicle,
-            length=configuration.slip.length_scale_m,
+            length=self.setup.configuration.slip.length_scale_m,
+            where=str(path),
         )
 
     def _aggregate(self) -> StageOutcome:

@@ -172,7 +172,7 @@ _SHOWN = (
 _DATASETS = (
     Column("dataset"), Column("runs", number=True), Column("samples", number=True),
     Column("distance", number=True), Column("time compared", number=True),
-    Column("median slip speed", "m/s", number=True), Column("95 % interval", number=True),
+    Column("median slip modulus", "m/s", number=True), Column("95 % interval", number=True),
     Column("transitory", number=True), Column("steady", number=True),
     Column("window norm", "m/s", number=True), Column("as published", number=True),
     Column("drivetrain", "m\u00b2/s\u00b2", number=True), Column("ground", number=True),
@@ -193,7 +193,7 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
         f"{shown.height} datasets",
         f"{shown['runs'].sum()} runs",
         f"slip {INPUT_WORDS[answer.input]}",
-        "as published" if answer.quantity == "published_norm" else "median slip speed",
+        answer.measure,
     ]
     return render_figures(
         "report/templates/comparison.html",
@@ -228,7 +228,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
         title = (
             "window norm of the published chain [m/s]"
             if published
-            else f"median slip speed {INPUT_WORDS[input_name]} [m/s]"
+            else f"{answer.measure} {INPUT_WORDS[input_name]} [m/s]"
         )
         drawing = draw_runs(own, rated, value=answer.quantity, title=title)
         pictures.append(Picture("run_medians_by_dataset", "Median over runs", drawing))
@@ -330,7 +330,7 @@ def tabulate_difficulty(shown: pl.DataFrame) -> Table:
         else f"{kendall_tau(pair['median_modulus'].to_numpy(), pair[column].to_numpy()):.2f}"
         for column, pair in both.items()
     )
-    rows.append([Cell("agreement with the slip speed (Kendall)", tag="i"), *agreement])
+    rows.append([Cell("agreement with the slip modulus (Kendall)", tag="i"), *agreement])
     head = [Column("dataset"), *(Column(one.name, one.unit, number=True) for one in MEASURES.values())]
     return Table("Median over runs and, in brackets, the rank from easy to hard", head, rows)
 
@@ -343,7 +343,7 @@ def list_contradictions(shown: pl.DataFrame) -> list[str]:
         if both.height >= _FEWEST:
             swaps = list_swaps(both["median_modulus"].to_numpy(), both[measure.column].to_numpy())
             sentences += [
-                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by slip speed, "
+                f"{both['dataset'][i]} slips more than {both['dataset'][j]} by slip modulus, "
                 f"but less by {measure.name}"
                 for i, j in swaps[:_MOST_SWAPS]
             ]

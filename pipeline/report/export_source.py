@@ -147,6 +147,12 @@ class ExportSource:
             known |= set(frame["input"].cast(pl.String).unique())
         return [name for name in INPUTS if name in known]
 
+    @property
+    def length_scale_m(self) -> float:
+        """Length scale L of the moduli [m]."""
+        scale = self.manifest.part("configuration", "slip").get("length_scale_m")
+        return float(scale) if isinstance(scale, int | float) else 1.0
+
     @cached_property
     def shift_ns(self) -> int:
         """Offset from stamps to the recorder's clock [ns].
@@ -326,6 +332,7 @@ def _find_end(source: ExportSource, table: str) -> float:
 
 MEASURED = "/slip/velocity/measured"
 MODEL = "/slip/velocity/model"
+RESIDUAL = "/slip/residual_modulus"
 POSE = "/slip/pose"
 PATH = "/slip/path"
 PREDICTED_PATH = "/slip/predicted_path"
@@ -346,7 +353,7 @@ def name_slip(input_name: str) -> str:
 
 
 def name_modulus(input_name: str) -> str:
-    """Topic of the slip speed on an input."""
+    """Topic of the slip modulus on an input."""
     return f"/slip/modulus_{input_name}"
 
 
@@ -359,7 +366,7 @@ _LIFT_M = 0.4
 
 
 def write_trail(writer: LogWriter, source: ExportSource, track: pl.DataFrame) -> None:
-    """Write one line per segment, coloured by slip speed on the leading input; grey without slip.
+    """Write one line per segment, coloured by slip modulus on the leading input; grey without slip.
 
     Args:
         writer: writer of the derived log.

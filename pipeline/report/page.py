@@ -155,14 +155,14 @@ def _tabulate(report: RunReport) -> Table | None:
         return None
     scale = report.number("length_scale_m")
     caption = "Slip g = f(u) \u2212 v of the ideal model"
-    caption += "" if scale is None else f"; slip speed with L = {scale:g} m"
+    caption += "" if scale is None else f"; slip modulus with L = {scale:g} m"
     rows: list[list[str | Cell]] = [[words, *(c[i] for c in columns)] for i, words in enumerate(_QUANTITIES)]
     head = [Column("u"), *(Column(INPUT_WORDS[name], number=True) for name in report.inputs)]
     return Table(caption, head, rows)
 
 
 _QUANTITIES = (
-    Cell("median slip speed", small="m/s"),
+    Cell("median slip modulus", small="m/s"),
     Cell("median 2 s window norm", small="m/s"),
     Cell("RMS g", sub="x", after=", forward", small="m/s"),
     Cell("RMS g", sub="y", after=", lateral", small="m/s"),

@@ -336,7 +336,7 @@ class Scene:
         return {name: frame for name, frame in sound.items() if not frame.is_empty()}
 
     def median_modulus(self, name: str) -> float | None:
-        """Median slip speed on an input [m/s], without suspect stretches."""
+        """Median slip modulus on an input [m/s], without suspect stretches."""
         frame = self.sound_slip.get(name)
         return None if frame is None else float(np.median(frame["modulus"].to_numpy()))
 
@@ -344,6 +344,12 @@ class Scene:
     def main_slip(self) -> pl.DataFrame | None:
         """Slip of the leading input."""
         return self.slip.get(self.report.main_input)
+
+    @cached_property
+    def main_residual(self) -> pl.DataFrame | None:
+        """Slip of the leading input where a model was followed; None without a model."""
+        known = None if self.main_slip is None else self.main_slip.drop_nulls("residual_modulus")
+        return None if known is None or known.is_empty() else known
 
     @cached_property
     def velocities(self) -> pl.DataFrame | None:
@@ -418,8 +424,12 @@ class Scene:
 
     @cached_property
     def modulus_lines(self) -> Thinned | None:
-        """Slip speed over time, long: ``t value series``, null where a line breaks."""
-        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()])
+        """Slip modulus over time, long: ``t value series``, null where a line breaks.
+
+        The series `model` is what the model leaves.
+        """
+        residual = [] if self.main_residual is None else [(self.main_residual, "residual_modulus", "model")]
+        return self._join_lines([(frame, "modulus", name) for name, frame in self.slip.items()] + residual)
 
     def component_lines(self, component: str) -> Thinned | None:
         """Velocities of `x`, `y` or `w` over time, long: ``t value series``, null where a line breaks."""

@@ -27,6 +27,7 @@ from pipeline.report.export_source import (
     PATH,
     POSE,
     PREDICTED_PATH,
+    RESIDUAL,
     SEGMENT,
     TRAIL,
     ExportSource,
@@ -127,6 +128,12 @@ def _write_model(
     columns = {f"v_{axis}": predicted.velocity[:, i] for i, axis in enumerate("xyw")}
     velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
     _write_twist(writer, source, MODEL, velocity, "v")
+    scale = np.array([1.0, 1.0, source.length_scale_m])
+    residual = (predicted.velocity - frame.select("v_x", "v_y", "v_w").to_numpy()) * scale
+    modulus = np.linalg.norm(residual, axis=1)
+    known = np.isfinite(modulus)
+    times = source.log_times(frame["stamp"].to_numpy()[known])
+    writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})
     _write_predictions(writer, source, predicted.prediction)
 
 
@@ -249,8 +256,11 @@ def _build_panels(source: ExportSource) -> dict[str, object]:
         "3D!map": _build_map(source),
         "RosOut!findings": {"searchTerms": [], "minLogLevel": 1, "topicToRender": FINDINGS},
         "Plot!slip": _build_plot(
-            "slip speed [m/s]",
-            [(f"{name_modulus(name)}.data", f"on {name}", theme.INPUT_COLOURS[name]) for name in inputs],
+            "slip modulus [m/s]",
+            [
+                *((f"{name_modulus(name)}.data", f"on {name}", theme.INPUT_COLOURS[name]) for name in inputs),
+                *([] if source.model is None else [(f"{RESIDUAL}.data", "left by the model", theme.MODEL)]),
+            ],
         ),
     }
     for axis, title in (("x", "v_x [m/s]"), ("y", "v_y [m/s]"), ("w", "v_w [rad/s]")):
@@ -324,13 +334,14 @@ def _build_tabs(source: ExportSource) -> ET.Element:
     tab = ET.SubElement(window, "Tab", {"containers": "1", "tab_name": "slip"})
     container = ET.SubElement(tab, "Container")
     slip = [(f"{name_modulus(name)}/data", theme.INPUT_COLOURS[name]) for name in source.inputs]
+    slip += [] if source.model is None else [(f"{RESIDUAL}/data", theme.MODEL)]
     plots = [slip]
     plots += [[(line.path(axis, "/"), line.colour) for line in list_series(source)] for axis in "xyw"]
     sizes = ";".join(["0.25"] * len(plots))
     splitter = ET.SubElement(
         container, "DockSplitter", {"orientation": "-", "count": str(len(plots)), "sizes": sizes}
     )
-    names = ("slip speed [m/s]", "v_x [m/s]", "v_y [m/s]", "v_w [rad/s]")
+    names = ("slip modulus [m/s]", "v_x [m/s]", "v_y [m/s]", "v_w [rad/s]")
     for name, curves in zip(names, plots, strict=True):
         area = ET.SubElement(splitter, "DockArea", {"name": name})
         plot = ET.SubElement(area, "plot", {"style": "Lines", "mode": "TimeSeries"})

@@ -100,7 +100,7 @@ class Alignment:
         outlier_s: duration of contradictions of localization and wheels, except bad stretches.
         gyro: fit of the gyro to the poses; None without a good one.
         heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
-        recorded_moduli: median slip speed with L = 1 m by input before the corrections [m/s].
+        recorded_moduli: median slip modulus with L = 1 m by input before the corrections [m/s].
     """
 
     hold_s: float | None = None

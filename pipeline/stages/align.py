@@ -203,7 +203,7 @@ class _Grid:
         velocities: table `velocities`.
         bad: samples in an incident, or in a stretch with implausible poses, shape (n,).
         steps: columns of table `slip` with the starts of steps and the samples not to be scored.
-        recorded: median slip speed with L = 1 m by input [m/s].
+        recorded: median slip modulus with L = 1 m by input [m/s].
         is_localization: whether the poses are more than integrated wheels, so that their delay is observable.
     """
 
@@ -243,7 +243,7 @@ def _tabulate_steps(
 
 
 def _measure_moduli(samples: Samples, bad: Flags) -> dict[str, float | None]:
-    """Median slip speed with L = 1 m of every input [m/s], as recorded."""
+    """Median slip modulus with L = 1 m of every input [m/s], as recorded."""
     medians: dict[str, float | None] = {}
     for name, ideal in (("command", samples.command), ("measured", samples.measured)):
         if ideal is not None:

@@ -428,7 +428,17 @@ def aggregate_run(
             )
     from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
 
-    return tabulate("aggregates", rows)
+    return set_residuals(tabulate("aggregates", rows), slip)
+
+
+def set_residuals(aggregates: pl.DataFrame, slip: pl.DataFrame) -> pl.DataFrame:
+    """Table `aggregates` with the medians of the residual moduli in table `slip`."""
+    clean = slip.filter(~pl.col("suspect"))
+    medians = [
+        clean.filter((pl.col("input") == name) & _in_subset(subset))["residual_modulus"].median()
+        for name, subset in aggregates.select("input", "subset").iter_rows()
+    ]
+    return aggregates.with_columns(pl.Series("median_residual_modulus", medians, pl.Float64))
 
 
 def _in_subset(subset: str) -> pl.Expr:
@@ -442,7 +452,6 @@ def _summarize_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, floa
         "samples": slip.height,
         "windows": windows.height,
         "median_modulus": _number(slip["modulus"].median()),
-        "median_residual_modulus": _number(slip["residual_modulus"].median()),
         "median_window_norm": _number(windows["window_norm"].median()),
         **{f"rms_{axis}": _root_mean_square(slip[f"g_{axis}"]) for axis in "xyw"},
         "mean_square": _number((slip["modulus"] ** 2).mean()),

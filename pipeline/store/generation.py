@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,7 @@ from pipeline.store.files import (
     temporary_beside,
 )
 from pipeline.store.names import (
+    NO_FACTS,
     QUARANTINE,
     StoreError,
     TableReport,
@@ -129,19 +131,54 @@ class Generation:
             self._folder.mkdir()
         watch("opened")
 
-    def write_table(self, name: str, frame: pl.DataFrame) -> TableReport:
+    def write_table(
+        self, name: str, frame: pl.DataFrame, facts: Mapping[str, float] = NO_FACTS
+    ) -> TableReport:
         """Hold a frame against its contract and write it; rows that break a rule go to the quarantine.
 
         Args:
             name: table name.
             frame: exactly the contract's columns, in any order.
+            facts: numbers of the whole table that its contract declares.
 
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``written_twice``, or the disk refuses.
         """
         from pipeline.store.parquet_tables import check_table  # noqa: PLC0415 - heavy
 
-        return self.write_checked(check_table(name, frame))
+        return self.write_checked(check_table(name, frame, facts))
+
+    def replace_table(self, name: str, frame: pl.DataFrame) -> None:
+        """Write a table of this generation once more; its rows, its facts and its quarantine stay.
+
+        Args:
+            name: a table that was written or taken over.
+            frame: exactly the contract's columns, in any order; every row keeps the contract.
+
+        Raises:
+            StoreError: ``no_such_table``, ``wrong_columns``, ``broken_rows``, or the disk refuses.
+        """
+        from pipeline.store.parquet_tables import check_table, read_facts  # noqa: PLC0415 - heavy
+
+        self._require_open()
+        before = self._require_table(name)
+        path = self._folder / before.file
+        checked = check_table(name, frame, read_facts(path))
+        if checked.report.rows != before.rows:
+            what = f"{name} has {before.rows} rows, and is to be replaced by {checked.report.rows} good ones"
+            raise self._refuse("broken_rows", what, "Replace values, and keep the rows")
+        data, _ = checked.encode()
+        with name_disk_errors(path):
+            # A table that was taken over is a link to the file of the generation before.
+            path.unlink()
+            self._draft(path, data)
+        self._watch("file_written")
+        self._tables[name] = replace(
+            before,
+            sha256=hash_bytes(data),
+            bytes=len(data),
+            contract_version=checked.contract.version,
+        )
 
     def write_checked(self, checked: CheckedTable) -> TableReport:
         """Write a table that was held against its contract.
@@ -174,10 +211,7 @@ class Generation:
         Raises:
             StoreError: ``no_such_table``, it was neither written nor taken over so far.
         """
-        if name not in self._tables:
-            what = f"the generation holds no {name!r} so far"
-            raise self._refuse("no_such_table", what, "Run the stage before, or analyze the whole log")
-        return read_parquet(self._folder / self._tables[name].file)
+        return read_parquet(self._folder / self._require_table(name).file)
 
     def write_text(self, name: str, text: str) -> None:
         """Write a text file, UTF-8.
@@ -222,6 +256,16 @@ class Generation:
             raise self._nothing_to_reuse(name)
         self._link(name, previous.files[name].sha256)
         self._files[name] = previous.files[name]
+
+    def reuse_all(self, *others: str) -> None:
+        """Take over all tables and files of the previous generation but the ``others``; as `reuse_table`."""
+        previous = self._require_previous("table")
+        for table in previous.tables:
+            self.reuse_table(table)
+        taken = {f"{QUARANTINE}{table}.parquet" for table in previous.tables}
+        for name in previous.files:
+            if name not in taken.union(others):
+                self.reuse_file(name)
 
     def commit(self, details: Mapping[str, JSON]) -> Manifest:
         """Publish the generation: from here on every reader sees it, and nothing of the one before.
@@ -324,6 +368,12 @@ class Generation:
         if name in taken:
             hint = "Write each table and file of a generation once"
             raise self._refuse("written_twice", f"{name} was written already", hint)
+
+    def _require_table(self, name: str) -> TableEntry:
+        if name not in self._tables:
+            what = f"the generation holds no {name!r} so far"
+            raise self._refuse("no_such_table", what, "Run the stage before, or analyze the whole log")
+        return self._tables[name]
 
     def _require_previous(self, name: str) -> Manifest:
         if self.previous is None:

@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
+from types import MappingProxyType
 
 from pipeline.core import SlipError
 from pipeline.core.untrusted import TOO_LARGE, PathError, may_lead_out, resolve_inside
@@ -18,6 +19,10 @@ from pipeline.core.untrusted import TOO_LARGE, PathError, may_lead_out, resolve_
 
 class StoreError(SlipError):
     """Results cannot be written, read or trusted."""
+
+
+NO_FACTS: Mapping[str, float] = MappingProxyType({})
+"""Numbers of a table that has none."""
 
 
 _KNOWN = (

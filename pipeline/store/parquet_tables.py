@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.store.names import (
+    NO_FACTS,
     QUARANTINE,
     StoreError,
     TableReport,
@@ -63,17 +64,19 @@ class CheckedTable:
         valid: the rows that keep it.
         broken: the rows that break it, with `BROKEN_RULES`; None when there are none.
         report: the counts.
+        facts: numbers of the whole table.
     """
 
     contract: Contract
     valid: pl.DataFrame
     broken: pl.DataFrame | None
     report: TableReport
+    facts: Mapping[str, float] = field(default_factory=dict)
 
     def encode(self) -> tuple[bytes, bytes | None]:
         """Parquet bytes of the rows that keep the contract, and of those that break it."""
-        broken = None if self.broken is None else encode_parquet(self.contract, self.broken)
-        return encode_parquet(self.contract, self.valid), broken
+        broken = None if self.broken is None else encode_parquet(self.contract, self.broken, self.facts)
+        return encode_parquet(self.contract, self.valid, self.facts), broken
 
 
 def find_contract(name: str) -> Contract:
@@ -166,17 +169,22 @@ def _annotate_columns(contract: Contract) -> Mapping[str, Mapping[str, str]]:
     return {name: dict(sorted(contract.metadata_of(name).items())) for name in names}
 
 
-def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
+def check_table(name: str, frame: pl.DataFrame, facts: Mapping[str, float] = NO_FACTS) -> CheckedTable:
     """Hold a frame against its contract.
 
     Args:
         name: table name.
         frame: exactly the contract's columns, in any order.
+        facts: numbers of the whole table that the contract declares.
 
     Raises:
-        StoreError: ``no_such_table``; ``wrong_columns``: a column is missing, unknown or of another type.
+        StoreError: ``no_such_table``; ``wrong_columns``: a column is missing, unknown or of another type, or
+            a fact is unknown.
     """
     contract = find_contract(name)
+    if unknown := sorted(facts.keys() - contract.facts):
+        hint = "Declare it in FACTS of the table in schemas/"
+        raise StoreError("wrong_columns", f"the table {name} declares no {', '.join(unknown)}", hint=hint)
     schema = schema_of(name)
     _check_columns(name, frame.schema, schema)
     valid, failure = contract.schema.filter(frame.select(schema.names()))
@@ -188,6 +196,7 @@ def check_table(name: str, frame: pl.DataFrame) -> CheckedTable:
         valid=valid,
         broken=name_broken_rules(failure) if len(failure) else None,
         report=report,
+        facts=facts,
     )
 
 
@@ -204,13 +213,20 @@ def name_broken_rules(failure: FailureInfo) -> pl.DataFrame:
     return rows.with_columns(broken.to_series())
 
 
-def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str = "zstd") -> bytes:
+def encode_parquet(
+    contract: Contract,
+    frame: pl.DataFrame,
+    facts: Mapping[str, float] = NO_FACTS,
+    *,
+    compression: str = "zstd",
+) -> bytes:
     """A frame as Parquet bytes; the same frame gives the same bytes.
 
-    Fields carry unit, frame and description, the schema carries ``contract`` and ``contract_version``.
+    Fields carry unit, frame and description, the schema carries ``contract``, ``contract_version`` and the
+    facts.
     """
     table = frame.rechunk().to_arrow(compat_level=pl.CompatLevel.oldest())
-    schema = _annotate(contract, table.schema)
+    schema = _annotate(contract, table.schema, facts)
     sink = pa.BufferOutputStream()
     pq.write_table(
         pa.Table.from_arrays(table.columns, schema=schema),
@@ -225,15 +241,24 @@ def encode_parquet(contract: Contract, frame: pl.DataFrame, *, compression: str 
     return data
 
 
-def _annotate(contract: Contract, schema: pa.Schema) -> pa.Schema:
+def read_facts(path: Path) -> dict[str, float]:
+    """Numbers of the whole table in the metadata of its Parquet file, as its contract declares them."""
+    with name_damage(path):
+        metadata = pq.read_schema(path).metadata or {}
+    known = {key.decode(): value.decode() for key, value in metadata.items()}
+    return {name: float(known[name]) for name in find_contract(known["contract"]).facts if name in known}
+
+
+def _annotate(contract: Contract, schema: pa.Schema, facts: Mapping[str, float]) -> pa.Schema:
     fields = []
     described = _annotate_columns(contract)
-    for field in schema:
-        ours = _ABOUT_BROKEN_RULES if field.name == BROKEN_RULES else described[field.name]
+    for column in schema:
+        ours = _ABOUT_BROKEN_RULES if column.name == BROKEN_RULES else described[column.name]
         # polars keeps the values of an Enum in the field's metadata; without them it reads back a category.
-        theirs = {key.decode(): value.decode() for key, value in (field.metadata or {}).items()}
-        fields.append(field.with_metadata(theirs | dict(ours)))
-    return pa.schema(fields, metadata={"contract": contract.name, "contract_version": str(contract.version)})
+        theirs = {key.decode(): value.decode() for key, value in (column.metadata or {}).items()}
+        fields.append(column.with_metadata(theirs | dict(ours)))
+    about = {"contract": contract.name, "contract_version": str(contract.version)}
+    return pa.schema(fields, metadata=about | {name: repr(float(value)) for name, value in facts.items()})
 
 
 def _check_columns(name: str, columns: pl.Schema, wanted: pl.Schema) -> None:

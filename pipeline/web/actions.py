@@ -89,7 +89,7 @@ class Shown:
         view: rows to draw.
         where: regions with most of its error, as text of `slip diagnose`.
         predict: function for its body velocities at times of aligned poses [s], shape (n, 3).
-        apportion: function for its budgets by cause, given the length scale of the slip speed [m].
+        apportion: function for its budgets by cause, given the length scale of the slip modulus [m].
     """
 
     view: MotionView

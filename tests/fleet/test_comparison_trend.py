@@ -74,7 +74,7 @@ def test_a_track_that_moved_is_said_with_its_day_and_what_is_likely(store: Store
     page = write_trend(store, found).read_text(encoding="utf-8")
     assert "1.8 -&gt; 2.1 since 2026-05-03" in page
     titles = re.findall("<h3>([^<]+)</h3>", page)
-    assert titles[:2] == ["Effective track (effective_track.k)", "Median slip speed from commands [m/s]"]
+    assert titles[:2] == ["Effective track (effective_track.k)", "Median slip modulus from commands [m/s]"]
     assert titles[-3:] == [
         "Value of the finding heading_skew",
         "Share of suspect samples",
@@ -127,7 +127,7 @@ def test_what_moves_with_a_parameter_is_told_with_it(store: Store) -> None:
     (kind,) = kinds
     assert kind == ("since", "run", "before", "after", "runs_before", "runs_after", "p", "likely", "text")
     with_it = alert.text.split("; with it: ")[1]
-    assert with_it.startswith("median slip speed from commands of warthog-2 ")
+    assert with_it.startswith("median slip modulus from commands of warthog-2 ")
     assert "finding heading_skew of warthog-2 0.1 -> 0.3" in with_it
 
 

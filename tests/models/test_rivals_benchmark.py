@@ -69,7 +69,7 @@ def test_a_difference_within_its_interval_is_no_win(
     printed = capsys.readouterr().out
     counts = {"-": (0, 1, 0), "=": (0, 0, 1), "+": (1, 0, 0)}[sign]
     assert (
-        "in the run, position [m]: the best model of the literature is better than the named physics on "
+        "- Position: the best model of the literature is better than the named physics on "
         f"{counts[0]} of 1, worse on {counts[1]}, not significantly different on {counts[2]}."
     ) in printed
 

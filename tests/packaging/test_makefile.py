@@ -65,7 +65,7 @@ def test_a_path_may_hold_spaces_and_quotes(tmp_path: Path) -> None:
     )
 
     assert done.returncode == 0, done.stderr
-    assert "slip      median slip speed" in done.stdout
+    assert "slip      median slip modulus" in done.stdout
     assert list((tmp_path / "my results").rglob("slip.parquet"))
 
 

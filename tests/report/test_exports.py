@@ -88,6 +88,21 @@ def test_the_official_reader_finds_what_the_tables_hold(source: ExportSource, de
     assert {"/slip/velocity/model", "/slip/predicted_path", "/slip/trail", "/slip/segment"} <= set(found)
 
 
+def test_what_the_model_leaves_is_its_distance_from_the_measured_velocity(derived: Path) -> None:
+    found = read_officially(derived)
+    measured, model = (
+        {
+            time: (twist.linear.x, twist.linear.y, twist.angular.z)
+            for time, twist in ((time, message.twist) for time, message in found[f"/slip/velocity/{kind}"])  # type: ignore[attr-defined]
+        }
+        for kind in ("measured", "model")
+    )
+    left = {time: message.data for time, message in found["/slip/residual_modulus"]}  # type: ignore[attr-defined]
+    assert left.keys() == model.keys()
+    own = {time: float(np.linalg.norm(np.subtract(model[time], measured[time]))) for time in model}
+    assert left == pytest.approx(own, abs=1e-12)
+
+
 def test_another_reader_finds_the_same(derived: Path) -> None:
     official = read_officially(derived)
     counts: dict[str, int] = {}
@@ -263,7 +278,7 @@ def test_layouts_name_only_topics_of_the_derived_log(
     plots = [panel for name, panel in layout["configById"].items() if name.startswith("Plot")]
     drawn = {line["value"].split(".")[0] for plot in plots for line in plot["paths"]}
     assert drawn <= topics
-    assert len(drawn) == 6
+    assert len(drawn) == 7
     panels = json.dumps(layout["layout"])
     assert all(name in panels for name in layout["configById"])
     tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file

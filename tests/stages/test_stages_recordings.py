@@ -26,7 +26,7 @@ class Known:
 
     Attributes:
         held: share of held poses.
-        measured, command: median slip speed [m/s].
+        measured, command: median slip modulus [m/s].
         norm: median 2 s window norm, measured wheels.
         faults: findings it must give.
         absent: findings it must not give.

@@ -237,10 +237,10 @@ def before_and_after(input_name: str) -> Channel:
 
 
 def slip_colour(scene: Scene, field: str = "modulus") -> Channel:
-    """Colour ramp of slip speed, the same in every figure of a run."""
+    """Colour ramp of slip modulus, the same in every figure of a run."""
     words = INPUT_WORDS[scene.report.main_input]
     legend = {
-        "title": f"slip speed {words} [m/s]",
+        "title": f"slip modulus {words} [m/s]",
         "gradientLength": 150,
         "gradientThickness": 8,
         "tickCount": 3,

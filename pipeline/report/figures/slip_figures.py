@@ -43,7 +43,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     path = line.encode(x=x, y=y)
     tooltip = [
         encode_column("t:Q", title="time [s]", format=".2f"),
-        encode_column("modulus:Q", title="slip speed [m/s]", format=".2f"),
+        encode_column("modulus:Q", title="slip modulus [m/s]", format=".2f"),
     ]
     dots = base.mark("circle", size=16, opacity=1).encode(
         x="x:Q", y="y:Q", color=figures.slip_colour(scene), tooltip=tooltip
@@ -135,7 +135,7 @@ def format_map(scene: Scene) -> str:
         return "There are no poses to draw."
     frame = scene.track.frame
     sizes = [float(np.ptp(frame[name].to_numpy())) for name in "xy"]
-    sentence = f"Map of the trajectory, {' by '.join(map(format_length, sizes))}, coloured by slip speed."
+    sentence = f"Map of the trajectory, {' by '.join(map(format_length, sizes))}, coloured by slip modulus."
     known = frame.filter(pl.col("modulus").is_not_null())
     if known.is_empty():
         return sentence
@@ -153,7 +153,7 @@ _SMALLEST_BOUND = 0.1
 
 
 def draw_command_space(scene: Scene) -> Drawing | None:
-    """A heat map: colour is the median slip speed of the samples in a cell; empty cells stay empty."""
+    """A heat map: colour is the median slip modulus of the samples in a cell; empty cells stay empty."""
     slip = scene.sound_slip.get(scene.report.main_input)
     if slip is None:
         return None
@@ -187,7 +187,7 @@ def draw_command_space(scene: Scene) -> Drawing | None:
 
 
 def list_cells(scene: Scene) -> dict[str, pl.DataFrame]:
-    """Cells of the plane of commands: edges, median slip speed, samples; empty without slip."""
+    """Cells of the plane of commands: edges, median slip modulus, samples; empty without slip."""
     slip = scene.sound_slip.get(scene.report.main_input)
     return {} if slip is None else {"command_cells": _count_cells(slip)}
 
@@ -201,7 +201,7 @@ def _bound(slip: pl.DataFrame, name: str) -> list[float]:
 
 
 def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
-    """Cells of equal size over the plane of commands: edges, median slip speed, samples."""
+    """Cells of equal size over the plane of commands: edges, median slip modulus, samples."""
     columns = []
     for name, short in (("f_x", "x"), ("f_w", "w")):
         low, high = _bound(slip, name)
@@ -224,7 +224,7 @@ def _count_cells(slip: pl.DataFrame) -> pl.DataFrame:
 def format_cells(scene: Scene) -> str:
     """Commands with the most and the least slip."""
     grid = list_cells(scene).get("command_cells")
-    title = "Median slip speed over ideal speed and ideal yaw rate."
+    title = "Median slip modulus over ideal speed and ideal yaw rate."
     if grid is None or grid.is_empty():
         return title
     row = grid.row(grid["modulus"].arg_max() or 0, named=True)
@@ -245,10 +245,11 @@ def draw_modulus(scene: Scene) -> Drawing | None:
     if lines is None:
         return None
     shown = find_range(lines.frame, lines.usual)
-    colour = figures.series_colour(list(scene.slip), INPUT_WORDS)
+    residual = [] if scene.main_residual is None else ["model"]
+    colour = figures.series_colour([*scene.slip, *residual], {**INPUT_WORDS, "model": "left by the model"})
     chart = figures.draw_lines(scene, ["modulus"], shown, colour).properties(
         height=150,
-        title=figures.title_panel("slip speed", "m/s", shown),
+        title=figures.title_panel("slip modulus", "m/s", shown),
         usermeta=figures.brush_over_time(),
     )
     note = figures.format_thinning(lines, rule="first, last, lowest and highest of every bin")
@@ -265,7 +266,10 @@ def _format_slip(scene: Scene) -> str:
             f"{INPUT_WORDS[name]} its median is {format_number(scene.median_modulus(name))} m/s "
             f"and it is highest, {row['modulus']:.2f} m/s, at {row['t']:.0f} s"
         )
-    return "Slip speed over time: " + "; ".join(sentences) + "."
+    if scene.main_residual is not None:
+        median = scene.main_residual.filter(~pl.col("suspect"))["residual_modulus"].median()
+        sentences.append(f"the model leaves a median of {format_number(median)} m/s")  # type: ignore[arg-type]
+    return "Slip modulus over time: " + "; ".join(sentences) + "."
 
 
 MODULUS = Figure("Slip over time", Section.HOW_BAD, draw_modulus, order=10, width="full", id="modulus")
@@ -274,7 +278,7 @@ _BINS = 600
 
 
 def draw_navigator(scene: Scene) -> Drawing | None:
-    """Draw slip speed over the whole run, and the visible stretch; None for a short run."""
+    """Draw slip modulus over the whole run, and the visible stretch; None for a short run."""
     slip, span = scene.main_slip, scene.worst_span
     if slip is None or span is None:
         return None
@@ -293,7 +297,7 @@ def draw_navigator(scene: Scene) -> Drawing | None:
     length = span[1] - span[0]
     note = f"Enlarged below: the {length:g} s with the most slip. Drag over the strip to draw others."
     words = (
-        f"Slip speed {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
+        f"Slip modulus {INPUT_WORDS[scene.report.main_input]} over the whole run. It is highest between "
         f"{span[0]:.0f} s and {span[1]:.0f} s, which the figure below draws large; "
         "arrow keys move the stretch."
     )
@@ -308,7 +312,7 @@ def draw_distribution(scene: Scene) -> Drawing | None:
     if not scene.sound_slip:
         return None
     values = {name: frame["modulus"] for name, frame in scene.sound_slip.items()}
-    return draw_shares("modulus_shares", values, "slip speed", of=" of a time step")
+    return draw_shares("modulus_shares", values, "slip modulus", of=" of a time step")
 
 
 DISTRIBUTION = Figure(
@@ -321,7 +325,7 @@ def draw_window_norms(scene: Scene) -> Drawing | None:
     norms = _list_norms(scene)
     if not norms:
         return None
-    note = "The norm of the published figure: \u221a40 \u00d7 root mean square slip speed over 2 s."
+    note = "The norm of the published figure: \u221a40 \u00d7 root mean square slip modulus over 2 s."
     return draw_shares("norm_shares", norms, "2 s window norm", note=note)
 
 
