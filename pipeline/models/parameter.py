@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from pipeline.core import JSON_DIGITS, round_digits
+from pipeline.core import JSON_DIGITS, NORMAL_95, round_digits
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
@@ -374,6 +374,21 @@ class Parameter:
         low, high = self.bounds
         rounded = round_digits(value, digits)
         return rounded if low <= rounded <= high and value != self.neutral else value
+
+    def is_physical(self, value: float, error: float) -> bool:
+        """Whether an estimate can be physics: within bounds, and within its error in the observed range.
+
+        Beside a bound that is neutral, as a lag of zero, chance may put it within its error.
+
+        Args:
+            value: the estimate.
+            error: its standard error.
+        """
+        low, high = cut_interval(value - NORMAL_95 * error, value + NORMAL_95 * error, self.bounds)
+        if low > high or (self.neutral not in self.bounds and not self.bounds[0] < value < self.bounds[1]):
+            return False
+        shown = self.plausible
+        return shown is None or (low <= shown.high and high >= shown.low)
 
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""

@@ -155,6 +155,7 @@ def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path) -> None:
     with path.open("wb") as stream, Writer(stream) as writer:
         for time, number, message in sorted(messages, key=lambda one: one[:2]):
             writer.write_message(sheets[number].topic, message, time, time)
+        writer.add_metadata(*_MARK)
 
 
 def _set(message: Any, path: str, value: object) -> None:  # noqa: ANN401 - made at run time
@@ -194,6 +195,8 @@ def _make_classes() -> dict[str, Any]:
 
 
 _BOOTED_NS = 100_000_000_000
+_MARK = ("simulation", {"by": "slip simulate"})
+"""Metadata record of every simulated log: it is never pooled with recordings."""
 
 
 def write_log(run: SimulatedRun, path: Path) -> None:
@@ -242,6 +245,7 @@ def write_log(run: SimulatedRun, path: Path) -> None:
                 fields,
                 header_time=header,
             )
+        writer.metadata(*_MARK)
         if scenario.recording.deployment == "written":
             writer.metadata(
                 "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}
