@@ -117,7 +117,7 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
         notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
     notes += _note_unphysical(known)
     numbers = []
-    for vehicle, effect, parameter, rows in list_numbers(known):
+    for vehicle, effect, parameter, rows in list_numbers(known.filter(_find_physical(known))):
         # A corrected clock is named, and no part of the model.
         own = rows.filter(pl.col("in_model") | pl.col("named"))
         numbers.append(_fit_number(vehicle, effect, parameter, own, rows.height - own.height))
@@ -175,9 +175,9 @@ def _note_unphysical(estimates: pl.DataFrame) -> list[str]:
 
 
 def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFrame:
-    """Valid rows of `estimates`: not at a bound, with an error, within physics, one of two inputs."""
+    """Valid rows of `estimates`: not at a bound, with an error, one of two inputs."""
     return (
-        estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0, _find_physical(estimates))
+        estimates.filter(~pl.col("at_bound"), pl.col("standard_error") > 0.0)
         .with_columns(pl.col("input").cast(pl.String))
         .sort("run", "effect", "parameter", pl.col("input") != source)
         .unique(["run", "effect", "parameter"], keep="first", maintain_order=True)
@@ -433,7 +433,7 @@ def forecast_vehicle(
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
     """
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
-    rows = take_numbers(known, source).filter(pl.col("vehicle") == vehicle)
+    rows = take_numbers(known.filter(_find_physical(known)), source).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
         what = f"no run of {vehicle} on a known terrain has estimates"
         hint = f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}."

@@ -94,7 +94,9 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
         )
     slip = pl.concat(parts)
     if run.gain:
-        slip = slip.with_columns(v_x=run.gain * pl.col("f_x"))
+        slip = slip.with_columns(v_x=run.gain * pl.col("f_x"), v_y=pl.lit(0.0), g_y=pl.lit(0.0))
+        slip = slip.with_columns(g_x=pl.col("f_x") - pl.col("v_x"))
+        slip = slip.with_columns(modulus=pl.col("g_x").abs())
     if not run.moves:
         slip = slip.with_columns(pl.col("^[fv]_[xyw]$") * 0.0)
     tables = {
