@@ -127,7 +127,8 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
         f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
     lines += [_format_dataset(row, width) for row in rated.iter_rows(named=True)]
-    lines += ["", *_format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    pairs = _format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))
+    lines += ["", *pairs] if pairs else []
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
