@@ -404,15 +404,15 @@ class _Labellings:
         """The last shift in a direction from the observed one that is not rejected; None without an end."""
         first, _ = self.sizes
         inner = float(self.values[first:].mean() - self.values[:first].mean())
-        reach = float(np.ptp(self.values))
+        extent = float(np.ptp(self.values))
         if smallest_p(*self.sizes, draws=self.draws) > level:
             return None
-        if reach == 0.0:
+        if extent == 0.0:
             return inner
-        outer = inner + direction * reach
+        outer = inner + direction * extent
         # Zero is on the side of the interval on which its own test puts it.
         if direction * inner < 0.0:
-            inner, outer = (0.0, direction * reach) if self.find_p(0.0) > level else (inner, 0.0)
+            inner, outer = (0.0, direction * extent) if self.find_p(0.0) > level else (inner, 0.0)
         for _ in range(_DOUBLINGS):
             if self.find_p(outer) <= level:
                 break

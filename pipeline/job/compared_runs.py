@@ -142,14 +142,14 @@ def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> 
     Raises:
         ComparisonError: ``no_such_vehicle``, ``no_such_dataset``, or ``nothing_to_compare``: one dataset.
     """
-    kept = compared.labels
+    rows = compared.labels
     if vehicle:
-        known = sorted(set(kept["vehicle"]))
+        known = sorted(set(rows["vehicle"]))
         if vehicle not in known:
             hint = f"{guess_names(vehicle, known)}There are runs of: {', '.join(known) or 'no vehicle'}."
             raise ComparisonError("no_such_vehicle", f"no run is of {vehicle}", hint=hint)
-        kept = kept.filter(pl.col("vehicle") == vehicle)
-    known = sorted(set(kept["group"]))
+        rows = rows.filter(pl.col("vehicle") == vehicle)
+    known = sorted(set(rows["group"]))
     for group in groups:
         if group not in known:
             hint = f"{guess_names(group, known)}There are: {', '.join(known) or 'none'}."
@@ -157,10 +157,10 @@ def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> 
     if len(set(groups)) == 1:
         hint = "Name another one, too, or none to compare all."
         raise ComparisonError("nothing_to_compare", f"{groups[0]} is one dataset", hint=hint)
-    kept = kept.filter(pl.col("group").is_in(list(groups))) if groups else kept
-    runs = set(kept["run"])
+    rows = rows.filter(pl.col("group").is_in(list(groups))) if groups else rows
+    runs = set(rows["run"])
     manifests = {run: manifest for run, manifest in compared.manifests.items() if run in runs}
-    return replace(compared, labels=kept, manifests=manifests)
+    return replace(compared, labels=rows, manifests=manifests)
 
 
 def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:
