@@ -45,7 +45,7 @@ def write_task(task: Task, folder: Path) -> Json:
     run = _read_by_sensors(run)
     held = cut_windows(task, run)
     folder.mkdir(parents=True, exist_ok=True)
-    write_log(_cut_log(run, task.log_s), folder / "log.mcap")
+    write_log(_cut_log(run, task.log_s), folder / "log.mcap", marked=False)
     first = round(scene.clock.start_ns)
     later = run.commands.time_s >= task.log_s
     write_held_out(folder, held, _name_commands(run.commands, task.kind, later), first)

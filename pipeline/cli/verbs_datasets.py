@@ -17,12 +17,20 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.fleet.pairs import Answer
+    from pipeline.job.compare import Question
     from pipeline.store import Store
 
 
 def compare(  # noqa: D417 - arguments document themselves
+    *datasets: Annotated[
+        str,
+        Parameter(
+            help="datasets to compare with each other (default: all, and those that differ in vehicle and "
+            "terrain without a test); the results folder may stand before them"
+        ),
+    ],
     results: Results = Path("results"),
-    *,
+    vehicle: Annotated[str, Parameter(help="compare only runs of this vehicle, for example warthog")] = "",
     by: Annotated[
         str,
         Parameter(
@@ -58,28 +66,27 @@ def compare(  # noqa: D417 - arguments document themselves
     from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-    store = Store(results)
+    # Alone or before datasets, a folder is that of the results.
+    is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
+    if is_folder and results == Path("results"):
+        results, datasets = Path(datasets[0]), datasets[1:]
     names = tuple(name.strip() for name in by.split(",") if name.strip())
+    question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
+    store = Store(results)
     if causes:
-        return _compare_causes(store, names, fed, figures, json=json, quiet=quiet)
-    answer = compare_results(store, Question(by=names, input=fed, as_published=as_published))
+        return _compare_causes(store, question, figures, json=json, quiet=quiet)
+    answer = compare_results(store, question)
     written = write_answer(store, answer, figures)
     content = {**summarize_answer(answer), "page": str(written["comparison.html"])}
     return print_result(content, lambda: _format_answer(answer, written), json=json, quiet=quiet)
 
 
 def _compare_causes(
-    store: Store,
-    by: tuple[str, ...],
-    fed: str | None,
-    figures: FigureFormat | None,
-    *,
-    json: bool,
-    quiet: bool,
+    store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
 ) -> int:
     from pipeline.job.over_runs import find_causes, summarize_causes, write_causes  # noqa: PLC0415 - heavy
 
-    causes = find_causes(store, by, fed)
+    causes = find_causes(store, question)
     written = write_causes(store, causes, figures)
     content = summarize_causes(causes)
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
@@ -117,7 +124,8 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
         f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
     ]
     lines += [_format_dataset(row, width) for row in rated.iter_rows(named=True)]
-    lines += ["", *_format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))]
+    pairs = _format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))
+    lines += ["", *pairs] if pairs else []
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
@@ -136,7 +144,15 @@ def _format_dataset(row: Mapping[str, object], width: int) -> str:
 
 
 def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    from pipeline.fleet.pairs import ABOUT_BLOCKS, DIFFERENT, OF_TWO_RUNS, count_pairs, judge_pair  # noqa: PLC0415 - heavy
+    from pipeline.fleet.pairs import (  # noqa: PLC0415 - heavy
+        ABOUT_BLOCKS,
+        BLOCKS,
+        DIFFERENT,
+        OF_TWO_RUNS,
+        RUNS,
+        count_pairs,
+        judge_pair,
+    )
 
     verdicts = [judge_pair(row) for row in rows]
     lines = [
@@ -147,8 +163,10 @@ def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
         for row, verdict in zip(rows, verdicts, strict=True)
         if verdict in (DIFFERENT, OF_TWO_RUNS)
     ]
-    head = ["differences are medians over all pairs of blocks, not differences of the medians above"]
-    return [*(head if lines else []), *lines, *([count_pairs(rows)] if len(lines) < len(rows) else [])]
+    units = [unit for unit in (RUNS, BLOCKS) if any(row["unit_of_analysis"] == unit for row in rows)]
+    over = f"differences are medians over all pairs of {' or '.join(units)}"
+    head = f"{over}, not differences of the medians above"
+    return [*([head] if lines else []), *lines, *([count_pairs(rows)] if len(lines) < len(rows) else [])]
 
 
 _OWN = Path("deployments.csv")

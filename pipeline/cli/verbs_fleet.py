@@ -366,15 +366,17 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
 def _format_expected(number: Mapping[str, object], parameter: ModelParameter) -> str:
     """An expected parameter; a limit at the largest value of its search is none."""
     low, most, unit = number["low"], parameter.bounds[1], suffix_unit(parameter.unit)
-    default = " (default spread between runs)" if number["default_spread"] else ""
     if parameter.neutral == math.inf and number["value"] == most:
-        return f"no limit, or one of at least {low:.3g}{unit}{default}"
-    cut = " (the interval ends at a limit of the search)" if number["at_bound"] else ""
-    return f"{_format_interval(number, parameter.unit)}{cut}{default}"
+        return "no limit" + (f", or one of at least {low:.3g}{unit}" if low is not None else "")
+    cut = " (the interval ends at a limit of the search)" if number["at_bound"] and low is not None else ""
+    return f"{_format_interval(number, parameter.unit)}{cut}"
 
 
 def _format_interval(number: Mapping[str, object], unit: str) -> str:
-    return f"{number['value']:.3g}{suffix_unit(unit)} [{number['low']:.3g}, {number['high']:.3g}]"
+    value = f"{number['value']:.3g}{suffix_unit(unit)}"
+    if number["low"] is None:
+        return f"{value} (no interval: fewer than three runs)"
+    return f"{value} [{number['low']:.3g}, {number['high']:.3g}]"
 
 
 ALERT = 4

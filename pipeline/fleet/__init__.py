@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import FOLDS, SlipError
+from pipeline.core import FEWEST_OF_SPREAD, FOLDS, SlipError
 from pipeline.core.arrays import STRETCH_S, Floats
 from pipeline.run.signals import MOVING_MPS
 from pipeline.stages.slip_stage import find_fastest
@@ -152,6 +152,23 @@ def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
         known.append(pl.col("terrain") != UNKNOWN)
     label = pl.concat_str(*by, separator=" / ")
     return runs.with_columns(pl.when(pl.all_horizontal(known)).then(label).alias("group"))
+
+
+def find_unrelated(labels: pl.DataFrame) -> frozenset[frozenset[str]]:
+    """Pairs of groups with neither a vehicle nor a terrain in common: a difference may be due to either.
+
+    Args:
+        labels: one row per run: ``group``, ``vehicle``, ``terrain``.
+    """
+    groups = [
+        (str(name), {column: set(rows[column]) - {UNKNOWN} for column in ("vehicle", "terrain")})
+        for (name,), rows in labels.partition_by("group", as_dict=True).items()
+    ]
+    return frozenset(
+        frozenset((one, other))
+        for (one, own), (other, theirs) in itertools.combinations(groups, 2)
+        if all(own[column].isdisjoint(theirs[column]) for column in own)
+    )
 
 
 def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
@@ -378,7 +395,7 @@ def _name_ends(
     """Bounds of a dataset's interval, and whether it is over runs or for this run."""
     medians = row[column]
     low, high, about = names
-    if isinstance(medians, list) and len(medians) > 1:
+    if isinstance(medians, list) and len(medians) >= FEWEST_OF_SPREAD:
         from pipeline.fleet.confidence import bound_typical  # noqa: PLC0415 - heavy
 
         interval, about_which = bound_typical(medians), OVER_RUNS

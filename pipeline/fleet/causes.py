@@ -8,19 +8,18 @@ their squares over the sum of the roots, so the difference of RMS slip is additi
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import format_share
+from pipeline.core import FEWEST_OF_SPREAD, format_share
 from pipeline.core.arrays import Floats
 from pipeline.estimation.apportion import jackknife_ratio
-from pipeline.fleet.confidence import bound_difference
 from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
-from pipeline.fleet.rank_tests import LEVEL, adjust_holm, permute_means, runs_needed
+from pipeline.fleet.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
 
 _LEAST_SHOWN = 0.05
 """Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""
@@ -116,14 +115,17 @@ class Difference:
         return f"{self.b} has {self.total:.2g} m/s more RMS slip than {self.a}: {words}{rest}"
 
 
-def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
-    """Return the budgets of deployments and the decomposition of the difference of every two.
+def compare_causes(
+    rows: pl.DataFrame, *, untested: Collection[frozenset[str]] = ()
+) -> tuple[tuple[Budget, ...], tuple[Difference, ...]]:
+    """Return the budgets of deployments and the decomposition of the difference of two.
 
     A cause that is absent from a run contributes zero there; its slip is part of that run's disturbance.
 
     Args:
         rows: rows of one input and quantity: ``group``, ``run``, ``name``, ``kind``, ``mean_square``,
             ``low``, ``high`` (bounds of the share).
+        untested: pairs of deployments that are not compared.
     """
     own = rows.sort("group", "run").partition_by("group", maintain_order=True)
     groups = [_Group.gather(str(one["group"][0]), one) for one in own]
@@ -131,6 +133,7 @@ def compare_causes(rows: pl.DataFrame) -> tuple[tuple[Budget, ...], tuple[Differ
     pairs = [
         _compare(*sorted(pair, key=lambda group: float(group.table.sum(axis=1).mean())))
         for pair in combinations(groups, 2)
+        if frozenset(group.name for group in pair) not in untested
     ]
     return budgets, tuple(pairs)
 
@@ -173,6 +176,8 @@ class _Group:
             share, half = jackknife_ratio(self.table[:, index], whole)
             if whole.size == 1:
                 half = float(self.half[0, index] / whole[0])
+            elif whole.size < FEWEST_OF_SPREAD:
+                half = math.nan
             parts.append(CausePart(name, kind, share, share - half, share + half))
         parts.sort(key=lambda part: (part.kind != "effect", part.kind, -part.share))
         unit = BLOCKS if whole.size == 1 else RUNS
@@ -190,16 +195,16 @@ def _compare(a: _Group, b: _Group) -> Difference:
         difference = float(second.mean() - first.mean())
         if single:
             half, p = float(np.hypot(half_first[0], half_second[0])), math.nan
+            ends = (difference - half, difference + half)
         else:
-            inside = bound_difference(first, second)
-            half, test = 0.5 * (inside.high - inside.low), permute_means(first, second)
+            test = permute_means(first, second)
+            ends = bound_permuted(first, second) or (math.nan, math.nan)
             p, smallest = test.p, test.smallest_p
-        differences.append((cause, difference, half, p))
+        differences.append((cause, difference, ends, p))
     adjusted = [math.nan] * len(differences) if single else adjust_holm([p for *_, p in differences]).tolist()
     parts = []
-    for ((name, kind), difference, half, p), q in zip(differences, adjusted, strict=True):
-        ends = (scale * (difference - half), scale * (difference + half))
-        parts.append(CauseDifference(name, kind, scale * difference, *ends, p, q))
+    for ((name, kind), difference, (low, high), p), q in zip(differences, adjusted, strict=True):
+        parts.append(CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q))
     parts.sort(key=lambda part: -abs(part.difference))
     note = ABOUT_BLOCKS if single else ""
     if not single and smallest * len(causes) > LEVEL:

@@ -10,6 +10,7 @@ from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
 from pipeline.fleet.rank_tests import (
     DRAWS,
     PermutationTest,
+    bound_permuted,
     check_values,
     cliffs_delta,
     permute_means,
@@ -146,61 +147,6 @@ def bound_typical(medians: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
     return Interval(float(np.exp(interval.low)), float(np.exp(interval.high)), level)
 
 
-def bound_shift(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
-    """Interval of the Hodges-Lehmann shift b - a, with Welch's standard error and degrees of freedom.
-
-    For nearly normal values the variance of the shift is that of the difference of means (within 5 % in the
-    limit of many values), so Welch's interval applies. Source: Welch, Biometrika 34 (1947).
-
-    A side with one value is assumed to have the variance of the other.
-
-    Args:
-        a: one value per unit, shape (n,).
-        b: the same for the other side, shape (m,), n + m >= 3.
-        level: confidence level.
-
-    Raises:
-        StatisticsError: a side is empty, both have a single value, or a value is not finite.
-    """
-    first, second = _check_sides(a, b)
-    return _bound_welch(first, second, shift_between(first, second), level)
-
-
-def bound_difference(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
-    """Welch's interval of the difference of means b - a; sides as in `bound_shift`.
-
-    Args:
-        a: one value per unit, shape (n,).
-        b: the same for the other side, shape (m,), n + m >= 3.
-        level: confidence level.
-
-    Raises:
-        StatisticsError: a side is empty, both have a single value, or a value is not finite.
-    """
-    first, second = _check_sides(a, b)
-    return _bound_welch(first, second, float(second.mean() - first.mean()), level)
-
-
-def _check_sides(a: ArrayLike, b: ArrayLike) -> tuple[Floats, Floats]:
-    first = check_values(a, what="values", fewest=1)
-    return first, check_values(b, what="values", fewest=2 if first.size == 1 else 1)
-
-
-def _bound_welch(first: Floats, second: Floats, centre: float, level: float) -> Interval:
-    scatter = [float(np.var(side, ddof=1)) for side in (first, second) if side.size > 1]
-    freedom = [side.size - 1 for side in (first, second) if side.size > 1]
-    parts = [scatter[0] / first.size, scatter[-1] / second.size]
-    error = sum(parts) ** 0.5
-    if error == 0.0:
-        return Interval(centre, centre, level)
-    if len(freedom) == 1:
-        half = student_quantile(level, freedom[0]) * error
-    else:
-        weights = sum(part**2 / count for part, count in zip(parts, freedom, strict=True))
-        half = student_quantile(level, sum(parts) ** 2 / weights) * error
-    return Interval(centre - half, centre + half, level)
-
-
 def bootstrap_median(
     values: ArrayLike, blocks: ArrayLike, *, level: float = CONFIDENCE, draws: int = 2_000, seed: int = 0
 ) -> Interval:
@@ -274,7 +220,7 @@ class Comparison:
 
     Attributes:
         shift: Hodges-Lehmann shift b - a, in the unit of the values.
-        interval: interval of the shift; None where the scatter of a side is unknown.
+        interval: the differences that the test does not reject; None where it can reject none.
         delta: Cliff's delta of the units, above zero if b is larger.
         test: permutation test of the units' labels.
     """
@@ -305,7 +251,8 @@ class Blocks:
 def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Comparison:
     """Compare datasets by the medians of their runs; a run is the unit, whatever its length.
 
-    The test permutes whole runs (difference of means of the logarithms if all medians are positive).
+    The test permutes whole runs (difference of means of the logarithms if all medians are positive), and the
+    interval holds the differences that it does not reject.
 
     Args:
         a: one median per run, shape (n,).
@@ -316,12 +263,23 @@ def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Co
         StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="run medians"), check_values(b, what="run medians")
+    positive = min(first.min(), second.min()) > 0.0
+    one, other = (np.log(first), np.log(second)) if positive else (first, second)
+    bounds = bound_permuted(one, other, level=1.0 - level)
+    if bounds is not None and positive:
+        bounds = (_spread_ratio(one, other, bounds[0]), _spread_ratio(one, other, bounds[1]))
     return Comparison(
         shift=shift_between(first, second),
-        interval=bound_shift(first, second, level=level) if first.size + second.size > 2 else None,  # noqa: PLR2004 - two runs have no scatter
+        interval=None if bounds is None else Interval(*bounds, level),
         delta=cliffs_delta(first, second),
-        test=permute_means(*_take_logarithms(first, second)),
+        test=permute_means(one, other),
     )
+
+
+def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
+    """Difference of the medians of two sides, from that of their logarithms and the mean of these."""
+    mean, share = float(np.concatenate((a, b)).mean()), b.size / (a.size + b.size)
+    return float(np.exp(mean + (1.0 - share) * difference) - np.exp(mean - share * difference))
 
 
 def compare_blocks(
@@ -329,8 +287,8 @@ def compare_blocks(
 ) -> Comparison:
     """Compare two single runs by the medians of their blocks; this does not compare terrains.
 
-    The test permutes blocks with Welch's t of the medians themselves, so that the test and the interval of
-    the shift refer to the same difference.
+    The test permutes blocks with Welch's t of the medians themselves, and the interval holds the differences
+    that it does not reject.
 
     Args:
         a: one median per block, shape (n,).
@@ -343,11 +301,13 @@ def compare_blocks(
     """
     first, second = check_values(a, what="block medians"), check_values(b, what="block medians")
     few = min(first.size, second.size) < 2  # noqa: PLR2004 - a single block has no scatter
+    permute = permute_means if few else permute_studentized
+    bounds = bound_permuted(first, second, studentized=not few, level=1.0 - level, draws=draws)
     return Comparison(
         shift=shift_between(first, second),
-        interval=None if few else bound_shift(first, second, level=level),
+        interval=None if bounds is None else Interval(*bounds, level),
         delta=cliffs_delta(first, second),
-        test=permute_means(first, second) if few else permute_studentized(first, second, draws=draws),
+        test=permute(first, second, draws=draws),
     )
 
 
@@ -409,9 +369,3 @@ def _rise_together(medians: Floats) -> bool:
         return False
     correlation = float(np.mean(deviation[1:] * deviation[:-1])) / variance
     return bool(correlation > 1.645 / medians.size**0.5)  # 1.645: the 95th percentile of a normal
-
-
-def _take_logarithms(a: Floats, b: Floats) -> tuple[Floats, Floats]:
-    if min(a.min(), b.min()) <= 0.0:
-        return a, b
-    return np.log(a), np.log(b)

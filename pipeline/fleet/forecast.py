@@ -99,9 +99,10 @@ def list_names(effect: str, *, is_dated: bool = False) -> tuple[str, ...]:
 def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     """Fit the parameters of every vehicle.
 
-    A parameter is included if at least one run reports its effect; runs that do not report it contribute the
-    estimate of one step from their fit. Of a run with both inputs the parameters from the command are used.
-    Runs on unknown terrain and parameters at a search bound are excluded, with a note.
+    A parameter is included if at least one run reports its effect, and of the runs whose model contains it:
+    what a model does without is not determined beside it. Of a run with both inputs the parameters from the
+    command are used. Runs on unknown terrain, parameters at a search bound and estimates outside physics are
+    excluded, with a note.
 
     Args:
         estimates: rows of the table `estimates` of all runs.
@@ -114,7 +115,12 @@ def fit_fleet(estimates: pl.DataFrame) -> FleetModel:
     bound = known.filter(pl.col("at_bound")).select("effect").to_series().unique().sort().to_list()
     if bound:
         notes.append(f"numbers at a bound of the search are left out: of {', '.join(bound)} in some runs")
-    numbers = [_fit_number(*number) for number in list_numbers(known)]
+    notes += _note_unphysical(known)
+    numbers = []
+    for vehicle, effect, parameter, rows in list_numbers(known.filter(_find_physical(known))):
+        # A corrected clock is named, and no part of the model.
+        own = rows.filter(pl.col("in_model") | pl.col("named"))
+        numbers.append(_fit_number(vehicle, effect, parameter, own, rows.height - own.height))
     numbers.sort(key=lambda one: (one.vehicle, -one.named, one.effect, one.parameter))
     runs = {
         str(vehicle): tuple(rows["run"].unique().sort().to_list())
@@ -138,6 +144,36 @@ def list_numbers(estimates: pl.DataFrame) -> list[tuple[str, str, str, pl.DataFr
     ]
 
 
+def _find_physical(estimates: pl.DataFrame) -> pl.Series:
+    """Whether each row of `estimates` can be one of physics."""
+    rows = estimates.select("effect", "parameter", "value", "standard_error").iter_rows()
+    return pl.Series(
+        [
+            find_effect(effect)().parameter(name).is_physical(value, error)
+            for effect, name, value, error in rows
+        ],
+        dtype=pl.Boolean,
+    )
+
+
+def _note_unphysical(estimates: pl.DataFrame) -> list[str]:
+    """Notes on numbers of models that are left out because they are outside physics, by parameter."""
+    own = estimates.filter(pl.col("in_model") | pl.col("named"), ~pl.col("at_bound"))
+    out = own.filter(~_find_physical(own)).with_columns(
+        pl.format("{}.{}", "effect", "parameter").alias("label")
+    )
+    return [
+        f"{label} left out, outside the physical range: "
+        + ", ".join(
+            f"{value:.3g} in {run}" for run, value in rows.unique("run", maintain_order=True).iter_rows()
+        )
+        for (label,), rows in out.sort("label", "run")
+        .partition_by("label", as_dict=True, maintain_order=True, include_key=False)
+        .items()
+        for rows in [rows.select("run", "value")]
+    ]
+
+
 def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFrame:
     """Valid rows of `estimates`: not at a bound, with an error, one of two inputs."""
     return (
@@ -148,13 +184,16 @@ def take_numbers(estimates: pl.DataFrame, source: str = "command") -> pl.DataFra
     )
 
 
-def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame) -> FleetNumber:
+def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, without: int) -> FleetNumber:
+    """Fit one parameter to its rows; ``without`` is the number of runs whose model lacks its effect."""
     used, odd = leave_out_odd(rows)
     fit = split_levels(used["value"], used["standard_error"], used["terrain"].to_list())
     declared = find_effect(effect)().parameter(parameter)
     level, because = _take_declared(declared) or decide_level(fit, declared.neutral)
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
+    if without:
+        because += f"; not in the models of {without} other run{'s' * (without != 1)}"
     # A clock offset determined by a gyro was corrected before the fit: no written model contains it.
     is_dated = find_effect(effect).late is Late.POSES and not used["in_model"].any()
     readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
@@ -214,7 +253,7 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         return None, reason
     if fit.p_groups < SURE:
         ends = sorted(fit.groups.items(), key=lambda one: one[1].value)
-        means = ", ".join(f"{name} {mean.value:.3g}" for name, mean in ends)
+        means = ", ".join(f"{name} {mean.value:.3g} ({_count_runs(mean.runs)})" for name, mean in ends)
         return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {means}"
     alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
     inside = fit.interval
@@ -224,6 +263,10 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         spread = f"scatter by {fit.spread_run:.2g} about {fit.value:.3g}"
         return Level.RUN, f"{alike}, and runs {spread} (p = {fit.p_runs:.1g})"
     return None, f"{alike}, and the mean is not significantly different from neutral: more runs are needed"
+
+
+def _count_runs(runs: int) -> str:
+    return f"{runs} run{'s' * (runs != 1)}"
 
 
 def _find_open(fit: LevelFit) -> str | None:
@@ -298,6 +341,11 @@ class ForecastNumber:
     def has_default_spread(self) -> bool:
         """Whether the usual spread between runs is used, because too few runs determine the parameter."""
         return self.runs < FEWEST_OF_SPREAD
+
+    @property
+    def has_interval(self) -> bool:
+        """Whether a model file states its interval: three runs determine it, and no bound cuts it."""
+        return not (self.has_default_spread or self.at_bound)
 
     @property
     def deviation(self) -> float:
@@ -385,7 +433,7 @@ def forecast_vehicle(
         ComparisonError: ``no_such_vehicle``: no run of the vehicle on a known terrain has estimates.
     """
     known = estimates.filter(pl.col("terrain") != UNKNOWN)
-    rows = take_numbers(known, source).filter(pl.col("vehicle") == vehicle)
+    rows = take_numbers(known.filter(_find_physical(known)), source).filter(pl.col("vehicle") == vehicle)
     if rows.is_empty():
         what = f"no run of {vehicle} on a known terrain has estimates"
         hint = f"There are runs of: {', '.join(sorted(set(known['vehicle']))) or 'no vehicle'}."

@@ -310,8 +310,8 @@ class ShiftSearch:
     Attributes:
         shifts: shifts in the order of time.
         level: expected value of each, shape (n,).
-        half: half-width of the simultaneous 95 % band of all n values, shape (n,); NaN without residual
-            degrees of freedom.
+        half: half-width of the simultaneous 95 % band of all n values, shape (n,); NaN with fewer
+            than two residual degrees of freedom.
         freedom: degrees of freedom beside the groups and one step; below `FEWEST_FREE` nothing was tested.
         least: smallest detectable further step at its best position; infinite if none is detectable.
     """
@@ -480,7 +480,7 @@ class _Scan:
         fitted: Floats = self.design @ solved
         count, freedom = self.y.size, self.y.size - self.basis.shape[1]
         half: Floats = np.full(count, math.nan)
-        if freedom > 0:
+        if freedom >= FEWEST_OF_SPREAD - 1:
             scale = math.sqrt(float(np.sum((self.y - fitted) ** 2)) / freedom)
             half = student_quantile(1.0 - (1.0 - CONFIDENCE) / count, freedom) * scale / self.root
         level: Floats = fitted / self.root

@@ -46,11 +46,12 @@ class LevelFit:
 
     Attributes:
         value: the common mean mu.
-        interval: interval of the common mean; None with a single run.
+        interval: interval of the common mean; None with fewer than three runs.
         spread_group, spread_run: standard deviations between groups and between runs of a group; NaN if no
             group has two runs, the first also if there is only one group.
         scatter: standard deviation of the estimates of runs about their group, errors included.
-        groups: means by label; their intervals assume the same scatter in all groups, None without scatter.
+        groups: means by label; their intervals assume the same scatter in all groups, None for a group of
+            fewer than three runs.
         p_groups: p value of equal groups (F test); NaN if it cannot be tested.
         p_runs: p value of no spread between runs within groups (Cochran's Q); NaN likewise.
         chi_square: reduced chi-square of runs within groups relative to their errors; NaN likewise.
@@ -244,7 +245,7 @@ def maximize_likelihood(sample: Sample, *, common: bool) -> tuple[float, float]:
 
 def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
     """Interval of the common mean; its degrees of freedom are those of the nonzero variances."""
-    if sample.y.size < 2:  # noqa: PLR2004 - one value has no scatter
+    if sample.y.size < FEWEST_OF_SPREAD:
         return None
     weight, _, total = sample.weigh(run)
     outer = 1.0 / (between + 1.0 / total)
@@ -284,7 +285,7 @@ def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom:
     means_by_name = {}
     for name, mean, weight, count in zip(names, means.tolist(), total.tolist(), runs.tolist(), strict=True):
         interval = None
-        if freedom:
+        if count >= FEWEST_OF_SPREAD:
             half = student_quantile(CONFIDENCE, freedom) / math.sqrt(weight)
             interval = Interval(mean - half, mean + half, CONFIDENCE)
         means_by_name[name] = GroupMean(mean, interval, count)

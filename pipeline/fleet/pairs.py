@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ import polars as pl
 import polars.selectors as cs
 
 from pipeline.core import pick
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.untrusted import format_csv, number_in
 from pipeline.fleet import MEASURES
 from pipeline.fleet.confidence import (
@@ -31,6 +31,7 @@ from pipeline.fleet.rank_tests import (
     MOST_GROUPS,
     adjust_holm,
     adjust_max_t,
+    find_testable,
     kendall_p,
     kendall_tau,
     mann_whitney,
@@ -116,17 +117,23 @@ class Pair:
         return name_delta(self.comparison.delta)
 
 
-def compare_groups(groups: Sequence[Group]) -> list[Pair]:
-    """Compare every pair of groups.
+def compare_groups(groups: Sequence[Group], *, untested: Collection[frozenset[str]] = ()) -> list[Pair]:
+    """Compare pairs of groups.
 
     Two groups of one run each are compared block by block; the result applies to these two runs only. They
     form a family of their own, corrected after Holm. All other pairs permute whole runs; their family is
-    corrected by max-T, or after Holm for more than eight groups.
+    corrected by max-T, or after Holm for more than eight groups. Pairs that can never be significant do not
+    count in their family (Tarone).
 
     Args:
         groups: groups of at least one run each, with samples.
+        untested: names of pairs that are not compared.
     """
-    numbered = list(itertools.combinations(range(len(groups)), 2))
+    numbered = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(groups)), 2)
+        if frozenset((groups[i].name, groups[j].name)) not in untested
+    ]
     single = [(i, j) for i, j in numbered if len(groups[i].runs) == len(groups[j].runs) == 1]
     several = [pair for pair in numbered if pair not in set(single)]
     return sorted(
@@ -148,20 +155,24 @@ def cut_run(run: Samples) -> Blocks:
 def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
     compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
     by_max_t = len(groups) <= MOST_GROUPS
-    own = [comparison.test.p for comparison in compared]
     draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else FEWER_DRAWS
-    if by_max_t and pairs:
+    own = np.array([comparison.test.p for comparison in compared])
+    smallest = np.array([max(comparison.test.smallest_p, 1.0 / (draws + 1)) for comparison in compared])
+    if by_max_t:
         positive = all(np.all(group.medians > 0.0) for group in groups)
         units = [np.log(group.medians) if positive else group.medians for group in groups]
-        matrix = adjust_max_t(units, draws=draws)
-        adjusted = [max(float(matrix[i, j]), p) for (i, j), p in zip(pairs, own, strict=True)]
+        counted, family = smallest <= LEVEL, 1
+        matrix = adjust_max_t(units, pairs, draws=draws)
+        adjusted = np.maximum([matrix[pair] for pair in pairs], own)[counted]
     else:
-        adjusted = adjust_holm(own).tolist()
-    factor = 1 if by_max_t else len(pairs)
-    correction = _name_correction("max-T" if by_max_t else "Holm", len(pairs))
+        counted, family = find_testable(smallest)
+        adjusted = adjust_holm(own[counted])
+    corrected = _correct(own, counted, family, adjusted)
+    correction = _name_correction("max-T" if by_max_t else "Holm", int(counted.sum()))
     decided = []
-    for (i, j), comparison, p in zip(pairs, compared, adjusted, strict=True):
-        smallest = min(max(comparison.test.smallest_p, 1.0 / (draws + 1)) * factor, 1.0)
+    for (i, j), comparison, p, least, counts in zip(
+        pairs, compared, corrected.tolist(), smallest.tolist(), counted.tolist(), strict=True
+    ):
         kind = "exact" if comparison.test.exact else "random"
         decided.append(
             Pair(
@@ -169,14 +180,21 @@ def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> 
                 b=groups[j],
                 comparison=comparison,
                 p_adjusted=p,
-                smallest_p=smallest,
+                smallest_p=min(least * family, 1.0),
                 unit=RUNS,
-                method=f"{kind} permutation of whole runs{correction}",
+                method=f"{kind} permutation of whole runs{correction * counts}",
                 p_uncorrected=_ask_published(groups[i], groups[j]),
-                note=_note_runs(groups[i], groups[j], smallest, 1 if by_max_t else len(pairs)),
+                note=_note_runs(groups[i], groups[j], least * family, 1 if by_max_t else len(pairs)),
             )
         )
     return decided
+
+
+def _correct(own: Floats, counted: Flags, family: int, adjusted: Floats) -> Floats:
+    """Corrected p of the pairs that count, and of the others one that is above the level."""
+    corrected = np.minimum(own * family, 1.0)
+    corrected[counted] = adjusted
+    return corrected
 
 
 def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
@@ -184,21 +202,27 @@ def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -
     blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
     draws = DRAWS if len(pairs) <= _MANY_PAIRS else FEWER_DRAWS
     compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
-    adjusted = adjust_holm([comparison.test.p for comparison in compared]).tolist()
-    correction = _name_correction("Holm", len(pairs))
+    smallest = np.array([comparison.test.smallest_p for comparison in compared])
+    counted, family = find_testable(smallest)
+    own = np.array([comparison.test.p for comparison in compared])
+    corrected = _correct(own, counted, family, adjust_holm(own[counted]))
+    correction = _name_correction("Holm", int(counted.sum()))
     return [
         Pair(
             a=groups[i],
             b=groups[j],
             comparison=comparison,
             p_adjusted=p,
-            smallest_p=min(comparison.test.smallest_p * len(pairs), 1.0),
+            smallest_p=min(least * family, 1.0),
             unit=BLOCKS,
-            method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks{correction}",
+            method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks"
+            f"{correction * counts}",
             p_uncorrected=_ask_published(groups[i], groups[j]),
-            note=_note_blocks(groups[i], groups[j], comparison.test.smallest_p, len(pairs)),
+            note=_note_blocks(groups[i], groups[j], least, family, len(pairs)),
         )
-        for (i, j), comparison, p in zip(pairs, compared, adjusted, strict=True)
+        for (i, j), comparison, p, least, counts in zip(
+            pairs, compared, corrected.tolist(), smallest.tolist(), counted.tolist(), strict=True
+        )
     ]
 
 
@@ -222,11 +246,11 @@ def _note_runs(a: Group, b: Group, smallest: float, family: int) -> str:
     return "; ".join(notes)
 
 
-def _note_blocks(a: Group, b: Group, smallest: float, pairs: int) -> str:
+def _note_blocks(a: Group, b: Group, smallest: float, family: int, pairs: int) -> str:
     notes = [ABOUT_BLOCKS, *_note_scatter(a.runs[0].values, b.runs[0].values)]
     if smallest > LEVEL:
         notes.append("cannot be significant: too short for enough independent blocks")
-    elif smallest * pairs > LEVEL:
+    elif smallest * family > LEVEL:
         notes.append(f"cannot be significant among {pairs} pairs; compare fewer")
     return "; ".join(notes)
 

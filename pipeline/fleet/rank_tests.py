@@ -1,9 +1,11 @@
 """Rank and permutation tests, and p values corrected for multiple comparisons."""
 
+from __future__ import annotations
+
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -243,7 +245,7 @@ def permute_means(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRA
     Raises:
         StatisticsError: a side is empty or contains a value that is not finite.
     """
-    return _permute(a, b, _differ_by_means, seed=seed, draws=draws)
+    return _Labellings.make(a, b, studentized=False, seed=seed, draws=draws).test
 
 
 def permute_studentized(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int = DRAWS) -> PermutationTest:
@@ -252,7 +254,40 @@ def permute_studentized(a: ArrayLike, b: ArrayLike, *, seed: int = 0, draws: int
     Raises:
         StatisticsError: a side is empty or contains a value that is not finite.
     """
-    return _permute(a, b, _differ_by_welch, seed=seed, draws=draws)
+    return _Labellings.make(a, b, studentized=True, seed=seed, draws=draws).test
+
+
+def bound_permuted(
+    a: ArrayLike,
+    b: ArrayLike,
+    *,
+    studentized: bool = False,
+    level: float = LEVEL,
+    seed: int = 0,
+    draws: int = DRAWS,
+) -> tuple[float, float] | None:
+    """Bounds of the difference b - a: the shifts of b that the permutation test does not reject.
+
+    They exclude zero exactly if the test's p is at most ``level``. Source: Good, Permutation, Parametric and
+    Bootstrap Tests of Hypotheses (2005), section 3.2.
+
+    Args:
+        a: one value per unit, shape (n,).
+        b: the same for the other side, shape (m,).
+        studentized: whether the test is `permute_studentized`, else `permute_means`.
+        level: probability of bounds that miss the difference.
+        seed: seed of the random labellings.
+        draws: number of random labellings.
+
+    Returns:
+        None if the units are too few for a p of ``level``: no shift can be rejected.
+
+    Raises:
+        StatisticsError: a side is empty or contains a value that is not finite.
+    """
+    labellings = _Labellings.make(a, b, studentized=studentized, seed=seed, draws=draws)
+    low, high = (labellings.find_end(direction, level) for direction in (-1.0, 1.0))
+    return None if low is None or high is None else (low, high)
 
 
 def smallest_p(first: int, second: int, *, draws: int = DRAWS) -> float:
@@ -287,51 +322,107 @@ def list_labellings(first: int, second: int, *, seed: int, draws: int = DRAWS) -
     return marks
 
 
-def _permute(
-    a: ArrayLike,
-    b: ArrayLike,
-    statistic: Callable[[Floats, Flags], Floats],
-    *,
-    seed: int,
-    draws: int,
-) -> PermutationTest:
-    first, second = check_values(a, what="values"), check_values(b, what="values")
-    values = np.concatenate((first, second))
-    values = values - values.mean()
-    marks = list_labellings(first.size, second.size, seed=seed, draws=draws)
-    statistics = np.abs(statistic(values, marks))
-    given = np.zeros((1, values.size), dtype=bool)
-    given[0, : first.size] = True
-    observed = float(np.abs(statistic(values, given))[0])
-    as_extreme = int(np.count_nonzero(statistics >= observed - TIE * float(statistics.max())))
-    total = math.comb(values.size, first.size)
-    return PermutationTest(
-        p=as_extreme / statistics.size,
-        smallest_p=smallest_p(first.size, second.size, draws=draws),
-        arrangements=statistics.size,
-        exact=total <= LARGEST_EXACT,
-    )
+_DOUBLINGS = 60
+"""Largest number of doublings of a distance: the last is beyond any shift that a double can resolve."""
+_HALVINGS = 40
+"""Halvings of a distance: the last digits of a double are left."""
 
 
-def _differ_by_means(values: Floats, marks: Flags) -> Floats:
-    first = marks.sum(axis=1)
-    total = float(values.sum())
-    inside: Floats = marks @ values
-    difference: Floats = (total - inside) / (values.size - first) - inside / first
-    return difference
+@dataclass(frozen=True)
+class _Labellings:
+    """All labellings of the units of two sides, or random ones; the first is the given one.
 
+    Attributes:
+        values: of all units about their mean, those of the first side before those of the second, shape (n,).
+        marks: which units belong to the first side, shape (labellings, n).
+        studentized: whether Welch's t is compared between labellings, else the difference of means.
+        draws: number of random labellings.
+    """
 
-def _differ_by_welch(values: Floats, marks: Flags) -> Floats:
-    first = marks.sum(axis=1)
-    second = values.size - first
-    sums, squares = marks @ values, marks @ values**2
-    mean_first, mean_second = sums / first, (values.sum() - sums) / second
-    spread_first = (squares / first - mean_first**2) / np.maximum(first - 1, 1)
-    spread_right = ((np.sum(values**2) - squares) / second - mean_second**2) / np.maximum(second - 1, 1)
-    error = np.sqrt(np.maximum(spread_first + spread_right, 0.0))
-    floor = TIE * max(float(np.abs(values).max()), 1.0e-300)
-    difference: Floats = (mean_second - mean_first) / np.maximum(error, floor)
-    return difference
+    values: Floats
+    marks: Flags
+    studentized: bool
+    draws: int
+
+    @classmethod
+    def make(cls, a: ArrayLike, b: ArrayLike, *, studentized: bool, seed: int, draws: int) -> _Labellings:
+        """List the labellings of the units of both sides."""
+        first, second = check_values(a, what="values"), check_values(b, what="values")
+        values = np.concatenate((first, second))
+        marks = list_labellings(first.size, second.size, seed=seed, draws=draws)
+        return cls(values - values.mean(), marks, studentized, draws)
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """Numbers of units of both sides."""
+        first = int(np.count_nonzero(self.marks[0]))
+        return first, self.values.size - first
+
+    @property
+    def test(self) -> PermutationTest:
+        """The test of equal sides."""
+        first, second = self.sizes
+        return PermutationTest(
+            p=self.find_p(0.0),
+            smallest_p=smallest_p(first, second, draws=self.draws),
+            arrangements=self.marks.shape[0],
+            exact=math.comb(first + second, first) <= LARGEST_EXACT,
+        )
+
+    @functools.cached_property
+    def _sums(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Sums over the first side: of values, of units of the second side, of squares, of their values."""
+        other = (~self.marks[0]).astype(np.float64)
+        columns = np.column_stack((self.values, other, self.values**2, self.values * other))
+        sums: Floats = self.marks @ columns
+        return sums[:, 0], sums[:, 1], sums[:, 2], sums[:, 3]
+
+    def find_p(self, shift: float) -> float:
+        """Two-sided p of the hypothesis that the second side is the first one plus a shift."""
+        statistics = self._differ(shift)
+        as_extreme = np.count_nonzero(statistics >= statistics[0] - TIE * float(statistics.max()))
+        return int(as_extreme) / statistics.size
+
+    def _differ(self, shift: float) -> Floats:
+        """Size of the statistic of each labelling, with the shift taken off the second side."""
+        (first, second), (sums, others, squares, products) = self.sizes, self._sums
+        moved = self.values - shift * ~self.marks[0]
+        sums = sums - shift * others
+        mean_first, mean_second = sums / first, (moved.sum() - sums) / second
+        difference: Floats = np.abs(mean_second - mean_first)
+        if not self.studentized:
+            return difference
+        whole = float(moved @ moved)
+        squares = squares - 2.0 * shift * products + shift**2 * others
+        spread_first = (squares / first - mean_first**2) / max(first - 1, 1)
+        spread_second = ((whole - squares) / second - mean_second**2) / max(second - 1, 1)
+        error = np.sqrt(np.maximum(spread_first + spread_second, 0.0))
+        studentized: Floats = difference / np.maximum(error, TIE * max(math.sqrt(whole), 1.0e-300))
+        return studentized
+
+    def find_end(self, direction: float, level: float) -> float | None:
+        """The last shift in a direction from the observed one that is not rejected; None without an end."""
+        first, _ = self.sizes
+        inner = float(self.values[first:].mean() - self.values[:first].mean())
+        extent = float(np.ptp(self.values))
+        if smallest_p(*self.sizes, draws=self.draws) > level:
+            return None
+        if extent == 0.0:
+            return inner
+        outer = inner + direction * extent
+        # Zero is on the side of the interval on which its own test puts it.
+        if direction * inner < 0.0:
+            inner, outer = (0.0, direction * extent) if self.find_p(0.0) > level else (inner, 0.0)
+        for _ in range(_DOUBLINGS):
+            if self.find_p(outer) <= level:
+                break
+            inner, outer = outer, outer + 2.0 * (outer - inner)
+        else:
+            return None
+        for _ in range(_HALVINGS):
+            middle = 0.5 * (inner + outer)
+            inner, outer = (middle, outer) if self.find_p(middle) > level else (inner, middle)
+        return inner
 
 
 MOST_GROUPS = 8
@@ -360,24 +451,51 @@ def adjust_holm(p_values: ArrayLike) -> Floats:
     return corrected
 
 
-def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRAWS) -> Floats:
-    """Corrected p of every pair of groups: closed testing with the largest difference (max-T).
+def find_testable(smallest: ArrayLike, *, level: float = LEVEL) -> tuple[Flags, int]:
+    """The pairs that can be significant beside each other, and the number for which to correct.
 
-    A pair is called different only if every hypothesis in which it is equal, together with any other groups,
+    A pair whose smallest p is above the level over that number is never significant, whatever its data, and
+    does not count. Source: Tarone, Biometrics 46 (1990).
+
+    Args:
+        smallest: smallest p possible of each pair, shape (n,).
+        level: significance level.
+    """
+    values = check_values(smallest, what="smallest p", fewest=0)
+    for count in range(1, values.size + 1):
+        testable: Flags = values * count <= level
+        if np.count_nonzero(testable) <= count:
+            return testable, count
+    return np.zeros(0, dtype=bool), 1
+
+
+def adjust_max_t(
+    groups: Sequence[ArrayLike],
+    pairs: Collection[tuple[int, int]] | None = None,
+    *,
+    seed: int = 0,
+    draws: int = DRAWS,
+) -> Floats:
+    """Corrected p of pairs of groups: closed testing with the largest difference (max-T).
+
+    A pair is called different only if every hypothesis in which it is equal, together with any other pairs,
     is rejected. Each hypothesis splits the groups into sets of equal ones. Its test relabels the units within
     each set and takes the largest weighted difference of means, so it is exact, and the familywise error is
     controlled for any true configuration. For few runs it is more powerful than `adjust_holm`: a large
-    difference keeps the p of its own pair. Sources: Marcus, Peritz and Gabriel, Biometrika 63 (1976);
+    difference keeps the p of its own pair. A hypothesis is tested by its pairs that count after Tarone
+    (`find_testable`), if it has any: groups of few runs would only hide differences of others. Pairs whose
+    smallest p is above the level are left out. Sources: Marcus, Peritz and Gabriel, Biometrika 63 (1976);
     Westfall and Young, Resampling-Based Multiple Testing (1993).
 
     Args:
-        groups: units of each group (usually logarithms of run medians); at most `MOST_GROUPS` groups. Pairs
-            of two groups with a single unit each are excluded from the family.
+        groups: units of each group (usually logarithms of run medians); at most `MOST_GROUPS` groups.
+        pairs: the pairs of groups to test, each as (lower index, higher index); all by default.
         seed: seed of random labellings, used above `LARGEST_EXACT` labellings.
         draws: number of random labellings.
 
     Returns:
-        Corrected p values, symmetric, one on the diagonal and for excluded pairs, shape (groups, groups).
+        Corrected p values, symmetric, one on the diagonal and for pairs that are left out, shape
+        (groups, groups).
 
     Raises:
         StatisticsError: a group is empty or contains a value that is not finite.
@@ -386,29 +504,44 @@ def adjust_max_t(groups: Sequence[ArrayLike], *, seed: int = 0, draws: int = DRA
     if len(groups) > MOST_GROUPS:
         raise ValueError(f"closed testing takes at most {MOST_GROUPS} groups, not {len(groups)}")
     values = [check_values(group, what="values of a group") for group in groups]
-    count = len(values)
-    nulls = {
-        chosen: _list_largest([values[i] for i in chosen], seed=seed, draws=draws)
-        for size in range(2, count + 1)
-        for chosen in itertools.combinations(range(count), size)
-    }
-    corrected = np.zeros((count, count))
-    for partition in _list_partitions(tuple(range(count))):
-        sets = [chosen for chosen in partition if len(chosen) > 1]
-        if not sets:
+    asked = list(itertools.combinations(range(len(values)), 2) if pairs is None else pairs)
+    smallest = np.array([smallest_p(values[i].size, values[j].size, draws=draws) for i, j in asked])
+    possible = {asked[index] for index in np.flatnonzero(smallest <= LEVEL)}
+    testable = {asked[index] for index in np.flatnonzero(find_testable(smallest)[0])}
+    nulls: dict[tuple[int, ...], tuple[float, Floats]] = {}
+    corrected = dict.fromkeys(possible, 0.0)
+    for partition in _list_partitions(tuple(range(len(values)))):
+        equal = {pair for pair in possible if any(set(pair) <= set(chosen) for chosen in partition)}
+        # A set that the pairs do not connect is the union of others.
+        if not equal or _connect(equal) != sorted(chosen for chosen in partition if len(chosen) > 1):
             continue
+        counted = equal & testable or equal
+        sets = _connect(counted)
+        for chosen in sets:
+            if chosen not in nulls:
+                within = [(chosen.index(i), chosen.index(j)) for i, j in counted if {i, j} <= set(chosen)]
+                units = [values[i] for i in chosen]
+                nulls[chosen] = _list_largest(units, within, seed=seed, draws=draws)
         observed = max(nulls[chosen][0] for chosen in sets)
         tie = TIE * max(float(nulls[chosen][1].max()) for chosen in sets)
         none_above = 1.0
         for chosen in sets:
             none_above *= 1.0 - float(np.mean(nulls[chosen][1] >= observed - tie))
-        for chosen in sets:
-            for i, j in itertools.combinations(chosen, 2):
-                corrected[i, j] = corrected[j, i] = max(corrected[i, j], 1.0 - none_above)
-    for i, j in itertools.product(range(count), repeat=2):
-        if i == j or values[i].size == values[j].size == 1:
-            corrected[i, j] = 1.0
-    return np.minimum(corrected, 1.0)
+        for pair in equal:
+            corrected[pair] = max(corrected[pair], 1.0 - none_above)
+    matrix = np.ones((len(values), len(values)))
+    for (i, j), p in corrected.items():
+        matrix[i, j] = matrix[j, i] = min(p, 1.0)
+    return matrix
+
+
+def _connect(pairs: Iterable[tuple[int, int]]) -> list[tuple[int, ...]]:
+    """The sets of groups that pairs connect, in order."""
+    sets: list[set[int]] = []
+    for pair in pairs:
+        joined = set(pair).union(*(one for one in sets if not one.isdisjoint(pair)))
+        sets = [*(one for one in sets if one.isdisjoint(pair)), joined]
+    return sorted(tuple(sorted(one)) for one in sets)
 
 
 def runs_needed(pairs: int, *, level: float = LEVEL) -> int:
@@ -422,8 +555,10 @@ def runs_needed(pairs: int, *, level: float = LEVEL) -> int:
     return _MOST_RUNS
 
 
-def _list_largest(groups: list[Floats], *, seed: int, draws: int) -> tuple[float, Floats]:
-    """Largest weighted difference between any two of the groups: observed, and for every labelling."""
+def _list_largest(
+    groups: list[Floats], pairs: Sequence[tuple[int, int]], *, seed: int, draws: int
+) -> tuple[float, Floats]:
+    """Largest weighted difference between pairs of the groups: observed, and for every labelling."""
     sizes = np.array([group.size for group in groups])
     values = np.concatenate(groups)
     values = values - values.mean()
@@ -431,14 +566,14 @@ def _list_largest(groups: list[Floats], *, seed: int, draws: int) -> tuple[float
     rows = _list_labels(tuple(sizes.tolist()), seed, draws)
     means = np.stack([(rows == i) @ values / sizes[i] for i in range(sizes.size)], axis=1)
     given = np.array([values[labels == i].mean() for i in range(sizes.size)])[None, :]
-    return float(_take_largest(given, sizes)[0]), _take_largest(means, sizes)
+    return float(_take_largest(given, sizes, pairs)[0]), _take_largest(means, sizes, pairs)
 
 
-def _take_largest(means: Floats, sizes: np.ndarray[tuple[int], np.dtype[np.int_]]) -> Floats:
+def _take_largest(
+    means: Floats, sizes: np.ndarray[tuple[int], np.dtype[np.int_]], pairs: Sequence[tuple[int, int]]
+) -> Floats:
     largest = np.zeros(means.shape[0])
-    for i, j in itertools.combinations(range(sizes.size), 2):
-        if sizes[i] == sizes[j] == 1:
-            continue
+    for i, j in pairs:
         weight = math.sqrt(sizes[i] * sizes[j] / (sizes[i] + sizes[j]))
         largest = np.maximum(largest, weight * np.abs(means[:, i] - means[:, j]))
     return largest

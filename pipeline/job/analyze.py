@@ -352,6 +352,7 @@ def _details(work: Work, log: Mapping[str, JSON], sha256: str) -> dict[str, JSON
         "terrain": work.setup.terrain,
         "dataset": work.setup.dataset,
         "versions": cast("JSON", list_versions(work)),
+        **({"simulated": True} if work.setup.index.is_simulated else {}),
     }
 
 

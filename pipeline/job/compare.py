@@ -1,18 +1,19 @@
 """Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import read_version
+from pipeline.core import FEWEST_OF_SPREAD, read_version
 from pipeline.core.arrays import Ints
 from pipeline.fleet import (
     OVER_RUNS,
     THIS_RUN,
     add_measures,
+    find_unrelated,
     gather_runs,
     measure_difficulty,
     pool_runs,
@@ -33,7 +34,7 @@ from pipeline.fleet.pairs import (
     write_latex,
 )
 from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
-from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
+from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
 from pipeline.report import Picture
 from pipeline.stages.slip_stage import WINDOW_S
 from pipeline.store import Store
@@ -228,11 +229,16 @@ class Question:
         by: columns that define a dataset.
         input: input u; None: the command if every run has one, else the measured wheels.
         as_published: compare the window norms of the published chain instead of the median slip modulus.
+        datasets: compare only these, each with every other; all if empty, and of those that differ in both
+            vehicle and terrain no test.
+        vehicle: compare only runs of this vehicle; of any if empty.
     """
 
     by: tuple[str, ...] = ("dataset",)
     input: str | None = None
     as_published: bool = False
+    datasets: tuple[str, ...] = ()
+    vehicle: str = ""
 
 
 def compare_results(store: Store, question: Question) -> Answer:
@@ -240,9 +246,10 @@ def compare_results(store: Store, question: Question) -> Answer:
 
     Raises:
         JobError: ``nothing_to_compare``.
-        ComparisonError: ``no_such_column``.
+        ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
     """
     compared = find_material(store, question.by, trusted_only=True)
+    compared = choose_runs(compared, question.vehicle, question.datasets)
     compared, runs, notes = measure_runs(compared)
     if runs.is_empty():
         what = "there is no run whose numbers can be compared"
@@ -261,7 +268,8 @@ def compare_results(store: Store, question: Question) -> Answer:
     if missing:
         notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
     groups = _group(compared, samples)
-    pairs = compare_groups(groups)
+    untested = find_untested(compared, question)
+    pairs = compare_groups(groups, untested=untested)
     single = _find_single(compared)
     datasets = pool_runs(
         runs,
@@ -274,9 +282,24 @@ def compare_results(store: Store, question: Question) -> Answer:
     )
     windows = _tabulate_windows(samples, chosen) if question.as_published else compared.scan("windows")
     boxes = spread_windows(windows, compared.labels.select("run", "group"))
-    all_notes = (*compared.notes, *notes, *_sum_up(pairs, groups))
+    all_notes = (*compared.notes, *notes, *_sum_up(pairs, groups), *note_untested(untested))
     intervals = _list_intervals(groups, datasets, chosen, quantity)
     return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
+
+
+def find_untested(compared: ComparedRuns, question: Question) -> frozenset[frozenset[str]]:
+    """Pairs of datasets without a test; none where datasets are named."""
+    return frozenset() if question.datasets else find_unrelated(compared.labels)
+
+
+def note_untested(untested: Collection[frozenset[str]]) -> list[str]:
+    """The note on pairs of datasets without a test."""
+    if not untested:
+        return []
+    first, second = sorted(min(untested, key=sorted))
+    pairs = f"{len(untested)} pairs" if len(untested) > 1 else "1 pair"
+    why = "with neither vehicle nor terrain in common"
+    return [f"{pairs} of datasets {why}: no test, unless named, as in: slip compare {first} {second}"]
 
 
 def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
@@ -329,11 +352,11 @@ def _doubt_commands(compared: ComparedRuns) -> list[str]:
 
 
 def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:
-    members: dict[str, list[Samples]] = {}
-    for run, group in compared.labels.select("run", "group").sort("group", "run").iter_rows():
-        if run in samples:
-            members.setdefault(group, []).append(samples[run])
-    return [Group(name, tuple(runs)) for name, runs in members.items()]
+    known = compared.labels.filter(pl.col("run").is_in(list(samples))).sort("group", "run")
+    return [
+        Group(str(name), tuple(samples[run] for run in rows["run"]))
+        for (name,), rows in known.partition_by("group", as_dict=True, maintain_order=True).items()
+    ]
 
 
 def _find_single(compared: ComparedRuns) -> list[str]:
@@ -358,10 +381,13 @@ def _list_intervals(
         return own.select("dataset", pl.col(quantity).alias("value"), "low", "high", "interval")
     rows = []
     for group in groups:
-        several = len(group.runs) > 1
-        interval = bound_typical(group.medians) if several else bound_run(group.runs[0])
-        about = OVER_RUNS if several else THIS_RUN
-        rows.append((group.name, float(np.median(group.medians)), interval.low, interval.high, about))
+        interval, about = None, ""
+        if len(group.runs) >= FEWEST_OF_SPREAD:
+            interval, about = bound_typical(group.medians), OVER_RUNS
+        elif len(group.runs) == 1:
+            interval, about = bound_run(group.runs[0]), THIS_RUN
+        ends = (None, None) if interval is None else (interval.low, interval.high)
+        rows.append((group.name, float(np.median(group.medians)), *ends, about))
     kinds = {
         "dataset": pl.String,
         **dict.fromkeys(("value", "low", "high"), pl.Float64),

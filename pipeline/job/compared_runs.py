@@ -5,17 +5,20 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
+from pipeline.core import guess_names
 from pipeline.estimation.verdict import find_refusal
-from pipeline.fleet import label_runs
-from pipeline.job.run_results import DIAGNOSED
+from pipeline.fleet import ComparisonError, label_runs
+from pipeline.job.run_results import DIAGNOSED, DIAGNOSIS
 from pipeline.models.catalogue import list_effects
-from pipeline.store import Manifest, Store
+from pipeline.stages.checks import find_gain, is_grip
+from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.names import date_runs
 from pipeline.store.parquet_tables import scan_table
 from schemas import contract_of
 
 _DATES = ("day", "month", "year")
 _TABLES = ("aggregates", "slip")
+_RADIUS = "wheel_radius_wrong"
 _SCHEMA = {
     "run": pl.String,
     "key": pl.String,
@@ -73,7 +76,7 @@ def find_material(
 
     Excluded with a note are runs with a damaged table, whichever it is, duplicates of a recording, tables
     of another contract version, and runs without a group; with ``trusted_only`` also runs with a finding
-    that forbids conclusions.
+    that forbids conclusions. Simulated runs are left out where there are recordings.
 
     Args:
         store: the results.
@@ -89,6 +92,7 @@ def find_material(
     optional = (*optional, "findings") if trusted_only else optional
     survey = store.survey()
     notes = [f"left out, damaged: {error}" for error in survey.errors]
+    reasons: dict[str, list[str]] = {}
     manifests: dict[str, Manifest] = {}
     holders: dict[str, str] = {}
     refusals: dict[str, str] = {}
@@ -101,10 +105,11 @@ def find_material(
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
-            notes.append(f"left out, {reason}: {manifest.run}")
+            reasons.setdefault(reason, []).append(manifest.run)
             continue
         holders[digest] = manifest.run
         manifests[manifest.run] = manifest
+    notes += [_note_left_out(reason, runs) for reason, runs in reasons.items()]
     # Runs that are left out date the others all the same.
     days = date_runs({manifest.run: manifest.start_ns for manifest in survey.manifests}).days
     date_notes = date_runs({run: manifest.start_ns for run, manifest in manifests.items()}).notes
@@ -118,7 +123,44 @@ def find_material(
     compared = ComparedRuns(labels, manifests, store, tuple(notes), refusals, date_notes)
     reason = f"{' and '.join(by)} unknown, not pooled"
     compared = _leave_out(compared, pl.col("group").is_null(), reason)
-    return _leave_out_untrusted(compared) if trusted_only else compared
+    compared = _leave_out_untrusted(compared) if trusted_only else compared
+    simulated = [run for run, manifest in compared.manifests.items() if manifest.details.get("simulated")]
+    if len(simulated) == len(compared.manifests):
+        return compared
+    reason = "simulated, and never pooled with recordings"
+    return _leave_out(compared, pl.col("run").is_in(simulated), reason)
+
+
+def choose_runs(compared: ComparedRuns, vehicle: str, groups: Sequence[str]) -> ComparedRuns:
+    """Restrict a comparison to the runs that a user named; nothing is noted on the others.
+
+    Args:
+        compared: the runs.
+        vehicle: of these runs; of any if empty.
+        groups: at least two; all if empty.
+
+    Raises:
+        ComparisonError: ``no_such_vehicle``, ``no_such_dataset``, or ``nothing_to_compare``: one dataset.
+    """
+    rows = compared.labels
+    if vehicle:
+        known = sorted(set(rows["vehicle"]))
+        if vehicle not in known:
+            hint = f"{guess_names(vehicle, known)}There are runs of: {', '.join(known) or 'no vehicle'}."
+            raise ComparisonError("no_such_vehicle", f"no run is of {vehicle}", hint=hint)
+        rows = rows.filter(pl.col("vehicle") == vehicle)
+    known = sorted(set(rows["group"]))
+    for group in groups:
+        if group not in known:
+            hint = f"{guess_names(group, known)}There are: {', '.join(known) or 'none'}."
+            raise ComparisonError("no_such_dataset", f"no dataset is called {group}", hint=hint)
+    if len(set(groups)) == 1:
+        hint = "Name another one, too, or none to compare all."
+        raise ComparisonError("nothing_to_compare", f"{groups[0]} is one dataset", hint=hint)
+    rows = rows.filter(pl.col("group").is_in(list(groups))) if groups else rows
+    runs = set(rows["run"])
+    manifests = {run: manifest for run, manifest in compared.manifests.items() if run in runs}
+    return replace(compared, labels=rows, manifests=manifests)
 
 
 def keep_runs(compared: ComparedRuns, runs: Sequence[str], reason: str) -> ComparedRuns:
@@ -131,9 +173,13 @@ def _leave_out(compared: ComparedRuns, which: pl.Expr, reason: str) -> ComparedR
     if not gone:
         return compared
     remaining = {run: manifest for run, manifest in compared.manifests.items() if run not in set(gone)}
-    note = f"left out, {reason}: {', '.join(gone)}"
-    notes = (*compared.notes, note)
+    notes = (*compared.notes, _note_left_out(reason, gone))
     return replace(compared, labels=compared.labels.filter(~which), manifests=remaining, notes=notes)
+
+
+def _note_left_out(reason: str, runs: Sequence[str]) -> str:
+    count = f" ({len(runs)} runs)" if len(runs) > 1 else ""
+    return f"left out, {reason}{count}: {', '.join(runs)}"
 
 
 def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
@@ -149,9 +195,47 @@ def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
         .sort("run", "id")
         .collect()
     )
-    for (finding,), rows in sorted(grave.partition_by("id", as_dict=True).items()):
+    slippery = _find_slippery(compared) if _RADIUS in set(grave["id"]) else []
+    if slippery:
+        reason = "slippery ground and no wrong wheel radius, by other runs of the same vehicle"
+        compared = replace(compared, notes=(*compared.notes, f"{reason}: {', '.join(slippery)}"))
+    is_grip = (pl.col("id") == _RADIUS) & pl.col("run").is_in(slippery)
+    for (finding,), rows in sorted(grave.filter(~is_grip).partition_by("id", as_dict=True).items()):
         compared = _leave_out(compared, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
     return compared
+
+
+def _find_slippery(compared: ComparedRuns) -> list[str]:
+    """Runs whose finding of a wrong wheel radius other runs with the same data sheet contradict."""
+    sheets = {
+        run: str([manifest.part("vehicle").get(key) for key in ("id", "name", "wheel_radius_m")])
+        for run, manifest in compared.manifests.items()
+    }
+    claims = compared.scan("findings").filter(pl.col("id") == _RADIUS).select("run", "value").collect()
+    claimed = {run: value for run, value in claims.iter_rows() if value is not None}
+    asked = {sheets[run] for run in claimed}
+    siblings = [
+        manifest
+        for run, manifest in compared.manifests.items()
+        if sheets[run] in asked and run not in claimed and not manifest.find_damage(["slip"])
+    ]
+    driven = (
+        scan_table("slip", root=compared.store.root, manifests=siblings)
+        .filter(pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"))
+        .select("run", "f_x", "v_x", "transitory")
+        .collect()
+    )
+    gains: dict[str, list[float]] = {}
+    for (run,), rows in driven.partition_by("run", as_dict=True).items():
+        gain = find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy(), ~rows["transitory"].to_numpy())
+        if gain is not None:
+            gains.setdefault(sheets[str(run)], []).append(gain)
+    slippery = []
+    for run, value in sorted(claimed.items()):
+        radius = compared.manifests[run].part("vehicle").get("wheel_radius_m")
+        if isinstance(radius, (int, float)) and is_grip(value / radius, gains.get(sheets[run], [])):
+            slippery.append(run)
+    return slippery
 
 
 def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
@@ -159,6 +243,8 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
     for name in tables:
         entry = manifest.tables.get(name)
         if entry is None:
+            if name in DIAGNOSED and DIAGNOSIS in manifest.files:
+                return _explain_empty(manifest)
             how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
             return f"it has no table {name}; {how}"
         if entry.contract_version != contract_of(name).version:
@@ -167,6 +253,16 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
                 f"{contract_of(name).version}; analyze its log again"
             )
     return ""
+
+
+def _explain_empty(manifest: Manifest) -> str:
+    """Reason why a diagnosis gave no numbers."""
+    try:
+        findings = manifest.read_json(DIAGNOSIS).get("findings")
+    except StoreError:
+        findings = None
+    ids = [one.get("id") for one in findings if isinstance(one, dict)] if isinstance(findings, list) else []
+    return "too short to be diagnosed alone" if "too_short" in ids else "its diagnosis gave no numbers"
 
 
 def find_run_refusal(manifest: Manifest) -> str:

@@ -36,8 +36,16 @@ from pipeline.fleet.trend import (
     summarize_parameter,
 )
 from pipeline.job import FigureFormat, JobError, lack_runs
-from pipeline.job.compare import choose_input, measure_runs, write_figures, write_tables
-from pipeline.job.compared_runs import ComparedRuns, find_material, keep_runs, read_digest
+from pipeline.job.compare import (
+    Question,
+    choose_input,
+    find_untested,
+    measure_runs,
+    note_untested,
+    write_figures,
+    write_tables,
+)
+from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
 from pipeline.job.prediction import fit_results
 from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.store import Store
@@ -45,19 +53,20 @@ from pipeline.store import Store
 _EFFECT = "effect"
 
 
-def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
+def find_causes(store: Store, question: Question) -> Causes:
     """Compare the datasets of the results by cause; nothing is written.
 
     Args:
         store: the results.
-        by: columns that define a dataset.
-        chosen: input u; None: the command if every run has a budget on it, else the measured wheels.
+        question: what to compare; its input, if None, is the command if every run has a budget on it, else
+            the measured wheels.
 
     Raises:
         JobError: ``nothing_to_compare``.
-        ComparisonError: ``no_such_column``.
+        ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
     """
-    compared = find_material(store, by, trusted_only=True, tables=("budget", "estimates"))
+    compared = find_material(store, question.by, trusted_only=True, tables=("budget", "estimates"))
+    compared = choose_runs(compared, question.vehicle, question.datasets)
     rows = pl.DataFrame()
     if compared.manifests:
         rows = (
@@ -72,15 +81,17 @@ def find_causes(store: Store, by: Sequence[str], chosen: str | None) -> Causes:
         what = "no run has a budget of its slip"
         raise lack_runs("nothing_to_compare", what, store.root, hint, compared.notes)
     on_command = rows.filter(pl.col("input") == "command")["run"].n_unique()
-    source = chosen or ("command" if on_command == rows["run"].n_unique() else "measured")
+    source = question.input or ("command" if on_command == rows["run"].n_unique() else "measured")
     own = rows.filter(pl.col("input") == source)
     compared = keep_runs(compared, own["run"].unique().to_list(), f"no budget of its slip on {source}")
     if own.is_empty():
         what = f"no run has a budget of its slip on {source}"
         raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
-    budgets, differences = compare_causes(own)
+    untested = find_untested(compared, question)
+    budgets, differences = compare_causes(own, untested=untested)
     keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
-    return Causes(budgets, differences, source, _find_names(store), keys, compared.notes)
+    notes = (*compared.notes, *note_untested(untested))
+    return Causes(budgets, differences, source, _find_names(store), keys, notes)
 
 
 def _find_names(store: Store) -> dict[str, str]:

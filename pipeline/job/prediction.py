@@ -12,7 +12,15 @@ from typing import cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import CONFIDENCE, SlipError, enumerate_texts, finite_or_none, guess_names, pick
+from pipeline.core import (
+    CONFIDENCE,
+    FEWEST_OF_SPREAD,
+    SlipError,
+    enumerate_texts,
+    finite_or_none,
+    guess_names,
+    pick,
+)
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.core.untrusted import read_bounded
 from pipeline.estimation.comparison import Comparison, Input
@@ -461,7 +469,7 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     effects: dict[str, dict[str, object]] = {}
     for number in forecast.numbers:
         low, high = number.ends
-        ends = {"value": number.value, "low": low, "high": high}
+        ends = _summarize_ends(Expected(number.value, Interval(low, high, CONFIDENCE)), number.runs)
         numbers = effects.setdefault(number.effect, {})
         numbers[number.parameter] = {
             **ends,
@@ -471,9 +479,10 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     return {
         **pick(forecast, "vehicle", "terrain", "input"),
         "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
-        "t_mrmse_m": _summarize_ends(prediction.t_mrmse_m),
-        "ideal_t_mrmse_m": _summarize_ends(prediction.ideal_t_mrmse_m),
-        "median_modulus": _summarize_ends(prediction.median_modulus),
+        **{
+            key: _summarize_ends(getattr(prediction, key), len(prediction.runs_used))
+            for key in ("t_mrmse_m", "ideal_t_mrmse_m", "median_modulus")
+        },
         "runs_on_terrain": len(forecast.here),
         "runs_elsewhere": len(forecast.elsewhere),
         "runs_used": list(prediction.runs_used),
@@ -481,16 +490,18 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     }
 
 
-def _summarize_ends(number: Expected) -> dict[str, float]:
-    return {"value": number.value, "low": number.interval.low, "high": number.interval.high}
+def _summarize_ends(number: Expected, runs: int) -> dict[str, float | None]:
+    """A value with its interval, which is not given from fewer than three runs."""
+    ends = (number.interval.low, number.interval.high) if runs >= FEWEST_OF_SPREAD else (None, None)
+    return {"value": number.value, "low": ends[0], "high": ends[1]}
 
 
 def make_model_file(prediction: Prediction) -> ModelFile:
-    """Model file of the forecast, with the intervals of the parameters that are not at a bound."""
+    """Model file of the forecast, with the intervals of three runs or more that end at no bound."""
     forecast = prediction.forecast
     there = f"{len(forecast.here)} runs on {forecast.terrain}, {len(forecast.elsewhere)} elsewhere"
     return ModelFile(
         Model(prediction.vehicle, forecast.effects),
-        intervals={number.label: number.ends for number in forecast.numbers if not number.at_bound},
+        intervals={number.label: number.ends for number in forecast.numbers if number.has_interval},
         note=f"Expected of {forecast.vehicle} on {forecast.terrain}, from {there}; not fitted to a run.",
     )

@@ -146,6 +146,11 @@ class LogIndex:
         return {key: shorten(text) for key, text in self.metadata.get("deployment", {}).items()}
 
     @property
+    def is_simulated(self) -> bool:
+        """Whether the log says that it is no recording: by a record ``simulation``, or as its terrain."""
+        return "simulation" in self.metadata or self.deployment.get("terrain") == "simulated"
+
+    @property
     def message_count(self) -> int:
         """Number of messages of all channels."""
         return sum(channel.message_count for channel in self.channels)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from pipeline.core import JSON_DIGITS, round_digits
+from pipeline.core import JSON_DIGITS, NORMAL_95, round_digits
 from pipeline.core.arrays import Floats
 from pipeline.run import MotionError
 
@@ -329,6 +329,8 @@ class Parameter:
         step: step of numerical derivatives.
         least: smallest size to report; None for any size, or where `Effect.is_degenerate` decides.
         plausible: the observed range; None for all within the bounds.
+        physical: the range of estimates that a fleet counts, where single runs may be beyond the observed one
+            without another cause; None for the observed one.
         one_sign: whether only positive values are physical: the other sign is a clock error or chance.
         instead_of: the parameter that this one replaces once it is given; this one is not searched.
         quantities: quantities of controllers that it determines; empty where there are none.
@@ -348,6 +350,7 @@ class Parameter:
     step: float = 1e-4
     least: Least | None = None
     plausible: Plausible | None = None
+    physical: tuple[float, float] | None = None
     one_sign: bool = False
     instead_of: str = ""
     quantities: tuple[Quantity, ...] = ()
@@ -374,6 +377,22 @@ class Parameter:
         low, high = self.bounds
         rounded = round_digits(value, digits)
         return rounded if low <= rounded <= high and value != self.neutral else value
+
+    def is_physical(self, value: float, error: float) -> bool:
+        """Whether an estimate can be physics: within bounds, and within its error in the physical range.
+
+        Beside a bound that is neutral, as a lag of zero, chance may put it within its error.
+
+        Args:
+            value: the estimate.
+            error: its standard error.
+        """
+        low, high = cut_interval(value - NORMAL_95 * error, value + NORMAL_95 * error, self.bounds)
+        if low > high or (self.neutral not in self.bounds and not self.bounds[0] < value < self.bounds[1]):
+            return False
+        shown = self.plausible
+        least, most = self.physical or ((shown.low, shown.high) if shown else self.bounds)
+        return low <= most and high >= least
 
     def is_one_sided(self, low: float, high: float) -> bool:
         """Whether an interval reaches a bound that is not the neutral value: the runs give one limit only."""

@@ -237,7 +237,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
 
 def _format_verdict(comparisons: pl.DataFrame) -> str:
     if comparisons.is_empty():
-        return "There is one dataset only: nothing to compare it with."
+        return "No pair of datasets is tested."
     counts = count_pairs(comparisons.to_dicts())
     return f"{counts} Level {format_share(LEVEL)}, corrected for multiple comparisons."
 

@@ -137,7 +137,7 @@ def is_protobuf(type_name: str) -> bool:
     return type_name in TYPES
 
 
-def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path) -> None:
+def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path, *, marked: bool = True) -> None:
     """Write sheets as an MCAP log of protobuf messages, in time order."""
     from mcap_protobuf.writer import Writer  # noqa: PLC0415 - heavy
 
@@ -155,6 +155,8 @@ def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path) -> None:
     with path.open("wb") as stream, Writer(stream) as writer:
         for time, number, message in sorted(messages, key=lambda one: one[:2]):
             writer.write_message(sheets[number].topic, message, time, time)
+        if marked:
+            writer.add_metadata(*_MARK)
 
 
 def _set(message: Any, path: str, value: object) -> None:  # noqa: ANN401 - made at run time
@@ -194,14 +196,17 @@ def _make_classes() -> dict[str, Any]:
 
 
 _BOOTED_NS = 100_000_000_000
+_MARK = ("simulation", {"by": "slip simulate"})
+"""Metadata record of every simulated log: it is never pooled with recordings."""
 
 
-def write_log(run: SimulatedRun, path: Path) -> None:
+def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
     """Write a run as an MCAP log; the same run gives the same bytes.
 
     Args:
         run: what was simulated.
         path: file to write; its folder must exist.
+        marked: whether its metadata say that it is simulated, as they must wherever it may meet recordings.
 
     Raises:
         SimulateError: ``unknown_layout`` or ``wrong_vehicle``, before anything is written.
@@ -225,7 +230,7 @@ def write_log(run: SimulatedRun, path: Path) -> None:
         ]
     )
     if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
-        write_protobuf(messages.cut_gaps(run, sheets), scenario.clock, path)
+        write_protobuf(messages.cut_gaps(run, sheets), scenario.clock, path, marked=marked)
         return
     with LogWriter(path) as writer:
         for sheet in messages.cut_gaps(run, sheets):
@@ -242,6 +247,8 @@ def write_log(run: SimulatedRun, path: Path) -> None:
                 fields,
                 header_time=header,
             )
+        if marked:
+            writer.metadata(*_MARK)
         if scenario.recording.deployment == "written":
             writer.metadata(
                 "deployment", {"vehicle": scenario.vehicle.name, "terrain": scenario.recording.terrain}

@@ -1,6 +1,6 @@
 """Checks of a whole run: wiring, scale, and consistency of encoders, command and pose."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from itertools import combinations
 from typing import Final
 
@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import arrays, format_share
-from pipeline.core.arrays import Floats, Ints, fit_robustly, robust_spread
+from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.run.signals import LIVE_SHARE, MOVING_MPS, STILL_MPS
@@ -228,13 +228,14 @@ _SPEED_TOLERANCE: Final = 0.05
 
 def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """Check the steady gain from the measured wheels to the forward motion."""
-    gain = None if samples.measured is None else _find_gain(samples, samples.measured[:, 0])
+    moved, steady = samples.velocity[:, 0], samples.steady
+    gain = None if samples.measured is None else find_gain(samples.measured[:, 0], moved, steady)
     if gain is None or samples.measured is None:
         return []
     if _LEAST < gain < _MOST:
         reached = None
         if samples.body_commanded and samples.command is not None:
-            reached = _find_gain(samples, samples.command[:, 0])
+            reached = find_gain(samples.command[:, 0], moved, steady)
         if reached is None or abs(reached - 1.0) > _SPEED_TOLERANCE or abs(gain - 1.0) < _LEAST_DIFFERENCE:
             return []
     driven = samples.measured[:, 0]
@@ -255,10 +256,23 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
 
 
-def _find_gain(samples: Samples, driven: Floats) -> float | None:
-    """Median of the forward motion over an ideal one [m/s], shape (n,); None if it is not steady."""
-    moved = samples.velocity[:, 0]
-    known = np.isfinite(driven) & np.isfinite(moved) & samples.steady
+def is_grip(gain: float, others: Iterable[float]) -> bool:
+    """Whether a gain that alone contradicts the wheel radius is the ground's, by gains of the same vehicle.
+
+    With the radius that this gain implies, a run whose gain may be slip would cover more than its wheels.
+    """
+    return any(_LEAST < other < _MOST and other > _MOST * gain for other in others)
+
+
+def find_gain(driven: Floats, moved: Floats, steady: Flags) -> float | None:
+    """Median of the forward motion over an ideal one; None if it is not steady.
+
+    Args:
+        driven: ideal forward speed [m/s], shape (n,).
+        moved: measured forward speed [m/s], shape (n,).
+        steady: samples without a change of command, shape (n,).
+    """
+    known = np.isfinite(driven) & np.isfinite(moved) & steady
     if known.sum() < FEWEST_SAMPLES:
         return None
     live = known & (np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven[known]))))

@@ -213,9 +213,9 @@ def test_what_was_not_given_is_said_to_be_needed(capsys: pytest.CaptureFixture[s
 
 def test_an_argument_too_many_is_named(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as left:
-        main(["compare", "results", "other"])
+        main(["fleet", "trend", "results", "other"])
     assert left.value.code == 2
-    assert "slip compare takes no further argument: other." in capsys.readouterr().err
+    assert "slip fleet trend takes no further argument: other." in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -47,6 +47,9 @@ class Run:
     sized: bool = True
     moves: bool = True
     wheels: bool = True
+    simulated: bool = False
+    gain: float = 0.0
+    """Forward speed over the ideal one on either input, in place of the slip."""
 
 
 def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
@@ -90,6 +93,10 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
             ).with_columns(pl.lit(name).cast(_INPUTS).alias("input"), *_WITHOUT_MODEL)
         )
     slip = pl.concat(parts)
+    if run.gain:
+        slip = slip.with_columns(v_x=run.gain * pl.col("f_x"), v_y=pl.lit(0.0), g_y=pl.lit(0.0))
+        slip = slip.with_columns(g_x=pl.col("f_x") - pl.col("v_x"))
+        slip = slip.with_columns(modulus=pl.col("g_x").abs())
     if not run.moves:
         slip = slip.with_columns(pl.col("^[fv]_[xyw]$") * 0.0)
     tables = {
@@ -115,6 +122,7 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 "vehicle": {
                     "id": run.vehicle,
                     "mass_kg": run.mass_kg,
+                    "wheel_radius_m": 0.3,
                     "track_width_m": 1.08 if run.sized else None,
                     "wheelbase_m": 0.914 if run.sized else None,
                     "max_speed_mps": 5.0,
@@ -122,6 +130,7 @@ def write_run(store: Store, run: Run, *, seed: int = 0) -> Manifest:
                 },
                 "terrain": run.terrain,
                 "dataset": run.dataset,
+                **({"simulated": True} if run.simulated else {}),
             }
         )
 

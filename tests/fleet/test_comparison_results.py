@@ -279,8 +279,114 @@ def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
 def test_more_groups_than_closed_testing_takes_are_corrected_after_holm(store: Store) -> None:
     fill(store, {f"terrain{i}": 1.0 for i in range(9)}, runs=2)
     (row, *_) = ask(store).comparisons.iter_rows(named=True)
-    assert "Holm over 36 pairs" in row["method"]
+    assert row["method"] == "exact permutation of whole runs", "no pair counts"
     assert row["note"] == "cannot be significant with 2 runs per side; 7 per side are needed"
+
+
+@pytest.mark.parametrize("others", [6, 7])
+def test_pairs_with_too_few_runs_take_nothing_from_those_with_enough(others: int) -> None:
+    """By closed testing of eight groups, and after Holm for nine."""
+    rng = np.random.default_rng(0)
+    ticks = np.arange(40)
+
+    def make(level: float) -> Samples:
+        median = level * float(np.exp(rng.normal(0.0, 0.3)))
+        return Samples(np.full(40, median), ticks, np.zeros_like(ticks), 40.0)
+
+    many = [Group(name, tuple(make(level) for _ in range(7))) for name, level in (("a", 0.5), ("b", 0.9))]
+    few = [Group(f"few{i}", (make(10.0 ** (i % 3 - 1)),)) for i in range(others)]
+    pairs = compare_groups([*many, *few])
+    (pair,) = (one for one in pairs if {one.a.name, one.b.name} == {"a", "b"})
+    assert pair.p_adjusted == pair.comparison.test.p < 0.05
+    hopeless = [one for one in pairs if one.unit == "runs" and one is not pair]
+    assert len(hopeless) == 2 * others
+    assert all(one.p_adjusted > 0.05 and "cannot be significant" in one.note for one in hopeless)
+
+
+def test_what_differs_in_vehicle_and_terrain_is_tested_where_it_is_named(
+    store: Store, capsys: pytest.CaptureFixture[str]
+) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=4)
+    for i in range(4):
+        write_run(store, Run(name=f"husky_{i}", dataset="husky_ice", vehicle="husky_a200", terrain="ice"))
+        write_run(store, Run(name=f"mud_{i}", dataset="husky_mud", vehicle="husky_a200", terrain="mud"))
+    answer = ask(store)
+    found = {frozenset((row["a"], row["b"])) for row in answer.comparisons.iter_rows(named=True)}
+    assert found == {
+        frozenset(pair)
+        for pair in (
+            ("warthog_asphalt", "warthog_ice"), ("husky_ice", "husky_mud"), ("husky_ice", "warthog_ice"),
+        )
+    }  # fmt: skip
+    (note,) = (note for note in answer.notes if "vehicle" in note)
+    assert note == (
+        "3 pairs of datasets with neither vehicle nor terrain in common: no test, unless named, as in: "
+        "slip compare husky_ice warthog_asphalt"
+    )
+    root = str(store.root)
+    named = json.loads(run(capsys, "husky_mud", "warthog_asphalt", "--results", root, "--json"))
+    (pair,) = named["pairs"]
+    assert {pair["a"], pair["b"]} == {"husky_mud", "warthog_asphalt"}
+    assert {row["dataset"] for row in named["datasets"]} == {"husky_mud", "warthog_asphalt"}
+    assert not any("vehicle" in note for note in named["notes"])
+    own = json.loads(run(capsys, root, "--vehicle", "husky_a200", "--json"))
+    assert [row["vehicle"] for row in own["datasets"]] == ["husky_a200"] * 2
+    before = json.loads(run(capsys, root, "husky_ice", "husky_mud", "--json"))
+    assert before["pairs"] == own["pairs"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (("warthog_ice", "warthog_icy"), "no dataset is called warthog_icy. Did you mean warthog_ice"),
+        (("warthog_ice", "warthog_ice"), "warthog_ice is one dataset"),
+        (("--vehicle", "warthogg"), "no run is of warthogg. Did you mean warthog?"),
+    ],
+)
+def test_a_name_that_no_run_has_is_said_in_one_line(
+    store: Store, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], words: str
+) -> None:
+    fill(store, {"asphalt": 0.5, "ice": 2.0}, runs=1)
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", *arguments, "--results", str(store.root)])
+    error = capsys.readouterr().err
+    assert ended.value.code == 1
+    assert words in error
+    assert error.count("\n") == 1
+
+
+def test_an_interval_takes_three_runs(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
+    for terrain, runs in (("asphalt", 1), ("gravel", 2), ("ice", 3)):
+        fill(store, {terrain: 0.5}, runs=runs)
+    rows = {row["dataset"]: row for row in json.loads(run(capsys, str(store.root), "--json"))["datasets"]}
+    assert rows["warthog_gravel"]["low"] is rows["warthog_gravel"]["high"] is None
+    assert rows["warthog_gravel"]["interval"] == ""
+    assert rows["warthog_ice"]["low"] < rows["warthog_ice"]["median_modulus"] < rows["warthog_ice"]["high"]
+    assert rows["warthog_asphalt"]["interval"] == "this run only"
+    (line,) = (line for line in run(capsys, str(store.root)).splitlines() if "warthog_gravel  " in line)
+    assert line.split()[3] == "-"
+
+
+def test_simulated_runs_are_never_pooled_with_recordings(store: Store) -> None:
+    for i in range(3):
+        write_run(store, Run(name=f"s{i}", simulated=True, median=9.0))
+    alone = ask(store)
+    assert alone.datasets["runs"].to_list() == [3, 3]
+    assert not any("simulated" in note for note in alone.notes)
+    for i in range(3):
+        write_run(store, Run(name=f"r{i}"))
+    mixed = ask(store)
+    assert mixed.datasets["runs"].to_list() == [3, 3]
+    assert all(row["keys"].split()[0].startswith("r") for row in mixed.datasets.iter_rows(named=True))
+    assert "left out, simulated, and never pooled with recordings (3 runs): s0, s1, s2" in mixed.notes
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """What `slip compare` prints."""
+    with pytest.raises(SystemExit) as ended:
+        main(["compare", *arguments])
+    assert ended.value.code == 0
+    return capsys.readouterr().out
 
 
 def test_many_single_runs_say_that_they_are_too_many() -> None:

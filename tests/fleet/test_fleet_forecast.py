@@ -105,7 +105,10 @@ def test_a_limit_that_no_run_reaches_is_said_to_be_none() -> None:
     limit = find_effect("acceleration_limit")().parameter("limit")
     number = {"value": 500.0, "low": 4.23, "high": 500.0, "at_bound": True, "default_spread": False}
     assert _format_expected(number, limit) == "no limit, or one of at least 4.23 rad/s^2"
-    number["value"] = 18.0
+    unknown = {**number, "low": None, "high": None, "default_spread": True}
+    assert _format_expected(unknown, limit) == "no limit"
+    unknown["value"] = number["value"] = 18.0
+    assert _format_expected(unknown, limit) == "18 rad/s^2 (no interval: fewer than three runs)"
     assert _format_expected(number, limit) == (
         "18 rad/s^2 [4.23, 500] (the interval ends at a limit of the search)"
     )
@@ -145,6 +148,12 @@ def test_spreads_of_few_runs_are_said_to_be_defaults() -> None:
         forecast = forecast_vehicle(draw({"ice": 0.9}, runs=runs), "warthog", "ice", "measured")
         told = summarize_prediction(Prediction(forecast, vehicle, some, some, some, ()))
         assert f"'default_spread': {is_default}" in str(told)
+        ((effect,), error) = told["effects"], told["t_mrmse_m"]  # type: ignore[misc]
+        assert (effect["parameters"]["k"]["low"] is None) == is_default
+        used = Prediction(forecast, vehicle, some, some, some, forecast.runs)
+        assert (summarize_prediction(used)["t_mrmse_m"]["low"] is None) == is_default  # type: ignore[index]
+        assert error["value"] == 1.0  # type: ignore[call-overload]
+        assert ("wheel_radius.k" in make_model_file(used).intervals) != is_default
 
 
 def test_of_two_runs_that_hold_different_effects_both_are_expected() -> None:

@@ -15,8 +15,10 @@ from comparison_store import Run, write_run
 from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
 from pipeline.fleet.forecast import FleetModel, FleetNumber, fit_fleet
-from pipeline.job.over_runs import update_trend
-from pipeline.job.prediction import summarize_fleet
+from pipeline.job.compare import Question, compare_results
+from pipeline.job.over_runs import follow_trend, update_trend
+from pipeline.job.prediction import fit_results, summarize_fleet
+from pipeline.models import find_effect
 from pipeline.models.parameter import Level
 from pipeline.store import Store
 from pipeline.store.mirror import Mirror
@@ -131,13 +133,110 @@ def test_a_damaged_run_is_told_apart_and_leaves_the_others_as_they_are() -> None
     assert fit_one(rows).odd == ()
 
 
-def test_only_what_is_named_counts_and_what_is_not_named_there_counts_as_measured() -> None:
+def test_only_what_is_named_counts_and_of_the_runs_whose_model_holds_it() -> None:
     elsewhere = {"asphalt": 1.0, "gravel": 1.0}
     quiet = draw(elsewhere, named=False)
     assert fit_fleet(quiet).numbers == ()
     number = fit_one(pl.concat([quiet, draw({"ice": 0.7})]))
-    assert (number.named, len(number.runs)) == (3, 9)
-    assert number.name == "longitudinal_slip"
+    assert (number.named, len(number.runs)) == (3, 3)
+    assert number.level is None
+    assert number.because.endswith("; not in the models of 6 other runs")
+    held = fit_one(pl.concat([draw(elsewhere, named=False, in_model=True), draw({"ice": 0.7})]))
+    assert (held.named, len(held.runs), held.name) == (3, 9, "longitudinal_slip")
+
+
+@pytest.mark.parametrize(
+    ("effect", "parameter", "value", "error", "physical"),
+    [
+        ("wheel_radius", "k", -0.372, 0.243, False),
+        ("wheel_radius", "k", -0.1, 2.0, False),
+        ("wheel_radius", "k", 2.271, 0.199, False),
+        ("wheel_radius", "k", 0.226, 0.02, True),
+        ("wheel_radius", "k", 1.4, 0.1, True),
+        ("drive_lag", "tau", -0.02, 0.02, True),
+        ("drive_lag", "tau", -0.2, 0.02, False),
+        ("body_speed_limit", "limit", 0.0, 0.1, False),
+        ("lateral_drift", "c", -0.05, 0.01, True),
+    ],
+)
+def test_what_is_outside_physics_enters_no_fleet_and_is_said(
+    effect: str,
+    parameter: str,
+    value: float,
+    error: float,
+    physical: bool,  # noqa: FBT001 - a case
+) -> None:
+    number = find_effect(effect)().parameter(parameter)
+    assert number.is_physical(value, error) == physical
+    usual = number.typical
+    rows = draw(dict.fromkeys(ALIKE, usual), effect=effect, parameter=parameter, runs=2, spread=0.0)
+    rows = rows.with_columns(value=pl.lit(usual), standard_error=pl.lit(0.01 * abs(usual)))
+    odd = draw({"ice": value}, effect=effect, parameter=parameter, runs=1, vehicle="warthog_odd")
+    odd = odd.with_columns(vehicle=pl.lit("warthog"), value=pl.lit(value), standard_error=pl.lit(error))
+    model = fit_fleet(pl.concat([rows, odd]))
+    (fitted,) = model.numbers
+    used = {*fitted.runs, *fitted.odd}
+    assert ("warthog_odd_ice_0" in used) == physical
+    said = f"{effect}.{parameter} left out, outside the physical range: {value:.3g} in warthog_odd_ice_0"
+    assert (said in model.notes) != physical
+
+
+def test_an_interval_of_a_fleet_takes_three_runs() -> None:
+    for runs, known in ((1, False), (2, False), (3, True)):
+        number = fit_one(draw({"ice": 0.7}, runs=runs))
+        assert (number.fit.interval is not None) == known
+        assert (number.fit.groups["ice"].interval is not None) == known
+    mixed = fit_one(pl.concat([draw(ALIKE), draw({"mud": 0.7}, runs=2)]))
+    assert mixed.fit.groups["mud"].interval is None
+    assert mixed.fit.groups["ice"].interval is not None
+
+
+def fill_slippery(store: Store, *, sibling: float, radius: float = 0.3) -> None:
+    """Six runs on ice with half the distance of their wheels, and three on asphalt."""
+    for terrain, gain in (("ice", 0.5), ("asphalt", sibling)):
+        for i in range(3):
+            findings = [("wheel_radius_wrong", "error", radius * gain)] if terrain == "ice" else []
+            numbers = [("wheel_radius", "k", gain + 0.01 * i, 0.02)]
+            run = Run(name=f"{terrain}_{i}", terrain=terrain, estimates=numbers, findings=findings, gain=gain)
+            write_run(store, replace(run, dataset=f"warthog_{terrain}"))
+
+
+def test_a_data_sheet_is_judged_over_the_runs_of_a_robot(tmp_path: Path) -> None:
+    store = Store(tmp_path / "results")
+    fill_slippery(store, sibling=0.9)
+    model, _ = fit_results(store)
+    assert len(model.runs["warthog"]) == 6
+    said = "slippery ground and no wrong wheel radius, by other runs of the same vehicle: ice_0, ice_1, ice_2"
+    assert said in model.notes
+    answer = compare_results(store, Question())
+    assert set(answer.datasets["runs"]) == {3}
+    assert said in answer.notes
+
+
+@pytest.mark.parametrize("sibling", [0.6, 1.4, 0.0])
+def test_siblings_that_do_not_contradict_it_leave_a_wrong_radius_wrong(
+    tmp_path: Path, sibling: float
+) -> None:
+    """With .6 the radius may be the cause of both, 1.4 is no grip, and with 0 the gain is not known."""
+    store = Store(tmp_path / "results")
+    fill_slippery(store, sibling=sibling)
+    assert len(fit_results(store)[0].runs["warthog"]) == 3
+    notes = compare_results(store, Question()).notes
+    assert "left out, finding wheel_radius_wrong (3 runs): ice_0, ice_1, ice_2" in notes
+
+
+def test_simulated_runs_enter_no_fleet_and_no_trend_of_recordings(results: Store) -> None:
+    write_run(
+        results,
+        Run(name="made", terrain="mud", estimates=[("wheel_radius", "k", 0.1, ERROR)], simulated=True),
+    )
+    said = "left out, simulated, and never pooled with recordings: made"
+    model, _ = fit_results(results)
+    assert "made" not in model.runs["warthog"]
+    assert said in model.notes
+    trend = follow_trend(results, ("vehicle",), threshold=0.05, limits={})
+    assert said in trend.notes
+    assert not any("made" in key for key in trend.keys)
 
 
 def test_runs_on_unknown_ground_and_numbers_at_a_bound_are_left_out_and_said() -> None:
@@ -191,7 +290,7 @@ def test_the_longest_label_stands_apart_from_its_value(
     limit = [("turn_acceleration_limit", "limit", 2.0, 0.1)]
     for name in ("monday", "tuesday"):
         write_run(store, Run(name=name, terrain="ice", seconds=6.0, estimates=limit))
-    assert "turn_acceleration_limit.limit  2 " in run_slip(capsys, "fleet", "fit", str(store.root))[1]
+    assert "turn_acceleration_limit.limit  2," in run_slip(capsys, "fleet", "fit", str(store.root))[1]
 
 
 def test_what_is_fitted_is_written_and_shown_again(

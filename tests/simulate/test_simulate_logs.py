@@ -269,9 +269,11 @@ def test_commands_may_be_recorded_at_the_wrong_scale(tmp_path: Path) -> None:
 
 def test_deployment_is_named_unless_it_shall_not_be(tmp_path: Path) -> None:
     record(replace(SHORT, recording=Recording(terrain="mud")), tmp_path / "a.mcap")
-    assert read_metadata(tmp_path / "a.mcap") == {"deployment": {"vehicle": "husky_a200", "terrain": "mud"}}
+    mark = {"simulation": {"by": "slip simulate"}}
+    deployment = {"deployment": {"vehicle": "husky_a200", "terrain": "mud"}}
+    assert read_metadata(tmp_path / "a.mcap") == mark | deployment
     record(replace(SHORT, recording=Recording(deployment="absent")), tmp_path / "b.mcap")
-    assert read_metadata(tmp_path / "b.mcap") == {}
+    assert read_metadata(tmp_path / "b.mcap") == mark
 
 
 def test_a_layout_of_ones_own_is_written(tmp_path: Path) -> None:

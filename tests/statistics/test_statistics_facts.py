@@ -17,6 +17,8 @@ from pipeline.fleet.confidence import (
     bootstrap_median,
     bound_mean,
     bound_typical,
+    compare_blocks,
+    compare_runs,
     integrated_time,
     number_blocks,
 )
@@ -25,7 +27,9 @@ from pipeline.fleet.rank_tests import (
     StatisticsError,
     adjust_holm,
     adjust_max_t,
+    bound_permuted,
     cliffs_delta,
+    find_testable,
     kendall_p,
     kendall_tau,
     list_swaps,
@@ -110,6 +114,103 @@ def test_max_t_keeps_the_p_of_a_large_difference_where_holm_loses_it() -> None:
     assert corrected[1, 2] == pytest.approx(2 / 70)
     assert corrected[0, 1] > 0.05
     assert adjust_holm(plain)[1] > 0.05
+
+
+def test_closed_testing_of_four_groups_is_that_of_all_hypotheses_one_by_one() -> None:
+    """Every hypothesis that holds a pair is enumerated here on its own, with the labels of all its sets."""
+    rng = np.random.default_rng(4)
+    kinds = ((0.0, 3.0), (0.5, 3.0), (10.0, 1.0), (12.0, 1.0))
+    groups = [rng.normal(level, spread, 4) for level, spread in kinds]
+    expected = np.zeros((4, 4))
+    for partition in ([[0, 1]], [[2, 3]], [[0, 1], [2, 3]]):
+        nulls = []
+        for chosen in partition:
+            units = np.concatenate([groups[i] for i in chosen])
+            rows = [list(row) for row in itertools.combinations(range(8), 4)]
+            means = np.array([units[row].mean() for row in rows])
+            nulls.append(np.abs(2.0 * means - 2.0 * units.mean()) * math.sqrt(2.0))
+        observed = max(null[0] for null in nulls)
+        both = np.array([max(pair) for pair in itertools.product(*nulls)])
+        p = float(np.mean(both >= observed - 1e-9))
+        for i, j in partition:
+            expected[i, j] = max(expected[i, j], p)
+    corrected = adjust_max_t(groups, [(0, 1), (2, 3)])
+    assert corrected[0, 1] == pytest.approx(expected[0, 1])
+    assert corrected[2, 3] == pytest.approx(expected[2, 3])
+    assert expected[2, 3] > permute_means(groups[2], groups[3]).p, "both sets of equal groups decide together"
+
+
+def test_all_six_pairs_of_four_groups_hold_what_their_partitions_say() -> None:
+    rng = np.random.default_rng(12)
+    groups = [rng.normal(level, 1.0, 4) for level in (0.0, 2.0, 20.0, 22.0)]
+    corrected = adjust_max_t(groups, draws=499)
+    apart = adjust_max_t(groups, [(0, 1), (2, 3)])
+    assert corrected[0, 1] >= apart[0, 1] - 1e-9
+    assert corrected[2, 3] >= apart[2, 3] - 1e-9
+    assert max(corrected[0, 2], corrected[1, 3]) <= 0.05
+
+
+def test_pairs_that_can_never_be_significant_do_not_count() -> None:
+    # Tarone's example: of nine tests, those that cannot reach .05 / K do not share the level.
+    testable, family = find_testable([0.001, 0.002, *[0.04] * 7])
+    assert testable.tolist() == [True, True, *[False] * 7]
+    assert family == 2
+    assert find_testable([0.2, 0.3])[0].tolist() == [False, False]
+    assert find_testable([])[0].size == 0
+    assert find_testable([0.01] * 5)[1] == 5
+    rng = np.random.default_rng(0)
+    sides = [rng.normal(level, 1.0, 7) for level in (0.0, 2.2)]
+    single = [rng.normal(0.0, 5.0, 2) for _ in range(4)]
+    assert adjust_max_t([*sides, *single], draws=499)[0, 1] == pytest.approx(permute_means(*sides).p)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 7), st.integers(1, 7))
+@settings(max_examples=60, deadline=None)
+def test_the_interval_excludes_zero_exactly_where_the_test_does(seed: int, first: int, second: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = rng.lognormal(0.0, 0.5, first), rng.lognormal(rng.uniform(0.0, 1.5), 0.5, second)
+    if seed % 3 == 0:
+        a, b = np.round(a) + 1.0, np.round(b) + 1.0
+    for found in (compare_runs(a, b), compare_runs(a - 3.0, b - 3.0), compare_blocks(a, b, draws=499)):
+        if found.test.smallest_p > 0.05:
+            assert found.interval is None
+        else:
+            assert found.interval is not None
+            excludes = not found.interval.low <= 0.0 <= found.interval.high
+            assert excludes == (found.test.p <= 0.05)
+
+
+def test_the_bounds_are_where_the_test_begins_to_reject() -> None:
+    rng = np.random.default_rng(3)
+    a, b = rng.normal(0.0, 1.0, 6), rng.normal(1.0, 2.0, 5)
+    blocks = rng.normal(0.0, 1.0, 25), rng.normal(0.5, 3.0, 12)
+    for sides, studentized, permute in (((a, b), False, permute_means), (blocks, True, permute_studentized)):
+        bounds = bound_permuted(*sides, studentized=studentized)
+        assert bounds is not None
+        for end, outward in zip(bounds, (-1e-6, 1e-6), strict=True):
+            assert permute(sides[0], sides[1] - end + outward).p > 0.05
+            assert permute(sides[0], sides[1] - end - outward).p <= 0.05
+    # On logarithms the bounds are those of a ratio, and turn round with the sides.
+    there, back = compare_runs(np.exp(a), np.exp(b)), compare_runs(np.exp(b), np.exp(a))
+    assert there.interval is not None
+    assert back.interval is not None
+    assert there.interval.low == pytest.approx(-back.interval.high)
+
+
+def test_both_ends_of_the_interval_of_a_run_are_widened_for_few_blocks() -> None:
+    rng = np.random.default_rng(5)
+    levels = np.array([-1.5, -0.5, 0.5, 1.5])
+    offsets = rng.normal(0.0, 1.0, 500)
+    values = np.concatenate([level + side * offsets for level in levels for side in (-1.0, 1.0)])
+    blocks = np.repeat(np.arange(4), 1_000)
+    found = bootstrap_median(values, blocks, draws=4_000)
+    drawn = rng.integers(4, size=(4_000, 4))
+    medians = [np.median(values.reshape(4, -1)[row]) for row in drawn]
+    low, high = np.quantile(medians, (0.025, 0.975))
+    # Student's t of three degrees of freedom over the normal quantile, and the deviation of four for three.
+    widened = 3.182 / 1.960 * math.sqrt(4 / 3)
+    assert found.low == pytest.approx(widened * low, rel=0.1)
+    assert found.high == pytest.approx(widened * high, rel=0.1)
 
 
 @given(st.lists(st.lists(NUMBERS, min_size=1, max_size=3), min_size=2, max_size=3))

@@ -7,6 +7,7 @@ correct test fails here once in two hundred seeds, and the seeds are fixed.
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 import pytest
@@ -14,7 +15,14 @@ from simulated_runs import RATE, simulate_runs
 
 from pipeline.fleet.confidence import bootstrap_median, bound_typical, compare_runs, cut_blocks
 from pipeline.fleet.joint_levels import find_changes
-from pipeline.fleet.rank_tests import adjust_max_t, mann_whitney, permute_studentized
+from pipeline.fleet.rank_tests import (
+    adjust_holm,
+    adjust_max_t,
+    find_testable,
+    mann_whitney,
+    permute_means,
+    permute_studentized,
+)
 
 SPREAD = 0.1
 
@@ -42,8 +50,20 @@ def test_whole_runs_are_rejected_at_the_attainable_level(runs: int, attainable: 
     rate = np.mean([one.test.p <= 0.05 for one in found])
     low, high = rejections_allowed(attainable, repetitions)
     assert low <= rate <= high
-    covered = np.mean([one.interval.low <= 0.0 <= one.interval.high for one in found])
-    assert 0.92 <= covered <= 0.985 if runs == 3 else 0.92 <= covered <= 0.975
+    covered = [one.interval is None or one.interval.low <= 0.0 <= one.interval.high for one in found]
+    assert np.mean(covered) == pytest.approx(1.0 - rate), "three runs a side exclude no difference"
+
+
+@pytest.mark.parametrize(("first", "second"), [(4, 4), (6, 3), (7, 7)])
+def test_intervals_of_a_difference_hold_it(first: int, second: int) -> None:
+    rng = np.random.default_rng(first)
+    hits = []
+    for _ in range(400):
+        a, b = (np.exp(rng.normal(level, 0.3, count)) for level, count in ((0.0, first), (0.5, second)))
+        found = compare_runs(a, b).interval
+        assert found is not None
+        hits.append(found.low <= math.exp(0.5) - 1.0 <= found.high)
+    assert 0.92 <= np.mean(hits) <= 0.99
 
 
 @pytest.mark.parametrize("runs", [3, 4, 6])
@@ -107,6 +127,26 @@ def test_a_family_controls_the_pair_that_is_equal_while_a_third_differs() -> Non
         powers.append(corrected[0, 2] <= 0.05)
     assert np.mean(alarms) <= rejections_allowed(0.05, repetitions)[1]
     assert np.mean(powers) > 0.95
+
+
+@pytest.mark.parametrize("pairs", [None, [(0, 1), (1, 2), (2, 3)]])
+def test_a_family_with_pairs_that_never_count_gives_a_false_alarm_once_in_twenty(
+    pairs: list[tuple[int, int]] | None,
+) -> None:
+    rng = np.random.default_rng(8)
+    repetitions = 150
+    by_max_t, by_holm = [], []
+    for seed in range(repetitions):
+        groups = [rng.normal(0.0, SPREAD, runs) for runs in ((5, 5, 4, 2) if pairs is None else (5, 4, 4, 5))]
+        asked = pairs or list(combinations(range(len(groups)), 2))
+        by_max_t.append(adjust_max_t(groups, pairs, seed=seed, draws=199).min() <= 0.05)
+        tests = [permute_means(groups[i], groups[j]) for i, j in asked]
+        counted, _ = find_testable([test.smallest_p for test in tests])
+        holm = adjust_holm(np.array([test.p for test in tests])[counted])
+        by_holm.append(bool(np.any(holm <= 0.05)))
+    most = rejections_allowed(0.05, repetitions)[1]
+    assert np.mean(by_max_t) <= most
+    assert np.mean(by_holm) <= most
 
 
 def test_power_grows_with_the_difference_and_the_runs() -> None:

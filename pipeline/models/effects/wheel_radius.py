@@ -28,6 +28,8 @@ class WheelRadius(KinematicEffect):
             0.92,
             least=Least(0.004, Least.DATA_SHEET),
             plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
+            # On slippery floors wheels spin nearly on the spot; they never fall far behind the vehicle.
+            physical=(0.0, 1.3),
             quantities=(Quantity.RADIUS,),
             between_runs=Spread(0.019),
         ),
