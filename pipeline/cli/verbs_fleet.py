@@ -77,51 +77,43 @@ def check(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    try:
-        _require_target(to, file, json=json)
-        _require_runs(after)
-        from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
-        from pipeline.job.check import (  # noqa: PLC0415 - heavy
-            check_as_json,
-            check_runs,
-            keep_baseline,
-            read_limits,
-        )
-        from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
-        from pipeline.models import write_text  # noqa: PLC0415 - heavy
-        from pipeline.store import Store  # noqa: PLC0415 - heavy
+    _require_target(to, file, json=json)
+    _require_runs(after)
+    from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
+    from pipeline.job.check import (  # noqa: PLC0415 - heavy
+        check_as_json,
+        check_runs,
+        keep_baseline,
+        read_limits,
+    )
+    from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.models import write_text  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-        bounds = None if limits is None else read_limits(limits)
-        options = build_options(Choices(results=results, key=key))
-        known = _open_known(before, trust_code=trust_code)
-        silent = quiet or json or (to is not None and file is None)
-        with ExitStack() as stack:
-            first = (
-                _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
-            )
-            second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
-            owner: Owner | None = vehicle_of
-            checked = check_runs(
-                first,
-                second,
-                Store(results),
-                source=input,
-                owner=owner,
-                limits=bounds,
-                simulated=simulated,
-            )
-        lines = list_lines(checked)
-        if to is not None:
-            text = _render(checked, to)
-            if file is None:
-                sys.stdout.write(text)
-            else:
-                write_text(file, text, code="check_unwritable")
-    except SlipError as error:
-        print_error(error)
-        if json:
-            print_json({"errors": [summarize_error(after, error)]})
-        return FAILED
+    bounds = None if limits is None else read_limits(limits)
+    options = build_options(Choices(results=results, key=key))
+    known = _open_known(before, trust_code=trust_code)
+    silent = quiet or json or (to is not None and file is None)
+    with ExitStack() as stack:
+        first = _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
+        second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
+        owner: Owner | None = vehicle_of
+        checked = check_runs(
+            first,
+            second,
+            Store(results),
+            source=input,
+            owner=owner,
+            limits=bounds,
+            simulated=simulated,
+        )
+    lines = list_lines(checked)
+    if to is not None:
+        text = _render(checked, to)
+        if file is None:
+            sys.stdout.write(text)
+        else:
+            write_text(file, text, code="check_unwritable")
     # The check is also printed if the baseline is not replaced.
     unkept: list[SlipError] = []
     try:

@@ -270,7 +270,7 @@ def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
 
 
 def _is_known(joint: str, series: Mapping[str, Floats], other: Mapping[str, Floats]) -> bool:
-    """Whether a joint's series has most of its readings: the topic's other messages may be of other joints."""
+    """Whether a joint's series has most of its readings; other messages may be of other joints."""
     read = [np.isfinite(one[joint]) for one in (series, other) if joint in one]
     return joint in series and bool(read[0].sum() > 0.5 * np.any(read, axis=0).sum())
 
