@@ -144,12 +144,14 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         topic: poses, satellite fixes, or velocities over ground.
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
+        axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
         time: which of the message's times to use.
     """
 
     topic: str | None = None
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
+    axes: Literal["enu", "ned"] = "enu"
     time: Clock | None = None
 
 

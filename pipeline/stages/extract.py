@@ -236,8 +236,11 @@ class _Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
+        # Half a turn about the x axis puts z and the vehicle upright.
+        upright = np.array([1.0, -1.0, -1.0]) if self.configuration.pose.axes == "ned" else np.ones(3)
+        position, quaternion = arrays.position * upright, arrays.quaternion * np.append(upright, 1.0)
         track = pose_topics.cut_track(
-            times, arrays.position, arrays.quaternion, breaks, self.configuration.velocity, source.topic
+            times, position, quaternion, breaks, self.configuration.velocity, source.topic
         )
         self.findings += track.findings
         return pl.DataFrame(

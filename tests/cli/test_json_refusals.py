@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-import inspect
 import json
-from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
-from cyclopts import App
 from verbs import run_verb
 
 from pipeline.cli import build_app
 from pipeline.simulate import simulate_case
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from cyclopts import App
+
 BROKEN = "broken.mcap"
 REFUSED: dict[str, list[tuple[str, ...]]] = {
     "analyze": [(BROKEN, "--no-report"), ("missing.mcap",), (BROKEN, "--config", "missing.toml")],
-    "diagnose": [(BROKEN,), ("missing.mcap",), (BROKEN, "--model", "missing.toml"), ("a", "--budget", "soon")],
+    "diagnose": [
+        (BROKEN,),
+        ("missing.mcap",),
+        (BROKEN, "--model", "missing.toml"),
+        ("a", "--budget", "soon"),
+    ],
     "watch": [("ws://192.0.2.1:8765",)],
     "inspect": [(BROKEN,), ("missing.mcap",)],
     "export": [("missing", "--to", "csv")],
