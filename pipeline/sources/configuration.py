@@ -116,6 +116,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         unit: unit of wheel speeds, or of wheel angles; by default that of the message type.
         per_turn: ticks per turn of the wheel.
         sign: -1 if forward is recorded as negative.
+        scale: factor on recorded speeds, where an encoder counts low or high.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
     """
@@ -133,6 +134,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unit: Unit | None = None
     per_turn: Positive | None = None
     sign: Literal[1, -1] = 1
+    scale: Positive | None = None
     time: Clock | None = None
     hold_s: Positive | None = None
 

@@ -382,10 +382,17 @@ class _Extraction:
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
         self.findings += drive.findings
+        if not held and section.scale is not None:
+            text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
+            self.findings.append(
+                Finding("encoder_scale_given", "info", text, where="wheels", value=section.scale)
+            )
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
         values = {
-            name: empty if (series := getattr(drive, name)) is None else series
+            name: empty
+            if (series := getattr(drive, name)) is None
+            else series * (1.0 if name == "steering" else section.scale or 1.0)
             for name in Drive.list_signals()
             if held or not name.startswith("body")
         }
