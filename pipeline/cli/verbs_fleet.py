@@ -31,7 +31,7 @@ from pipeline.cli.conventions import (
     use_key,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import SlipError, suffix_unit
+from pipeline.core import SlipError, format_interval, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.fleet.trend import Trend
@@ -372,7 +372,8 @@ def _format_expected(number: Mapping[str, object], parameter: ModelParameter) ->
 
 
 def _format_interval(number: Mapping[str, object], unit: str) -> str:
-    return f"{number['value']:.3g}{suffix_unit(unit)} [{number['low']:.3g}, {number['high']:.3g}]"
+    value, low, high = (cast("float", number[key]) for key in ("value", "low", "high"))
+    return format_interval(value, low, high, unit)
 
 
 ALERT = 4
