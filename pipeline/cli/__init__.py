@@ -6,6 +6,8 @@ the program, its verbs by task, and what errors become.
 
 import gc
 import importlib
+import itertools
+import json
 import os
 import re
 import sys
@@ -23,7 +25,15 @@ from cyclopts import (
     UnusedCliTokensError,
 )
 
-from pipeline.cli.conventions import CLEAN, FAILED, USAGE, print_error, print_lines, print_note
+from pipeline.cli.conventions import (
+    CLEAN,
+    FAILED,
+    USAGE,
+    print_error,
+    print_lines,
+    print_note,
+    summarize_error,
+)
 from pipeline.core import SlipError, keep_current_folder_out, read_version, silence_warnings
 
 HELP = """How far was the motion from the ideal model, and why?
@@ -139,6 +149,14 @@ def _rename_out(words: Sequence[str]) -> list[str]:
     return [*renamed, *words[len(options) :]]
 
 
+def _refuse(words: Sequence[str], error: SlipError) -> None:
+    """Print an error that a verb did not answer itself as its JSON object, if JSON was asked for."""
+    if "--json" in itertools.takewhile(lambda word: word != "--", words):
+        content = {"runs": [], "errors": [summarize_error(error.where, error)]}
+        # One line: those who read `watch` read line by line.
+        sys.stdout.write(json.dumps(content) + "\n")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one verb and exit: 0 clean, 1 failed, 2 usage, 3 done with losses."""
     # Results must not depend on the number of threads of a library, and short jobs are slower with more.
@@ -147,19 +165,24 @@ def main(arguments: Sequence[str] | None = None) -> None:
     keep_current_folder_out()
     silence_warnings()
     gc.set_threshold(_YOUNG)
+    words = _rename_out(sys.argv[1:] if arguments is None else arguments)
     try:
-        words = _rename_out(sys.argv[1:] if arguments is None else arguments)
         verb = next(iter(words), "")
         if verb == "help":
             words, verb = [*words[1:], "--help"], next(iter(words[1:]), "")
         if verb in _MOVED:
-            print_note(f"slip: slip {verb} is now: slip {_MOVED[verb]} {verb}")
+            what = f"slip {verb} is now: slip {_MOVED[verb]} {verb}"
+            print_note(f"slip: {what}")
+            _refuse(words, SlipError("usage", what, hint=f"See slip {_MOVED[verb]} --help"))
             sys.exit(USAGE)
         code = build_app(verb)(words, exit_on_error=False)
-    except CycloptsError:
+    except CycloptsError as error:
+        chain = " ".join(error.command_chain or ())
+        _refuse(words, SlipError("usage", str(error).rstrip("."), hint=f"See slip {chain} --help"))
         sys.exit(USAGE)
     except SlipError as error:
         print_error(error)
+        _refuse(words, error)
         sys.exit(FAILED)
     except BrokenPipeError:
         # The reader of the pipe has exited (`slip ... | head`): no output is possible.

@@ -14,10 +14,10 @@ from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_lin
 from pipeline.core import (
     INPUT_WORDS,
     format_duration,
+    format_interval,
     format_recorded,
     format_share,
     mark_finding,
-    suffix_unit,
 )
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
@@ -429,8 +429,7 @@ def _format_parameter(number: Seen) -> str:
     value, low, high, share = (cast("float | None", number[key]) for key in ("value", "low", "high", "share"))
     if value is None or low is None or high is None or share is None:
         return "not determined"
-    unit = suffix_unit(number["unit"])
-    return f"{value:.3g}{unit} [{low:.3g}, {high:.3g}] (known to {format_share(share)})"
+    return f"{format_interval(value, low, high, number['unit'])} (known to {format_share(share)})"
 
 
 def _format_looks(seen: Seen, knowledge: Seen) -> str:

@@ -13,21 +13,18 @@ from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import (
     CLEAN,
-    FAILED,
     LOSSY,
     Choices,
     Results,
     TrustCode,
     build_options,
     open_shown,
-    print_error,
     print_json,
     print_lines,
     print_note,
     print_result,
     show_progress,
     spell_choices,
-    summarize_error,
 )
 from pipeline.cli.model_runs import gather_runs, open_model
 from pipeline.core import SlipError, finite_or_none, naming_os_errors
@@ -99,54 +96,48 @@ def plan(  # noqa: D417 - the runs document themselves
     options = build_options(Choices(vehicle=vehicle, config=config, results=results))
     said = spell_choices(Choices(results=results))
     at_work = runs[0] if runs else str(check or vehicle or "plan")
-    try:
-        names = list(runs or [])
-        if check is not None:
-            return _check(check, names, options, said, json=json, quiet=quiet)
-        from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
-        from pipeline.job.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
-        from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
-        from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
-        from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
+    names = list(runs or [])
+    if check is not None:
+        return _check(check, names, options, said, json=json, quiet=quiet)
+    from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
+    from pipeline.job.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
+    from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
 
-        seconds = parse_time(time)
-        protocols = () if compare is None else parse_protocols(compare)
-        gathered = _gather(names, options, quiet=quiet or json) if names else None
-        chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
-        recordings = [] if gathered is None else gathered.recordings
-        # Report wrong options before a long diagnosis.
-        wish = Wish(
-            parse_area(area, chosen),
-            seconds,
-            tuple(wanted or ()),
-            max_speed,
-            max_yaw_rate,
-            max_acceleration,
-            topic,
-            type_name,
-            seed,
-        )
-        for name in {*wish.wanted} - {UNDECIDED, ALL}:
-            find_effect(name)
-        with show_progress(at_work, quiet=quiet or json) as progress:
-            progress("diagnosis")
-            if gathered is None:
-                studied = expect(chosen, terrain, known or results)
-            else:
-                studied = study(recordings, chosen, terrain, known or results)
-            command = {} if gathered is None else gathered.command
-            progress("choosing manoeuvres")
-            planned = plan_drive(chosen, studied, wish, recordings, command)
-            made, forecast = planned.plan, studied.forecast
-            others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
-        asked = [question.text for question in planned.questions]
-        files = write_drive(made, folder, results)
-        shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
-    except SlipError as error:
-        print_error(error)
-        if json:
-            print_json({"errors": [summarize_error(at_work, error)]})
-        return FAILED
+    seconds = parse_time(time)
+    protocols = () if compare is None else parse_protocols(compare)
+    gathered = _gather(names, options, quiet=quiet or json) if names else None
+    chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
+    recordings = [] if gathered is None else gathered.recordings
+    # Report wrong options before a long diagnosis.
+    wish = Wish(
+        parse_area(area, chosen),
+        seconds,
+        tuple(wanted or ()),
+        max_speed,
+        max_yaw_rate,
+        max_acceleration,
+        topic,
+        type_name,
+        seed,
+    )
+    for name in {*wish.wanted} - {UNDECIDED, ALL}:
+        find_effect(name)
+    with show_progress(at_work, quiet=quiet or json) as progress:
+        progress("diagnosis")
+        if gathered is None:
+            studied = expect(chosen, terrain, known or results)
+        else:
+            studied = study(recordings, chosen, terrain, known or results)
+        command = {} if gathered is None else gathered.command
+        progress("choosing manoeuvres")
+        planned = plan_drive(chosen, studied, wish, recordings, command)
+        made, forecast = planned.plan, studied.forecast
+        others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
+    asked = [question.text for question in planned.questions]
+    files = write_drive(made, folder, results)
+    shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     if json:
         content = {
             one.protocol: dict(zip(asked, map(finite_or_none, one.seconds), strict=True)) for one in others

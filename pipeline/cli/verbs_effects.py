@@ -109,7 +109,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
                 print_error(error)
                 errors.append(summarize_error(recordings[0].path, error))
     if apply is not None:
-        _apply(answers, apply, quiet=quiet or json)
+        errors += _apply(answers, apply, quiet=quiet or json)
     if json:
         omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
         print_json({"runs": _to_json(answers), "errors": errors, **omitted})
@@ -283,20 +283,24 @@ def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequenc
     return exit_code(errors, lossy=bool(lossy) or is_excluded)
 
 
-def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> None:
+def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[str, str]]:
+    """Write the proposed model; the error of there being none, as a JSON object."""
     from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415 - heavy
 
     if not answers:  # the errors were said
-        return
+        return []
     proposal = next((one.proposal for one in answers if one.proposal is not None), None)
     if proposal is None:
         refusals = [find_refusal(run) for answer in answers for run in answer.runs]
         what = f"no model can be proposed: {next(filter(None, refusals), 'nothing could be judged')}"
-        raise SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
+        error = SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
+        print_error(error)
+        return [summarize_error(str(path), error)]
     write_model(proposal, path)
     if not quiet:
         print_lines([f"{path}: {', '.join(proposal.model.ids) or 'the ideal model'}"])
+    return []
 
 
 def effects(  # noqa: D417 - the arguments document themselves

@@ -29,7 +29,7 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import SlipError, suffix_unit
+from pipeline.core import SlipError, format_interval, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.fleet.trend import Trend
@@ -74,51 +74,43 @@ def check(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    try:
-        _require_target(to, file, json=json)
-        _require_runs(after)
-        from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
-        from pipeline.job.check import (  # noqa: PLC0415 - heavy
-            check_as_json,
-            check_runs,
-            keep_baseline,
-            read_limits,
-        )
-        from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
-        from pipeline.models import write_text  # noqa: PLC0415 - heavy
-        from pipeline.store import Store  # noqa: PLC0415 - heavy
+    _require_target(to, file, json=json)
+    _require_runs(after)
+    from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
+    from pipeline.job.check import (  # noqa: PLC0415 - heavy
+        check_as_json,
+        check_runs,
+        keep_baseline,
+        read_limits,
+    )
+    from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.models import write_text  # noqa: PLC0415 - heavy
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
 
-        bounds = None if limits is None else read_limits(limits)
-        options = build_options(Choices(results=results))
-        known = _open_known(before, trust_code=trust_code)
-        silent = quiet or json or (to is not None and file is None)
-        with ExitStack() as stack:
-            first = (
-                _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
-            )
-            second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
-            owner: Owner | None = vehicle_of
-            checked = check_runs(
-                first,
-                second,
-                Store(results),
-                source=input,
-                owner=owner,
-                limits=bounds,
-                simulated=simulated,
-            )
-        lines = list_lines(checked)
-        if to is not None:
-            text = _render(checked, to)
-            if file is None:
-                sys.stdout.write(text)
-            else:
-                write_text(file, text, code="check_unwritable")
-    except SlipError as error:
-        print_error(error)
-        if json:
-            print_json({"errors": [summarize_error(after, error)]})
-        return FAILED
+    bounds = None if limits is None else read_limits(limits)
+    options = build_options(Choices(results=results))
+    known = _open_known(before, trust_code=trust_code)
+    silent = quiet or json or (to is not None and file is None)
+    with ExitStack() as stack:
+        first = _open_runs(before, options, stack, diagnosed=True, quiet=silent) if known is None else known
+        second = _open_runs(after, options, stack, diagnosed=known is None, quiet=silent)
+        owner: Owner | None = vehicle_of
+        checked = check_runs(
+            first,
+            second,
+            Store(results),
+            source=input,
+            owner=owner,
+            limits=bounds,
+            simulated=simulated,
+        )
+    lines = list_lines(checked)
+    if to is not None:
+        text = _render(checked, to)
+        if file is None:
+            sys.stdout.write(text)
+        else:
+            write_text(file, text, code="check_unwritable")
     # The check is also printed if the baseline is not replaced.
     unkept: list[SlipError] = []
     try:
@@ -373,10 +365,10 @@ def _format_expected(number: Mapping[str, object], parameter: ModelParameter) ->
 
 
 def _format_interval(number: Mapping[str, object], unit: str) -> str:
-    value = f"{number['value']:.3g}{suffix_unit(unit)}"
+    value, low, high = (cast("float", number[key]) for key in ("value", "low", "high"))
     if number["low"] is None:
-        return f"{value} (no interval: fewer than three runs)"
-    return f"{value} [{number['low']:.3g}, {number['high']:.3g}]"
+        return f"{value:.3g}{suffix_unit(unit)} (no interval: fewer than three runs)"
+    return format_interval(value, low, high, unit)
 
 
 ALERT = 4

@@ -215,6 +215,30 @@ def integrate_rate(times: Floats, rate: Floats) -> Floats:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
+def integrate_between(start: Floats, end: Floats, times: Floats, rate: Floats) -> Floats:
+    """Integrals of a sampled rate over spans of time, shape (m,); NaN where readings are missing.
+
+    A missing reading is no rate of zero: rows that are not finite are left out, and a span that touches a
+    hole of more than `PERIODS` usual periods is unknown.
+
+    Args:
+        start: of each span [s], shape (m,).
+        end: of each span [s], shape (m,).
+        times: of the readings [s], shape (n,), increasing.
+        rate: the readings, NaN where missing, shape (n,).
+    """
+    known = np.isfinite(rate)
+    times, rate = times[known], rate[known]
+    if times.size < 2:  # noqa: PLR2004 - one reading has no duration
+        return np.full(start.shape, np.nan)
+    steps = np.diff(times)
+    holes = np.append(0.0, np.cumsum(steps > PERIODS * max(float(np.median(steps)), _SHORTEST_PERIOD)))
+    path = integrate_rate(times, rate)
+    moved, missing = (np.interp(end, times, sums) - np.interp(start, times, sums) for sums in (path, holes))
+    inside = (start >= times[0]) & (end <= times[-1]) & (missing == 0.0)
+    return np.where(inside, moved, np.nan)
+
+
 _GAUSSIAN = 1.4826
 """Ratio of the standard deviation of a normal distribution to its median absolute value."""
 _SHARE_OF_RMS = 0.5

@@ -28,6 +28,7 @@ from pipeline.estimation.ambiguity import (
 )
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
+from pipeline.estimation.encoder_scale import find_encoder_scale
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
@@ -166,13 +167,26 @@ def diagnose_runs(
         return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
     runs = [load_recording(recording, vehicle) for recording in recordings]
     known = () if model is None else model.effects
-    chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
-    context = prepare(runs, vehicle, chosen.source)
-    driven = sum(run.duration_s for run in runs)
-    budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
-    with both_cores(context.list_shared()):
-        ways, clocks = _explore(context, chosen.source, known, budget)
-        return _conclude(recordings, context, chosen, ways, clocks)
+
+    def judge(runs: Sequence[MotionRun]) -> Diagnosis:
+        chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
+        context = prepare(runs, vehicle, chosen.source)
+        driven = sum(run.duration_s for run in runs)
+        budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
+        with both_cores(context.list_shared()):
+            ways, clocks = _explore(context, chosen.source, known, budget)
+            return _conclude(recordings, context, chosen, ways, clocks)
+
+    judged = judge(runs)
+    misread = find_encoder_scale(judged.runs[0])
+    if misread is None:
+        return judged
+    return Diagnosis(
+        tuple(
+            replace(run, findings=(misread.report(), *run.findings))
+            for run in judge(misread.correct(runs)).runs
+        )
+    )
 
 
 def _explore(

@@ -2,19 +2,28 @@
 
 import enum
 from collections.abc import Iterable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import Complex, Floats, Ints, join_parts, turn_units
+from pipeline.core.arrays import SILENT_S, Complex, Floats, Ints, join_parts, turn_units
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Late, Place, ReportEffect, find_late
 from pipeline.models.model import Forward, Timing, replace_context
 from pipeline.run import MotionError, MotionRun
-from pipeline.run.heading import Grid, HeadingSource, choose_heading, lay_grid
+from pipeline.run.heading import Grid, HeadingSource, choose_heading, find_silences, has_excluded, lay_grid
 from pipeline.run.signals import Resets, RunContext, Signal, Velocity
-from pipeline.run.windows import WINDOW_S, find_gaps, find_lead, gather_nodes, join_horizons, join_windows
+from pipeline.run.windows import (
+    WINDOW_S,
+    Windows,
+    find_gaps,
+    find_lead,
+    gather_nodes,
+    join_horizons,
+    join_windows,
+)
 from pipeline.sources import Vehicle
 
 # Cell means of held commands are exact: finer cells change residuals in the sixth digit.
@@ -109,8 +118,12 @@ class Comparison:
             hint = "Correct [[interval]], or take all with --interval all."
             raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
-        self.windows = join_windows(run, self.grid, self.nodes, lead)
-        self.horizons = join_horizons(run, self.grid, self.nodes, lead)
+        self._silences = np.zeros(0) if run.wheels is None else find_silences(run.wheels)
+        compared = run
+        if source is Input.MEASURED:
+            compared = replace(run, excluded=np.union1d(run.excluded, self._silences))
+        self.windows = join_windows(compared, self.grid, self.nodes, lead)
+        self.horizons = join_horizons(compared, self.grid, self.nodes, lead)
         # First node of each prediction, common to all of its rows.
         self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
@@ -121,6 +134,17 @@ class Comparison:
         base = self._make_context(vehicle)
         self.forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_context(self.forward, self._look_from_horizons(base))
+
+    @property
+    def where_read(self) -> "Comparison":
+        """The same run, without the windows in which its encoders were silent."""
+        if not self._silences.size:
+            return self
+        known = ~has_excluded(self._silences, *self.windows.times.T)
+        compared = copy(self)
+        compared.windows = Windows(**{name: rows[known] for name, rows in vars(self.windows).items()})
+        compared._measured = {}  # noqa: SLF001 - its own
+        return compared
 
     @property
     def has_gyro(self) -> bool:
@@ -371,7 +395,10 @@ class Comparison:
         """The context with states reset at every horizon to the values known at that time."""
         grid, nodes = self.grid, self.nodes
         origin = np.unique(self.horizons.origin)
-        begin = grid.locate_edges(nodes.times[origin]).astype(np.int64)
+        at = nodes.times[origin]
+        # Where the encoders were silent, the drive goes on as predicted.
+        at = at[~has_excluded(self._silences, at - SILENT_S, at + SILENT_S)]
+        begin = grid.locate_edges(at).astype(np.int64)
         begin = np.minimum(begin, grid.times.size - 1)
         before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
         first = np.unique(np.concatenate((grid.first, begin)))

@@ -7,7 +7,15 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, cast
 
-from pipeline.core import JSON_DIGITS, finite_or_none, pick_finite, round_digits, suffix_unit
+from pipeline.core import (
+    JSON_DIGITS,
+    finite_or_none,
+    format_interval,
+    pick_finite,
+    round_digits,
+    split_interval,
+    suffix_unit,
+)
 from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
 from pipeline.estimation.verdict import format_verdict
@@ -28,6 +36,9 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
+_TIGHT = 10.0
+"""Expected range between runs over the interval in this run above which a row has both: a limit that clips
+the samples of one run is known to a fraction of a percent there, and not in the next run."""
 _LEAST_UNITS = 3.55
 """Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
 moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
@@ -75,11 +86,21 @@ class Value:
     def __str__(self) -> str:
         """The value as text, with its interval where there is one, and whether it is at its bound."""
         text = f"{round_digits(self.value, self.digits):.3g}{self.suffix}"
-        if math.isfinite(self.low):
+        if math.isfinite(self.high - self.low):
+            text = format_interval(self.value, self.low, self.high, self.unit)
+        elif math.isfinite(self.low):
             text += f" [{self.low:.3g}, {self.high:.3g}]"
         if self.at_bound:
             return f"{text} ({AT_BOUND})"
         return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
+
+    def format_with_range(self) -> str:
+        """The value as text, and its range between runs where this run says little about another one."""
+        low, high = self.another_run
+        if not high - low > _TIGHT * (self.high - self.low):
+            return str(self)
+        _, *ends = split_interval(self.value, low, high)
+        return f"{self} this run, [{', '.join(ends)}] another"
 
     def move(self, change: float) -> Value:
         """The value and its intervals shifted by a known amount."""
@@ -97,6 +118,12 @@ class Value:
             "at_bound": self.at_bound,
             "undetermined": self.is_undetermined,
         }
+
+
+def split_determined(numbers: Mapping[str, Value]) -> tuple[dict[str, Value], dict[str, Value]]:
+    """Values that the runs determine, and those that they leave open or that are at a bound."""
+    known = {name: value for name, value in numbers.items() if not value.is_undetermined}
+    return known, {name: value for name, value in numbers.items() if name not in known}
 
 
 def format_numbers(numbers: Mapping[str, Value]) -> str:
@@ -154,6 +181,16 @@ class Named:
             # The delay comes from the gyro, so it is that of the pose clock and not of the body.
             known = tuple(one for one in known if one.name == self.id)
         return tuple(one for one in known if one.level is Level.RUN) if self.by_run else known
+
+    @property
+    def is_determined(self) -> bool:
+        """Whether the runs determine one of its numbers; a corrected clock was measured beforehand."""
+        return self.corrected or bool(self.by_run) or not self.parameters or bool(self.shown)
+
+    @property
+    def shown(self) -> Mapping[str, Value]:
+        """The values that the runs determine; all those of a corrected clock."""
+        return self.parameters if self.corrected else split_determined(self.parameters)[0]
 
     @property
     def tellings(self) -> tuple[Mapping[str, Value], ...]:

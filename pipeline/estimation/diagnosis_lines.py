@@ -21,6 +21,7 @@ from pipeline.estimation.diagnosis import (
     RunDiagnosis,
     Value,
     format_numbers,
+    split_determined,
 )
 from pipeline.estimation.error_regions import (
     ABOVE_FLOOR,
@@ -141,10 +142,10 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines = [(VERDICT, verdict)]
     if not run.ladder:
         return [*lines, *findings]
-    main, minor = _split_effects(run)
+    main, minor, unknown = _split_effects(run)
     felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
-    short = [effect for effect in main if len(effect.parameters) <= _MOST_IN_LINE]
+    short = [effect for effect in main if len(effect.shown) <= _MOST_IN_LINE]
     width = max((len(_format_values(effect)) for effect in short), default=0)
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _format_ambiguous(item, run, falls)]
@@ -160,6 +161,7 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     others = [text for one in minor for text in _format_effect(one, run, falls)]
     others += [text for item in small for text in _format_ambiguous(item, run, falls)]
     lines += _label("smaller", others)
+    lines += _label("open", [*(effect.motion for effect in unknown), _format_unknown(run)])
     lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
     lines += _label("clocks", [_format_encoders(run)])
     lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
@@ -177,9 +179,24 @@ def _label(label: str, texts: Sequence[str]) -> list[Row]:
     return [("" if number else label, text) for number, text in enumerate(filter(None, texts))]
 
 
-def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named]]:
-    """The effects that remove a tenth of the error, with corrected clocks; and the smaller effects."""
-    return split_main(run.effects, run.ladder, lambda effect: (effect.id, effect.corrected))
+def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named], list[Named]]:
+    """Effects that remove a tenth of the error, with corrected clocks; smaller ones; those without a number.
+
+    What this log does not determine, or only at a bound, has no row but with `--all`.
+    """
+    unknown = [effect for effect in run.effects if not effect.is_determined]
+    known = [effect for effect in run.effects if effect.is_determined]
+    return *split_main(known, run.ladder, lambda effect: (effect.id, effect.corrected)), unknown
+
+
+def _format_unknown(run: RunDiagnosis) -> str:
+    """Numbers that this log does not determine."""
+    texts = [
+        f"{effect.id} {', '.join(unknown)}"
+        for effect in run.effects
+        if not (effect.corrected or effect.by_run) and (unknown := split_determined(effect.parameters)[1])
+    ]
+    return f"not determined by this log: {'; '.join(texts)}" if texts else ""
 
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
@@ -197,7 +214,7 @@ def _format_effect(
     notes += ["corrected before the fit"] if effect.corrected else []
     notes += ["tentative"] if effect.tentative else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
-    yield from _describe_numbers(effect.id, effect.parameters, parts, _format_values(effect), width)
+    yield from _describe_numbers(effect.id, effect.shown, parts, _format_values(effect), width)
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
         yield f"{_INDENT}{format_numbers(numbers)} in {name}"
 
@@ -211,7 +228,7 @@ def _describe_numbers(
     rest = "  ".join(filter(None, [first, *parts]))
     yield f"{_INDENT}{_pad_id(name)}{rest}".rstrip()
     if is_long:
-        yield from (f"{_INDENT}{_pad_id('')}{format_numbers({key: one})}" for key, one in numbers.items())
+        yield from (f"{_INDENT}{_pad_id('')}{_format_all({key: one})}" for key, one in numbers.items())
 
 
 def _pad_id(name: str) -> str:
@@ -223,10 +240,9 @@ def _format_ambiguous(item: Undecided, run: RunDiagnosis, falls: Mapping[str, st
     held = run.find_held(item)
     yield f"Undecided: {name_group(item.candidates)}"
     for name in item.candidates:
-        if name in item.numbers:
+        if numbers := split_determined(item.numbers.get(name, {}))[0]:
             notes = [falls.get(name, ""), "(in the model)"] if name == held else []
-            numbers = item.numbers[name]
-            yield from _describe_numbers(name, numbers, notes, format_numbers(numbers))
+            yield from _describe_numbers(name, numbers, notes, _format_all(numbers))
     yield f"{_INDENT}to separate them: {item.separate_by}"
 
 
@@ -365,7 +381,12 @@ def _format_immaterial(run: RunDiagnosis) -> list[str]:
 
 
 def _format_values(effect: Named) -> str:
-    return "a clock offset of each run:" if effect.by_run else format_numbers(effect.parameters)
+    return "a clock offset of each run:" if effect.by_run else _format_all(effect.shown)
+
+
+def _format_all(numbers: Mapping[str, Value]) -> str:
+    """Values by parameter, with their ranges between runs where these are much wider."""
+    return ", ".join(f"{name} = {value.format_with_range()}" for name, value in numbers.items())
 
 
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:

@@ -190,7 +190,9 @@ class Problem:
             self.whole = BodyPart(self.comparisons)
             self.parts = (
                 BodyPart(measured, delays, whole=False),
-                WheelPart(self.comparisons, measured, self.largest, self.exceeded),
+                WheelPart(
+                    [one.where_read for one in self.comparisons], measured, self.largest, self.exceeded
+                ),
             )
 
     def _compare(self, source: Input) -> tuple[Comparison, ...]:

@@ -198,12 +198,19 @@ def _list_clauses(diagnosis: Content) -> dict[str, str]:
     known = {
         str(one["id"]): str(one["clause"])
         for one in objects_in(diagnosis, "effects")
-        if one.get("clause") and one["id"] not in undecided
+        if one.get("clause") and one["id"] not in undecided and _is_determined(one)
     }
     if where := str(mapping_in(diagnosis, "unexplained").get("where", "")).partition(":")[0]:
         known[FORMULA] = f"the {where}"
     main = rank_main(objects_in(diagnosis, "ladder"))
     return {name: known[name] for name in main if name in known}
+
+
+def _is_determined(effect: Content) -> bool:
+    """Whether the log determines a number of an effect, or its clock was corrected beforehand."""
+    numbers = mapping_in(effect, "parameters")
+    undetermined = [bool(mapping_in(numbers, key).get("undetermined")) for key in numbers]
+    return bool(effect.get("corrected")) or not undetermined or not all(undetermined)
 
 
 def _describe_choice(diagnosis: Content) -> str:

@@ -8,7 +8,7 @@ from typing import Literal, cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, format_interval
 from pipeline.core.arrays import Floats
 from pipeline.fleet import UNKNOWN, ComparisonError
 from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
@@ -258,7 +258,7 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
     alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
     inside = fit.interval
     if inside is not None and not (math.isfinite(neutral) and inside.low <= neutral <= inside.high):
-        return Level.VEHICLE, f"{alike}: {fit.value:.3g} [{inside.low:.3g}, {inside.high:.3g}]"
+        return Level.VEHICLE, f"{alike}: {format_interval(fit.value, inside.low, inside.high)}"
     if fit.p_runs < SURE:
         spread = f"scatter by {fit.spread_run:.2g} about {fit.value:.3g}"
         return Level.RUN, f"{alike}, and runs {spread} (p = {fit.p_runs:.1g})"

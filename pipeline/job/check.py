@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import NORMAL_95, finite_or_none, format_share, guess_names, shorten
+from pipeline.core import NORMAL_95, finite_or_none, format_interval, format_share, guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
@@ -242,7 +242,7 @@ def _judge_ends(key: str, bound: Bound, unit: str, value: float, ends: tuple[flo
     low = -math.inf if bound.min is None else bound.min
     high = math.inf if bound.max is None else bound.max
     known = math.isfinite(value) and math.isfinite(ends[0])
-    text = f"{value:.3g} [{ends[0]:.3g}, {ends[1]:.3g}] {_unit(unit)}".strip() if known else "not observable"
+    text = f"{format_interval(value, *ends)} {_unit(unit)}".strip() if known else "not observable"
     return [Judged(key, _format_limit(bound, unit), text, _compare(ends, low, high))]
 
 

@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from pipeline.core import split_interval
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
 from pipeline.estimation.diagnosis_lines import format_learned_share, format_unexplained
@@ -27,7 +28,7 @@ from pipeline.report import (
     set_squares,
 )
 from pipeline.report.figures import Section
-from pipeline.report.scene import RunReport, format_ends
+from pipeline.report.scene import RunReport
 
 if TYPE_CHECKING:
     from pipeline.report.page import Page
@@ -269,20 +270,26 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
         shown = set_squares(str(unit)) if unit not in (None, "1", "") else ""
         doubt = AT_BOUND if values.get("at_bound") else UNDETERMINED
         doubts = [doubt] if values.get("undetermined") else []
+        text, ends = _format_within(values, values)
         rows.append(
             [
                 Cell(small=key) if rows else Cell(name, small=key, notes=notes),
-                Cell(
-                    format_number(number_in(values, "value"), digits=4),
-                    small=shown,
-                    notes=doubts,
-                ),
-                format_ends(values, digits=4),
-                format_ends(mapping_in(values, "another_run"), digits=4),
+                Cell(text, small=shown, notes=doubts),
+                ends,
+                _format_within(values, mapping_in(values, "another_run"))[1],
                 "" if rows else without,
             ]
         )
     return rows or [[Cell(name, notes=notes), "", "", "", without]]
+
+
+def _format_within(values: Mapping[str, object], ends: Mapping[str, object]) -> tuple[str, str]:
+    """A value, and an interval about it with the digits that it supports; empty where unknown."""
+    value, low, high = number_in(values, "value"), number_in(ends, "low"), number_in(ends, "high")
+    if value is None or low is None or high is None:
+        return "" if value is None else format_number(value, digits=4), ""
+    text, *both = split_interval(value, low, high)
+    return text, " to ".join(both)
 
 
 def _format_gain(gain: float | None) -> str:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core import arrays
-from pipeline.core.arrays import ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
 from pipeline.core.machine_code import compiled
 from pipeline.run import GyroFit, MotionRun, Track
 from pipeline.run.signals import STILL, Commands, DriveSeries, Signal, Wheels
@@ -95,6 +95,17 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     span = np.repeat(np.arange(starts.size), counts)
     times = starts[span] + (np.arange(span.size) - first[span] + 0.5) * step
     return Grid(step, times, span, first, starts, starts + counts * step)
+
+
+def find_silences(series: DriveSeries) -> Floats:
+    """Times [s] within the gaps of a drive's readings, in which its motion is unknown, 0.05 s apart."""
+    steps = np.diff(series.times)
+    # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
+    longest = max(SILENT_S, PERIODS * float(np.quantile(steps, 0.75))) if steps.size else np.inf
+    gaps = np.flatnonzero(steps > longest + ROUNDING_S).tolist()
+    return np.concatenate(
+        [np.zeros(0), *(np.arange(series.times[gap] + 0.05, series.times[gap + 1], 0.05) for gap in gaps)]
+    )
 
 
 class MeasuredDrive:

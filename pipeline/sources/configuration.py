@@ -117,6 +117,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         unit: unit of wheel speeds, or of wheel angles; by default that of the message type.
         per_turn: ticks per turn of the wheel.
         sign: -1 if forward is recorded as negative.
+        scale: factor on recorded speeds, where an encoder counts low or high.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
     """
@@ -134,6 +135,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unit: Unit | None = None
     per_turn: Positive | None = None
     sign: Literal[1, -1] = 1
+    scale: Positive | None = None
     time: Clock | None = None
     hold_s: Positive | None = None
 
@@ -145,12 +147,14 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         topic: poses, satellite fixes, or velocities over ground.
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
+        axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
         time: which of the message's times to use.
     """
 
     topic: str | None = None
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
+    axes: Literal["enu", "ned"] = "enu"
     time: Clock | None = None
 
 

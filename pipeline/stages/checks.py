@@ -26,11 +26,19 @@ from pipeline.stages.trust import (
 
 # Consistency of commands, encoders and poses in left and right, ahead and back: faults of the wiring.
 #
-# Three signals describe the same motion: the command, the encoders and the localization. If one of them
-# contradicts the two others, it is wired or mounted wrongly; no physical effect exchanges left and right.
+# Three signals describe the same motion: the command, the encoders and the localization; a gyro describes its
+# turning. If one of them contradicts two others, it is wired or mounted wrongly; no physical effect exchanges
+# left and right. With two that contradict each other, either may be wrong.
 # Only differential drives are checked, whose sides are known.
 
-FAULTS: Final = ("sides_exchanged", "wheel_sign", "pose_mirrored", "wheel_dead", "steering_as_yaw_rate")
+FAULTS: Final = (
+    "sides_exchanged",
+    "wheel_sign",
+    "pose_mirrored",
+    "signs_contradict",
+    "wheel_dead",
+    "steering_as_yaw_rate",
+)
 """Findings each of which makes every fit meaningless."""
 
 _LIVE: Final = 0.05
@@ -44,6 +52,21 @@ _USUAL: Final = 0.95
 _LEAST_SCALE: Final = 0.04
 """Smallest difference of the sides' scales that is reported: unequal tyres and motors reach 0.035."""
 _AXES: Final = ("ahead", "turning")
+_EITHER: Final = "either"
+_WORDS: Final = {
+    "wheels": "the measured wheels",
+    "command": "the commands",
+    "pose": "the poses",
+    "gyro": "the gyro",
+}
+_MIRRORED: Final = (
+    "the poses' frame is of the other hand, as north, east, down (z down, yaw clockwise): "
+    'axes = "ned" under [pose] in run.toml'
+)
+_REVERSED: Final = (
+    "the frame of the poses points to the rear, as that of a sensor that is mounted backward: correct its "
+    "transform to base_link"
+)
 
 
 def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
@@ -62,7 +85,9 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         return []
     sides = {name: side[live] for name, side in sides.items()}
     findings = (
-        _check_dead_side(sides) or _check_one_sign(sides) or _check_signs(sides, body=samples.body_commanded)
+        _check_dead_side(sides)
+        or _check_one_sign(sides)
+        or _check_signs(sides, samples.gyro_sign, body=samples.body_commanded)
     )
     return findings or _check_side_scale(sides)
 
@@ -108,7 +133,7 @@ def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
     return []
 
 
-def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
+def _check_signs(sides: Mapping[str, Floats], gyro_sign: float, *, body: bool) -> list[Finding]:
     """The one of command, wheels and poses that contradicts the others, ahead or in turning."""
     motion = {name: (side.sum(axis=1), side[:, 1] - side[:, 0]) for name, side in sides.items()}
     least = LIVE_SHARE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
@@ -123,23 +148,33 @@ def _check_signs(sides: Mapping[str, Floats], *, body: bool) -> list[Finding]:
             frozenset(pair): _correlate(motion[pair[0]][index][axis_live], motion[pair[1]][index][axis_live])
             for pair in combinations(motion, 2)
         }
-        name = _find_odd(signs, list(motion))
+        name = _find_odd(signs, list(motion), gyro_sign if axis == "turning" else 0.0)
         if name is not None:
             wrong.setdefault(name, []).append(axis)
             value = min(signs.values())
-    # With all three, one of them is wrong; with two, the wrong one cannot be identified.
+    # A gyro that names what turns the other way tells of it alone.
+    if len(wrong) == 2 and _EITHER in wrong:  # noqa: PLR2004 - what the gyro names, and the way ahead
+        wrong = {name: list(_AXES) for name in wrong if name != _EITHER}
+    other = next(name for name in sides if name != "pose")
     return (
-        [_report_sign(name, axes, value, body=body) for name, axes in wrong.items()]
+        [
+            _report_either(other, axes, value, body=body)
+            if name == _EITHER
+            else _report_sign(name, axes, value, agree=_list_agreeing(sides, name), body=body)
+            for name, axes in wrong.items()
+        ]
         if len(wrong) == 1
         else []
     )
 
 
-def _find_odd(signs: Mapping[frozenset[str], float], names: list[str]) -> str | None:
-    """The signal against the others, `wheels` or `command` with poses alone; None if all agree."""
+def _find_odd(signs: Mapping[frozenset[str], float], names: list[str], gyro_sign: float) -> str | None:
+    """The signal against the others, `_EITHER` of two without a third; None if all agree."""
     if len(names) == 2:  # noqa: PLR2004 - poses, and one more
         other = next(name for name in names if name != "pose")
-        return other if signs[frozenset(names)] < -_RELATED else None
+        if signs[frozenset(names)] >= -_RELATED:
+            return None
+        return _EITHER if gyro_sign == 0.0 else "pose" if gyro_sign < 0.0 else other
     for name in names:
         against = [value for pair, value in signs.items() if name in pair]
         among = next(value for pair, value in signs.items() if name not in pair)
@@ -148,26 +183,64 @@ def _find_odd(signs: Mapping[frozenset[str], float], names: list[str]) -> str | 
     return None
 
 
-def _report_sign(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
+def _list_agreeing(sides: Mapping[str, Floats], odd: str) -> str:
+    """The signals that agree against the odd one, in words: the gyro where there is no third one."""
+    others = [name for name in ("command", "wheels", "pose") if name in sides and name != odd]
+    return " and ".join(_WORDS[name] for name in (others if len(others) > 1 else [*others, "gyro"]))
+
+
+def _list_fields(axes: list[str]) -> str:
+    """Fields of a body command along these axes."""
+    return " and ".join({"ahead": "linear.x", "turning": "angular.z"}[axis] for axis in axes)
+
+
+def _say_turned(name: str, axes: list[str], *, body: bool) -> str:
+    """What mends a command or wheels whose sign is wrong along these axes."""
+    if name == "command" and body:
+        return f"turn the sign of {_list_fields(axes)} in what sends it"
+    if axes == ["turning"]:
+        return f"exchange left and right under [{name}] in run.toml"
+    also = ", and left and right exchanged," if axes == ["ahead"] else ""
+    return f"sign = -1{also} under [{name}] in run.toml"
+
+
+def _report_either(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
+    """Two signals that contradict each other, with what mends the one and the other."""
+    verbs = {"ahead": "drive", "turning": "turn"}
+    pose = "base_link is mirrored: correct the localization's frame"
+    if len(axes) == 1:
+        pose = _MIRRORED if axes == ["turning"] else _REVERSED
+    what = f"have the wrong sign: {_say_turned(name, axes, body=body)}"
+    if name == "command" and body:
+        what = f"have the wrong sign of {_list_fields(axes)} where they are sent"
+    text = (
+        f"{_WORDS[name]} and the poses {' and '.join(verbs[axis] for axis in axes)} opposite ways "
+        f"(correlation {value:.2f}), and no third signal tells which of them is wrong: either {pose}; or "
+        f"{_WORDS[name]} {what}"
+    )
+    return Finding("signs_contradict", "error", text, where=f"{name}, pose", value=value)
+
+
+def _report_sign(name: str, axes: list[str], value: float, *, agree: str, body: bool) -> Finding:
     turned = f"correlation {value:.2f}"
     if name == "pose":
         what = "move backward and turn the other way: base_link is mirrored"
+        mend = "correct the localization's frame"
         if axes == ["turning"]:
-            what = "turn the other way: their frame is of the other hand (y right, or yaw clockwise)"
+            what, mend = "turn the other way", _MIRRORED
         elif axes == ["ahead"]:
-            what = "move backward: base_link points to the rear"
-        text = f"commands and wheels agree, and the poses {what} ({turned}): correct the localization's frame"
+            what, mend = "move backward", _REVERSED
+        text = f"{agree} agree, and the poses {what} ({turned}): {mend}"
         return Finding("pose_mirrored", "error", text, where="pose", value=value)
-    they = {"wheels": "the measured wheels", "command": "the commands"}[name]
-    mend = "turn the sign of {} in what sends it" if name == "command" and body else None
+    they, mend = _WORDS[name], _say_turned(name, axes, body=body)
     if axes == ["turning"]:
-        mend = mend.format("angular.z") if mend else f"exchange left and right under [{name}] in run.toml"
         text = (
             f"left and right are exchanged: {they} turn left where the vehicle turns right ({turned}; {mend})"
         )
         return Finding("sides_exchanged", "error", text, where=name, value=value)
-    also = " and left and right are exchanged" if axes == ["ahead"] else ""
-    mend = mend.format("linear.x") if mend else f"sign = -1 under [{name}] in run.toml"
+    also = (
+        " and left and right are exchanged" if axes == ["ahead"] and not (body and name == "command") else ""
+    )
     text = (
         f"{they} run backward while the vehicle drives forward ({turned}): their sign is wrong{also} ({mend})"
     )

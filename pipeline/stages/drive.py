@@ -96,16 +96,20 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
     findings: list[Finding] = []
-    missing = [joint for joint in (*left, *right) if not _is_known(velocity, joint)]
+    missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
     if missing:
         text = f"{columns.topic} has no velocity of {', '.join(missing)}: positions were differentiated"
         findings.append(Finding("velocity_from_position", "info", text, where=columns.topic))
     for joint in missing:
-        if not _is_known(position, joint):
+        if not _is_known(joint, position, velocity):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
     if section.unit is None:
-        both = [joint for joint in (*left, *right) if joint not in missing and _is_known(position, joint)]
+        both = [
+            joint
+            for joint in (*left, *right)
+            if joint not in missing and _is_known(joint, position, velocity)
+        ]
         unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
         if unit:
             section = structs.replace(section, unit=unit)
@@ -265,8 +269,10 @@ def _joint_matrix(values: object, names: RaggedStrings) -> dict[str, Floats]:
     return series_by_joint
 
 
-def _is_known(series: Mapping[str, Floats], joint: str) -> bool:
-    return joint in series and bool(np.isfinite(series[joint]).mean() > 0.5)  # noqa: PLR2004 - most of the time
+def _is_known(joint: str, series: Mapping[str, Floats], other: Mapping[str, Floats]) -> bool:
+    """Whether a joint's series has most of its readings; other messages may be of other joints."""
+    read = [np.isfinite(one[joint]) for one in (series, other) if joint in one]
+    return joint in series and bool(read[0].sum() > 0.5 * np.any(read, axis=0).sum())
 
 
 def _choose_joints(
@@ -290,13 +296,20 @@ def _no_wheels(topic: str, joints: Sequence[str]) -> StageError:
 
 
 def differentiate_angle(times: Floats, angle: Floats) -> Floats:
-    """Rate [rad/s] of a wheel angle [rad] by central differences; a wrapped angle is unwrapped."""
-    wraps = bool(np.nanmax(np.abs(np.diff(angle))) > np.pi and np.ptp(angle) <= 2.0 * np.pi + 1e-6)
-    series = np.unwrap(angle) if wraps else angle
-    if times.size < 3:  # noqa: PLR2004 - a central difference needs neighbours
-        return np.zeros_like(angle)
+    """Rate [rad/s] of a wheel angle [rad] by central differences between readings, NaN where there is none.
+
+    A wrapped angle is unwrapped.
+    """
+    rate = np.where(np.isfinite(angle), 0.0, np.nan)
+    known = np.isfinite(angle)
+    if known.sum() < 3:  # noqa: PLR2004 - a central difference needs neighbours
+        return rate
+    series, times = angle[known], times[known]
+    if float(np.max(np.abs(np.diff(series)))) > np.pi and np.ptp(series) <= 2.0 * np.pi + 1e-6:
+        series = np.unwrap(series)
     spaced = np.maximum.accumulate(times) + np.arange(times.size) * 1e-12
-    return np.asarray(np.gradient(series, spaced), dtype=np.float64)
+    rate[known] = np.gradient(series, spaced)
+    return rate
 
 
 def _to_radps(values: Floats, section: DriveSection, vehicle: Vehicle) -> Floats:

@@ -236,8 +236,11 @@ class _Extraction:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
+        # Half a turn about the x axis puts z and the vehicle upright.
+        upright = np.array([1.0, -1.0, -1.0]) if self.configuration.pose.axes == "ned" else np.ones(3)
+        position, quaternion = arrays.position * upright, arrays.quaternion * np.append(upright, 1.0)
         track = pose_topics.cut_track(
-            times, arrays.position, arrays.quaternion, breaks, self.configuration.velocity, source.topic
+            times, position, quaternion, breaks, self.configuration.velocity, source.topic
         )
         self.findings += track.findings
         return pl.DataFrame(
@@ -379,10 +382,17 @@ class _Extraction:
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
         self.findings += drive.findings
+        if not held and section.scale is not None:
+            text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
+            self.findings.append(
+                Finding("encoder_scale_given", "info", text, where="wheels", value=section.scale)
+            )
         times = self._seconds(stamp)
         empty = np.full(times.size, np.nan)
         values = {
-            name: empty if (series := getattr(drive, name)) is None else series
+            name: empty
+            if (series := getattr(drive, name)) is None
+            else series * (1.0 if name == "steering" else section.scale or 1.0)
             for name in Drive.list_signals()
             if held or not name.startswith("body")
         }

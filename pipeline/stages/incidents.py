@@ -98,7 +98,7 @@ class Rims:
         asked: (f_x, f_y, f_w times half the track) of the command, shape (n, 3).
         is_known: whether a command is valid, or the topic is silent after its first one.
         expired: what the last command asked where it is too old to be valid, else zero, shape (n, 3).
-        wheels: measured; None without encoders.
+        wheels: measured, NaN where unknown; None without encoders.
         driven: (f_x, f_y, f_w times half the track) of the wheels, zero where unknown, shape (n, 3).
         body: speed of the poses.
         moved: (v_x, v_y, v_w times half the track) of the poses, shape (n, 3).
@@ -213,9 +213,10 @@ def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: 
         known = np.asarray((counts | command.stale) & command.active, dtype=bool)
     driven, wheels = np.zeros((times.size, 3)), None
     if measured is not None:
+        # Unknown wheels neither turn nor stand: every comparison with NaN is false.
+        wheels = np.abs(measured.velocity * scale).sum(axis=1)
         driven = np.nan_to_num(measured.velocity) * scale
-        wheels = np.abs(driven).sum(axis=1)
-        known = known & np.isfinite(measured.velocity).all(axis=1)
+        known = known & np.isfinite(wheels)
     expired = np.zeros((times.size, 3)) if command is None else command.expired * scale
     size = np.abs(asked).sum(axis=1)
     largest = [one[one > 0.02] for one in (size, wheels) if one is not None]  # noqa: PLR2004 - asked at all

@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import SlipError, arrays, format_share, rigid
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Flags, Floats
 from pipeline.logs import LogData
 from pipeline.run.signals import ANSWERS_S, LIVE_SHARE
 from pipeline.run.windows import WINDOW_S
@@ -282,9 +282,12 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     if time.size < FEWEST_MESSAGES:
         return None
     ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
-    rate = np.nan_to_num(imu["rate_z"].to_numpy())
-    turned = np.diff(np.interp(time[ends], clock, arrays.integrate_rate(clock, rate)))
-    return measure_rest(np.diff(yaw[ends]), turned, np.diff(time[ends]))
+    at = time[ends]
+    turned = arrays.integrate_between(at[:-1], at[1:], clock, imu["rate_z"].to_numpy())
+    known = np.isfinite(turned)
+    if known.sum() < FEWEST_MESSAGES:
+        return None
+    return measure_rest(np.diff(yaw[ends])[known], turned[known], np.diff(at)[known])
 
 
 def split_chords(position: Floats, yaw: Floats) -> tuple[Floats, Floats]:
@@ -343,7 +346,7 @@ def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[s
     clock = wheels["t"].to_numpy()
 
     def integral(rate: Floats) -> Floats:
-        return np.diff(np.interp(time[ends], clock, arrays.integrate_rate(clock, np.nan_to_num(rate))))
+        return arrays.integrate_between(time[ends[:-1]], time[ends[1:]], clock, rate)
 
     if kind == "ackermann":
         speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
@@ -380,24 +383,19 @@ def fit_controller(
         return None
     if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
         return None
+    commands = commands.filter(pl.col("body_x").is_finite() & pl.col("body_w").is_finite())
+    if commands.height < FEWEST_MESSAGES:
+        return None
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
     starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S, WINDOW_S)
-    spans = np.stack((starts, starts + ANSWERS_S))
+    spans = (starts, starts + ANSWERS_S)
     held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
-
-    def sum_up(times: Floats, total: Floats) -> Floats:
-        moved: Floats = np.diff(np.interp(spans, times, total), axis=0)[0]
-        return moved
-
     left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
     rolled, turned = (
-        sum_up(clock, arrays.integrate_rate(clock, np.nan_to_num(rate)))
-        for rate in (0.5 * (left + right), right - left)
+        arrays.integrate_between(*spans, clock, rate) for rate in (0.5 * (left + right), right - left)
     )
-    distance, turn = (
-        sum_up(asked, np.append(0.0, np.cumsum(np.nan_to_num(commands[name].to_numpy())[:-1] * held)))
-        for name in ("body_x", "body_w")
-    )
+    sums = (np.append(0.0, np.cumsum(commands[name].to_numpy()[:-1] * held)) for name in ("body_x", "body_w"))
+    distance, turn = (np.diff([np.interp(at, asked, total) for at in spans], axis=0)[0] for total in sums)
     radius, over = _steady_gain(distance, rolled), _steady_gain(turn, turned)
     if not radius or not over or radius <= 0.0 or over <= 0.0:
         return None
@@ -412,14 +410,21 @@ def _steady_gain(moved: Floats, driven: Floats) -> float | None:
     gain = _median_gain(moved, driven)
     if gain is None:
         return None
-    live = np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven)))
+    live = _find_live(driven)
     rest = np.abs(moved[live] / (gain * driven[live]) - 1.0) if gain else np.ones(1)
     return gain if float(np.median(rest)) < ONE_SCALE else None
 
 
+def _find_live(driven: Floats) -> Flags:
+    """Known spans with a motion well above that of standing, shape (n,)."""
+    size = np.nan_to_num(np.abs(driven))
+    live: Flags = size > LIVE_SHARE * float(np.max(size, initial=0.0))
+    return live
+
+
 def _median_gain(moved: Floats, driven: Floats) -> float | None:
     """Weighted median of moved over driven; None if hardly anything was driven."""
-    live = np.abs(driven) > LIVE_SHARE * float(np.max(np.abs(driven), initial=0.0))
+    live = _find_live(driven)
     if live.sum() < FEWEST_MESSAGES:
         return None
     ratio, weight = moved[live] / driven[live], np.abs(driven[live])

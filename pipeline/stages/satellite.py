@@ -430,8 +430,12 @@ def list_turnings(imu: Receiver) -> list[Turning]:
     if times.size < reading.FEWEST_MESSAGES:
         return []
     rates, _ = reading.read_imu(imu.columns)
-    rate = np.nan_to_num(rates[imu.order, 2])
-    turnings = [Turning(f"the gyro of {imu.columns.topic}", times, arrays.integrate_rate(times, rate))]
+    rate = rates[imu.order, 2]
+    read = np.isfinite(rate)
+    turnings = []
+    if read.sum() >= reading.FEWEST_MESSAGES:
+        angle = arrays.integrate_rate(times[read], rate[read])
+        turnings.append(Turning(f"the gyro of {imu.columns.topic}", times[read], angle))
     attitude = reading.read_attitude(imu.columns)
     if attitude is not None:
         attitude = attitude[imu.order]

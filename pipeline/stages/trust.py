@@ -114,6 +114,7 @@ class Samples:
         command: ideal velocity of the command, shape (n, 3); None without commands.
         measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
         body_commanded: whether the command was a body command.
+        gyro_sign: sign of the gyro as recorded against the poses; zero without one that agrees with them.
     """
 
     times: Floats
@@ -127,6 +128,7 @@ class Samples:
     command: Floats | None
     measured: Floats | None
     body_commanded: bool
+    gyro_sign: float = 0.0
 
 
 def gather_samples(
@@ -320,12 +322,13 @@ def check_echo(
     if min(commands.height, wheels.height) < _FEWEST_CHANGES:
         return []
     kinematics = vehicle.kinematics
+    names = [one.name for one in kinematics.inputs]
+    commands, wheels = (_keep_readings(table, names) for table in (commands, wheels))
+    if min(commands.height, wheels.height) < _FEWEST_CHANGES:
+        return []
     asked, read = (
-        np.nan_to_num(
-            np.stack(
-                roll({one.name: table[one.name].to_numpy() for one in kinematics.inputs}, vehicle), axis=-1
-            )
-        )
+        # An input that no message has is none, as sideways speeds of wheels are.
+        np.nan_to_num(np.stack(roll({name: table[name].to_numpy() for name in names}, vehicle), axis=-1))
         for table, roll in (
             (commands, kinematics.asked if body_commanded else kinematics.forward),
             (wheels, kinematics.forward),
@@ -351,6 +354,13 @@ def check_echo(
         "commands alone; record the encoders (/joint_states), or set open_loop: false in the controller"
     )
     return [Finding("wheels_from_commands", "warning", text, where="wheels", value=share)]
+
+
+def _keep_readings(table: pl.DataFrame, names: Sequence[str]) -> pl.DataFrame:
+    """Rows in which every input is known that any row has."""
+    known = table.select(pl.col(names).cast(pl.Float64).is_finite().fill_null(value=False))
+    rows = [known[name] for name in names if known[name].any()]
+    return table.filter(pl.all_horizontal(rows)) if rows else table.clear()
 
 
 def check_live_commands(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

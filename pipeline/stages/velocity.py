@@ -272,7 +272,8 @@ def find_events(
     rims = gather_rims(velocities, inputs, vehicle)
     loss, events = np.zeros(times.size), list[_Event]()
     if rims is not None and rims.wheels is not None:
-        unknown = bad | mark_excluded(times, [span for span in incidents if span[0] != "stuck"])
+        unknown = bad | np.isnan(rims.wheels)
+        unknown |= mark_excluded(times, [span for span in incidents if span[0] != "stuck"])
         gain = measure_gain(rims, 0)
         limits = find_limits(rims.top, gain)
         brought = gain * rims.driven[:, 0]

@@ -124,6 +124,7 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         "tau": Value(0.681, 0.587, 0.775, "s"),
         "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
         "bound": Value(1.03, 0.91, 1.15, "m/s"),
+        "scrub": Value(1.3312, 1.3300, 1.3324, "m/s", another_run=(0.42, 2.24)),
     }
     named = Named(
         "wheel_servo", numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
@@ -133,14 +134,53 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
         {"effects": ["wheel_servo"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
     )
-    texts = [text for _, text in list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))]
+    lines = list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))
+    texts = [text for _, text in lines]
     at = texts.index("Wheel servo: lag 0.68 s")
     assert [text.strip() for text in texts[at + 1 : at + 5]] == [
         "wheel_servo         60 -> 54 cm",
-        "tau = 0.68 s [0.587, 0.775]",
-        "reset = 0 1/s (at its bound)",
+        "tau = 0.68 s [0.59, 0.78]",
         "bound = 1.03 m/s [0.91, 1.15]",
+        "scrub = 1.3312 m/s [1.3300, 1.3324] this run, [0.4, 2.2] another",
     ]
+    # A number at its bound is none: only --all says which.
+    assert not any("reset" in text for _, text in choose_lines(lines, everything=False))
+    assert ("open", "not determined by this log: wheel_servo reset") in lines
+
+
+def test_an_effect_without_a_determined_number_has_no_row_and_no_sentence() -> None:
+    """Its step of the errors stays, and JSON says `at_bound` and `undetermined`."""
+    ladder = (
+        {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
+        {"effects": ["torque_limit"], "t_mrmse_m": 0.3, "r_mrmse_rad": 0.5},
+        {"effects": ["torque_limit", "drive_lag"], "t_mrmse_m": 0.2, "r_mrmse_rad": 0.5},
+    )
+    known = {"tau": Value(0.3, 0.2, 0.4, "s")}
+    for unknown in (
+        {
+            "limit": Value(14.4, 14.4, 14.4, "m/s^2", at_bound=True),
+            "no_load": Value(1.0, 0.1, 27.0, "m/s", one_sided=True),
+        },
+        {"limit": Value(14.4, math.nan, math.nan, "m/s^2")},
+        {"no_load": Value(1.0, 0.1, 27.0, "m/s", one_sided=True)},
+    ):
+        effects = tuple(
+            Named(
+                name, numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
+                motion=f"{name} in words", clause=f"has a {name}",
+            )
+            for name, numbers in (("torque_limit", unknown), ("drive_lag", known))
+        )  # fmt: skip
+        run = RunDiagnosis("run", "command", effects=effects, ladder=ladder)
+        lines = list_lines(run)
+        shown = " ".join(text for _, text in choose_lines(lines, everything=False))
+        assert "torque" not in shown
+        assert "The robot has a drive_lag; with two effects in the model" in shown
+        words = f"not determined by this log: torque_limit {', '.join(unknown)}"
+        assert ("open", "torque_limit in words") in lines
+        assert ("", words) in lines
+        first, _ = run.to_json()["effects"]
+        assert all(number["undetermined"] for number in first["parameters"].values())
 
 
 @pytest.mark.parametrize(

@@ -343,7 +343,7 @@ def test_without_a_diagnosis_the_page_proposes_one_and_draws_no_model(report: Ru
 def test_what_a_diagnosis_names_is_told_with_its_numbers(page: str) -> None:
     told = outline_text(page)
     assert "effective_track" in told
-    assert "1.740 to 1.840" in told
+    assert "1.74 to 1.84" in told
     assert "x 13" in told
     assert "from command to wheels" in told
     assert "held-out squared error over half a second without it" in told

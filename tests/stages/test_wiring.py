@@ -15,6 +15,7 @@ from pipeline.estimation import diagnose_runs
 from pipeline.job import Options, work
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
+from pipeline.simulate import Imu, make_scenario, simulate_run, write_log
 from pipeline.stages.checks import FAULTS, check_wiring, run_checks
 
 if TYPE_CHECKING:
@@ -115,9 +116,15 @@ UNTOLD = {
 }
 
 
+CONTRADICTED = {"command", "wheels"}
+
+
 def check_all(samples: Samples, vehicle: Vehicle, name: str = "") -> None:
     assert check_wiring(samples, vehicle) == []
     assert vehicle.track_width_m is not None
+    # Without encoders or without commands, a gyro is the third signal; its sign is that of the poses or not.
+    is_pair = samples.command is None or samples.measured is None
+    is_alone = is_pair and samples.gyro_sign == 0.0
     for words, (signal, change, told) in FAULTY.items():
         if getattr(samples, signal) is None:
             continue
@@ -128,22 +135,37 @@ def check_all(samples: Samples, vehicle: Vehicle, name: str = "") -> None:
             assert check_wiring(wired, vehicle) == []
             continue
         (found,) = check_wiring(wired, vehicle)
-        assert (found.id, found.where) == told, words
+        contradicts = is_alone and told[1] in CONTRADICTED
+        expected = ("signs_contradict", f"{told[1]}, pose") if contradicts else told
+        assert (found.id, found.where) == expected, words
         # Whatever else such wheels look like: a vehicle that does not move, for one.
         assert found in run_checks(wired, vehicle), words
     for factors in ((1.0, -1.0, -1.0), (-1.0, -1.0, 1.0), (-1.0, 1.0, -1.0)):
-        turned = replace(samples, velocity=samples.velocity * np.array(factors))
+        turned = replace(
+            samples,
+            velocity=samples.velocity * np.array(factors),
+            gyro_sign=samples.gyro_sign * factors[2],
+        )
         (found,) = check_wiring(turned, vehicle)
-        assert (found.id, found.where) == ("pose_mirrored", "pose"), factors
+        is_told = not is_pair or (samples.gyro_sign != 0.0 and factors[2] < 0.0)
+        assert found.id == ("pose_mirrored" if is_told else "signs_contradict"), factors
 
 
 def test_every_fault_is_told_apart_on_a_sample(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     check_all(*gather(SAMPLE, tmp_path, monkeypatch))
 
 
-@pytest.mark.parametrize(("turning", "told"), [(0.02, []), (0.5, ["sides_exchanged"])])
+@pytest.mark.parametrize(
+    ("turning", "gyro_sign", "told"),
+    [
+        (0.02, 0.0, []),
+        (0.5, 0.0, ["signs_contradict"]),
+        (0.5, 1.0, ["sides_exchanged"]),
+        (0.5, -1.0, ["pose_mirrored"]),
+    ],
+)
 def test_turning_that_is_no_more_than_a_rest_has_no_sign(
-    turning: float, told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    turning: float, gyro_sign: float, told: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A vehicle that follows late still turns back while the command already stands."""
     samples, vehicle = gather(SAMPLE, tmp_path, monkeypatch)
@@ -151,8 +173,96 @@ def test_turning_that_is_no_more_than_a_rest_has_no_sign(
     swing = turning * np.sign(np.sin(np.arange(samples.command.shape[0])))
     command, velocity = samples.command.copy(), samples.velocity.copy()
     command[:, 2], velocity[:, 2] = swing, -swing
-    changed = replace(samples, command=command, velocity=velocity, measured=None)
+    changed = replace(samples, command=command, velocity=velocity, measured=None, gyro_sign=gyro_sign)
     assert [found.id for found in check_wiring(changed, vehicle)] == told
+
+
+def write_run(
+    path: Path, layout: str, *, ned: bool = False, command: float = 1.0, gyro: float | None = None
+) -> Path:
+    """A drive whose poses are in north, east, down, or whose commanded yaw rate has another sign.
+
+    Args:
+        path: the log.
+        layout: topics.
+        ned: whether poses are in north, east, down.
+        command: sign of the recorded angular.z.
+        gyro: sign of the gyro, in place of encoders; None without one.
+    """
+    scenario = make_scenario(
+        None, {"effective_track": 1.3}, seed=3, duration_s=60.0, vehicle="husky", layout=layout
+    )
+    imu = None if gyro is None else Imu(sign=1 if gyro > 0.0 else -1)
+    encoders = scenario.encoders if gyro is None else None
+    run = simulate_run(replace(scenario, imu=imu, encoders=encoders))
+    run = replace(run, commands=replace(run.commands, turn=command * run.commands.turn))
+    if ned:
+        upright = np.array([1.0, -1.0, -1.0, 1.0])
+        poses = replace(
+            run.poses, position=run.poses.position * upright[:3], quaternion=run.poses.quaternion * upright
+        )
+        run = replace(run, poses=poses)
+    write_log(run, path)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("layout", "changes", "told", "mends"),
+    [
+        (
+            "body_command",
+            {"ned": True},
+            "signs_contradict",
+            ('axes = "ned" under [pose] in run.toml', "wrong sign of angular.z"),
+        ),
+        (
+            "body_command",
+            {"command": -1.0},
+            "signs_contradict",
+            ('axes = "ned" under [pose] in run.toml', "wrong sign of angular.z"),
+        ),
+        (
+            "husky_body_command",
+            {"ned": True},
+            "pose_mirrored",
+            ("the commands and the measured wheels agree", 'axes = "ned" under [pose] in run.toml'),
+        ),
+        ("husky_body_command", {"command": -1.0}, "sides_exchanged", ("turn the sign of angular.z",)),
+        (
+            "husky_body_command",
+            {"ned": True, "gyro": 1.0},
+            "pose_mirrored",
+            ("the commands and the gyro agree", 'axes = "ned"'),
+        ),
+        (
+            "husky_body_command",
+            {"command": -1.0, "gyro": 1.0},
+            "sides_exchanged",
+            ("turn the sign of angular.z",),
+        ),
+    ],
+)
+def test_poses_in_north_east_down_are_not_taken_for_a_wrong_command(
+    layout: str, changes: dict[str, float], told: str, mends: tuple[str, ...], tmp_path: Path
+) -> None:
+    log = write_run(tmp_path / "run.mcap", layout, **changes)
+    manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
+    vehicle, recording = read_recording(manifest)
+    (found,) = [one for one in recording.list_findings() if one["id"] in FAULTS]
+    assert found["id"] == told
+    for mend in mends:
+        assert mend in found["text"]
+    (run,) = diagnose_runs([recording], vehicle).runs
+    assert run.effects == ()
+    if changes.get("ned"):
+        # The line that the finding gives mends it.
+        (tmp_path / "run.toml").write_text('[pose]\naxes = "ned"\n')
+        manifest = analyze_log(log, Options(out=tmp_path / "mended", report=False, diagnosis=False)).manifest
+        vehicle, recording = read_recording(manifest)
+        assert not {one["id"] for one in recording.list_findings()} & set(FAULTS)
+        (run,) = diagnose_runs([recording], vehicle).runs
+        (effect,) = [one for one in run.effects if one.id == "effective_track"]
+        assert effect.parameters["k"].value == pytest.approx(1.3, rel=0.02)
 
 
 def test_without_commands_the_poses_tell(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,7 +270,7 @@ def test_without_commands_the_poses_tell(tmp_path: Path, monkeypatch: pytest.Mon
     track_m = vehicle.track_width_m or 1.0
     for words in ("encoders exchanged", "left negative", "right dead"):
         _, change, told = FAULTY[words]
-        wired = replace(rewire(samples, track_m, "measured", change), command=None)
+        wired = replace(rewire(samples, track_m, "measured", change), command=None, gyro_sign=1.0)
         (found,) = check_wiring(wired, vehicle)
         assert (found.id, found.where) == told, words
 

@@ -1,0 +1,83 @@
+"""Scale of the encoders: a drive gain and a wheel radius whose product is one are what the encoders misread.
+
+An encoder that counts low makes wheels reach less than their command, and the body go further than them.
+Together both leave the motion as it was commanded: they change nothing but the readings between.
+"""
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from pipeline.core import format_share
+from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
+from pipeline.models.catalogue import find_effect
+from pipeline.models.parameter import TwinRole
+from pipeline.run import MotionRun
+
+GIVEN: Final = "encoder_scale_given"
+"""Finding of a run whose configuration says the scale: it is not estimated."""
+_LEAST: Final = 0.02
+"""Smallest misreading that is reported: unequal tyres and motors reach 0.035 between the sides."""
+_ONE: Final = 0.004
+"""Deviation of the product from one within which it is one: the least size of a wheel radius worth a name."""
+
+
+@dataclass(frozen=True)
+class EncoderScale:
+    """Readings of the encoders over the true wheel speeds, and the effects that it explains."""
+
+    value: float
+    gain: float
+    radius: float
+
+    def correct(self, runs: Sequence[MotionRun]) -> list[MotionRun]:
+        """The runs with the true wheel speeds."""
+        return [
+            replace(run, wheels=run.wheels.change(run.wheels.times, lambda read: read / self.value))
+            if run.wheels is not None
+            else run
+            for run in runs
+        ]
+
+    def report(self) -> Mapping[str, object]:
+        """The finding, with the line of run.toml that mends it."""
+        way = "low" if self.value < 1.0 else "high"
+        text = (
+            f"the encoders read {format_share(abs(self.value - 1.0))} {way}: the body moves as commanded, "
+            f"while the wheels seem to turn {self.gain:.3g} times as fast as commanded and the body to move "
+            f"{self.radius:.3g} times as far as they turn. The readings were corrected for the effects; "
+            f"scale = {1.0 / self.value:.4g} under [wheels] in run.toml corrects the tables too. If instead "
+            "the wheels have another radius and the drive has that gain by coincidence, scale = 1 names both"
+        )
+        where, severity = "wheels", "warning"
+        return {
+            "id": "encoder_scale",
+            "text": text,
+            "where": where,
+            "severity": severity,
+            "value": self.value,
+        }
+
+
+def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
+    """Scale of the encoders that explains two identified effects; None if their product is not one."""
+    if any(finding["id"] == GIVEN for finding in diagnosis.findings):
+        return None
+    gain, radius = (next(_list_values(diagnosis.effects, role), None) for role in _ROLES)
+    if gain is None or radius is None or gain.is_undetermined or radius.is_undetermined:
+        return None
+    off = abs(math.log(gain.value * radius.value))
+    sure = math.hypot(gain.half / gain.value, radius.half / radius.value)
+    if off > max(sure, _ONE) or abs(math.log(gain.value)) < max(_LEAST, 2.0 * off):
+        return None
+    return EncoderScale(gain.value, gain.value, radius.value)
+
+
+_ROLES: Final = (TwinRole.SPEED_GAIN, TwinRole.RADIUS)
+
+
+def _list_values(effects: Sequence[Named], role: TwinRole) -> Iterator[Value]:
+    for effect in effects:
+        if find_effect(effect.id).twin is role:
+            yield from effect.parameters.values()
