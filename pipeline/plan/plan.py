@@ -1,14 +1,14 @@
 """A plan: manoeuvres chosen for questions, and the expected gain of the whole."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from pipeline.core import finite_or_none, format_share, pick
+from pipeline.core import enumerate_texts, finite_or_none, format_share, pick
 from pipeline.core.arrays import Complex, Floats
 from pipeline.models import Effect, list_effects
 from pipeline.models.parameter import Largest
@@ -26,6 +26,7 @@ from pipeline.plan import (
     is_steered,
     join,
     list_manoeuvres,
+    list_raised,
     wait,
 )
 from pipeline.plan.questions import (
@@ -102,6 +103,7 @@ class Plan:
         wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
             has other inputs.
         ways: paths of the models, base first, positions x + iy [m] at 20 Hz, shape (models, n).
+        as_driven: limits that are what the runs reached, in words.
     """
 
     vehicle: str
@@ -120,6 +122,12 @@ class Plan:
     spare_gain: float
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
+    as_driven: tuple[str, ...] = ()
+
+    def format_limits(self) -> str:
+        """All limits, and which of them are what the runs reached."""
+        text = self.limits.format(steered=self.steered)
+        return f"{text} ({enumerate_texts(self.as_driven)} as the runs reached)" if self.as_driven else text
 
     def format_rest(self) -> str:
         """Use of the time after the last decision, or why it is not driven; empty without a drive."""
@@ -150,6 +158,7 @@ class Plan:
             "runs": list(self.runs),
             **pick(self, "home_m", "spare_s", "spare_gain"),
             "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
+            "limits_as_driven": list(self.as_driven),
             "area": asdict(self.area),
             "safety": list(SAFETY),
             "topic": self.topic,
@@ -181,6 +190,7 @@ class Request:
         runs: names of the logs that the knowledge is based on.
         topic, type_name: topic on which the commands will be played, and its type.
         seed: seed of the draws of parameters.
+        as_driven: limits that are what the runs reached, in words.
     """
 
     limits: Limits
@@ -190,10 +200,15 @@ class Request:
     topic: str = "/cmd_vel"
     type_name: str = "geometry_msgs/msg/Twist"
     seed: int = 0
+    as_driven: tuple[str, ...] = ()
 
 
 def make_plan(
-    knowledge: Knowledge, questions: Sequence[Question], request: Request, later: Sequence[Question] = ()
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    request: Request,
+    later: Sequence[Question] = (),
+    notify: Callable[[str], object] = str,
 ) -> Plan:
     """Choose manoeuvres that answer questions, and compute the expected gain of the whole.
 
@@ -202,6 +217,7 @@ def make_plan(
         questions: to answer.
         request: time, area and limits.
         later: questions for the time that remains after the others are answered.
+        notify: called with what is being done.
 
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
@@ -209,9 +225,11 @@ def make_plan(
     largest = find_largest(knowledge, request.limits, request.time_s)
     models = _list_models(knowledge, [*questions, *later], largest, request.seed)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
+    notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open questions")
     chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
     best, order, gain = _rehearse(knowledge, questions, request.area, [], models), [], 0.0
-    for reserve in _RESERVES if chooser is not None else ():
+    for attempt, reserve in enumerate(_RESERVES if chooser is not None else (), start=1):
+        notify(f"choosing manoeuvres, attempt {attempt} of at most {len(_RESERVES)}")
         chosen = chooser.choose(reserve) if chooser is not None else []
         trial = _rehearse(knowledge, questions, request.area, [library[number] for number in chosen], models)
         if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
@@ -222,6 +240,7 @@ def make_plan(
         asked = [*questions, *(later if not best.impossible else ())]
         if len(asked) > len(questions):
             chooser = _make_chooser(knowledge, asked, request, library, models)
+        notify("filling the time that is left")
         longer = chooser.extend(order, _AMPLE)
         fuller = _rehearse(knowledge, asked, request.area, [library[number] for number in longer], models)
         # Questions of second priority may stay open without a report.
@@ -237,10 +256,14 @@ def make_plan(
         undriven = tuple(replace(one, reached="") for one in best.impossible)
         best, order = replace(best, manoeuvres=(), starts=(), impossible=undriven), []
     if chooser is not None:
-        reasons = tuple(explain_open(one, chooser, order) for one in best.impossible)
-        best = replace(best, impossible=reasons)
+        reasons = []
+        for number, one in enumerate(best.impossible, start=1):
+            notify(f"what keeps open questions open: {number} of {len(best.impossible)}")
+            reasons.append(explain_open(one, chooser, order))
+        best = replace(best, impossible=_name_limits(reasons, knowledge, questions, request, notify))
     commands, ways = best.commands, best.ways
     return Plan(
+        as_driven=request.as_driven,
         vehicle=knowledge.vehicle.id,
         runs=request.runs,
         manoeuvres=tuple((one.name, at) for one, at in zip(best.manoeuvres, best.starts, strict=True)),
@@ -258,6 +281,38 @@ def make_plan(
         wheels=_turn_wheels(commands, knowledge),
         ways=ways,
     )
+
+
+def _name_limits(
+    reasons: Sequence[Impossible],
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    request: Request,
+    notify: Callable[[str], object],
+) -> tuple[Impossible, ...]:
+    """Open questions; where no room and no time answers one, with the limit of commands that keeps it open.
+
+    All manoeuvres are rehearsed with one limit after the other raised.
+    """
+    still = {one.question for one in reasons if one.needs_limits}
+    for name, limits, text in list_raised(knowledge.vehicle, request.limits) if still else ():
+        notify(f"whether the limit of {text} keeps them open")
+        library = list_manoeuvres(knowledge.vehicle, limits)
+        edges = np.concatenate(([0.0], np.cumsum([one.commands.duration_s for one in library])))
+        commands = join([one.commands for one in library])
+        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, edges[:-1])
+        asked = [one for one in questions if one.text in still]
+        found = {
+            one.question.text
+            for one in Judge(rehearsal, knowledge, edges).judge(asked)
+            if float(one.answer(np.ones(edges.size - 1))) >= 1.0
+        }
+        advice = f"the limit of {text} keeps it open: give {name}, where the robot and the ground allow it"
+        reasons = [replace(one, because=advice) if one.question in found else one for one in reasons]
+        still -= found
+        if not still:
+            break
+    return tuple(reasons)
 
 
 def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
