@@ -29,8 +29,8 @@ STATUSES = ("changed", "differs", "unchanged", "unknown")
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
-LIKELY = 0.1
-"""Largest probability of a difference without a change at which a change is called likely."""
+LIKELY = 0.2
+"""Largest p at which a change is called likely: at most one check in five of an unchanged robot says so."""
 _LEAST_SHARE = 0.01
 """Smallest share of cases that is printed as a number."""
 _LEAST_P = 1e-4
@@ -105,7 +105,7 @@ def _format_doubts(check: Check, differs: Sequence[str]) -> str:
     least = min(change.p_alone for change in changes)
     often = format_share(max(least, _LEAST_SHARE), 1)
     rate = f"{'less than ' if least < _LEAST_SHARE else ''}{often}"
-    opening = "Likely changed" if least <= LIKELY else "No conclusion"
+    opening = "Likely changed" if min(change.p for change in changes) <= LIKELY else "No conclusion"
     chance = f"runs without a change differ by as much in {rate} of cases"
     return f"{opening}: the recordings differ in {listed}; {chance}"
 

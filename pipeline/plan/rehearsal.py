@@ -31,8 +31,6 @@ from pipeline.sources import Vehicle
 # derivatives. The ground is assumed to be level.
 
 _POSE_HZ = 20.0
-_SLOW_SHARE = 0.7
-"""Share of the largest speed below which a speed is another one."""
 # Poses and encoders continue for this time after the last command [s].
 _AFTER_S = 0.2
 
@@ -89,11 +87,10 @@ class Rehearsal:
     def find_excitation(self, edges: Floats) -> dict[Excitation, Flags]:
         """What the commands between each two edges excite, by kind: columns for its parts, shape (k, parts).
 
-        Whether commands are large, small or changing enough, the information on a question itself says.
+        Whether commands are large, small, different or changing enough, the information on a question says.
         """
         asked, size = self.predict(()), edges.size - 1
         group = np.clip(np.searchsorted(edges, self._comparison.grid.times, side="right") - 1, 0, size - 1)
-        fastest = float(np.abs(asked.x).max(initial=0.0))
 
         def happens(*parts: Flags) -> Flags:
             counts = [np.bincount(group, part, minlength=size) > 0.0 for part in parts]
@@ -101,12 +98,10 @@ class Rehearsal:
 
         ahead, back = asked.x > STILL_MPS, asked.x < -STILL_MPS
         left, right = asked.w > STILL_MPS, asked.w < -STILL_MPS
-        slow = np.abs(asked.x) < _SLOW_SHARE * fastest
         return {
             Excitation.DRIVING: happens(ahead | back),
             Excitation.TURNING: happens(left, right),
             Excitation.BOTH_SIGNS: happens(ahead, back),
-            Excitation.SPEED_SPREAD: happens((ahead | back) & slow, (ahead | back) & ~slow),
             Excitation.STEERING: happens(left, right),
             Excitation.SIDEWAYS: happens(np.abs(asked.y) > STILL_MPS),
         }
