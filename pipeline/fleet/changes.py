@@ -259,7 +259,7 @@ def compare_sides(
         return replace(run, values=run.values / size, covariance=run.covariance / np.outer(size, size))
 
     scaled = [rescale(run) for run in runs]
-    groups = [(run.side, run) for run in scaled]
+    groups: list[tuple[str, RunNumbers]] = [(run.side, run) for run in scaled]
     groups += [(f"others {name}", rescale(run)) for name, group in others.items() for run in group]
     spreads = [
         _learn_spread(groups, index, float(scale)) for index, scale in enumerate((usual / size).tolist())

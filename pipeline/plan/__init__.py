@@ -88,7 +88,7 @@ class Reached:
     Attributes:
         speed_mps, yaw_rate_radps: commanded.
         acceleration_mps2: of the body, measured.
-        lateral_mps2: commanded speed times commanded yaw rate.
+        lateral_mps2: measured speed times measured yaw rate.
     """
 
     speed_mps: float = math.nan

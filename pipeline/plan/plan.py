@@ -51,6 +51,8 @@ _RESERVES = (1.1, 1.4, 1.8)
 # Multiple of the goals; more driving adds nothing. Spare time is driven if it narrows an interval by a tenth.
 _AMPLE = 2.0
 _LEAST_GAIN = 0.1
+# Factor on what is reached from which a raised limit is named: less is not worth a harder drive.
+_HELPS = 1.25
 # A shorter rest is not reported.
 _LEAST_REST_S = 5.0
 
@@ -290,29 +292,41 @@ def _name_limits(
     request: Request,
     notify: Callable[[str], object],
 ) -> tuple[Impossible, ...]:
-    """Open questions; where no room and no time answers one, with the limit of commands that keeps it open.
+    """Open questions; where no room and no time answers one, with the limit that holds it back most.
 
     All manoeuvres are rehearsed with one limit after the other raised.
     """
     still = {one.question for one in reasons if one.needs_limits}
-    for name, limits, text in list_raised(knowledge.vehicle, request.limits) if still else ():
-        notify(f"whether the limit of {text} keeps them open")
+    asked = [one for one in questions if one.text in still]
+    if not asked:
+        return tuple(reasons)
+
+    def look(limits: Limits) -> list[tuple[float, bool]]:
+        """By question: how much all manoeuvres reach, larger for more, and whether that answers it."""
         library = list_manoeuvres(knowledge.vehicle, limits)
         edges = np.concatenate(([0.0], np.cumsum([one.commands.duration_s for one in library])))
         commands = join([one.commands for one in library])
         rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, edges[:-1])
-        asked = [one for one in questions if one.text in still]
-        found = {
-            one.question.text
-            for one in Judge(rehearsal, knowledge, edges).judge(asked)
-            if float(one.answer(np.ones(edges.size - 1))) >= 1.0
-        }
-        advice = f"the limit of {text} keeps it open: give {name}, where the robot and the ground allow it"
-        reasons = [replace(one, because=advice) if one.question in found else one for one in reasons]
-        still -= found
-        if not still:
-            break
-    return tuple(reasons)
+        every = np.ones(edges.size - 1)
+        judged = Judge(rehearsal, knowledge, edges).judge(asked)
+        return [(one.rate(every), float(one.answer(every)) >= 1.0) for one in judged]
+
+    notify("what the limits of the commands keep open")
+    before = [reached for reached, _ in look(request.limits)]
+    best: dict[str, tuple[float, str]] = {}
+    for option, limits, text in list_raised(knowledge.vehicle, request.limits):
+        notify(f"whether the limit of {text} keeps questions open")
+        for one, own, (reached, is_answered) in zip(asked, before, look(limits), strict=True):
+            if reached > max(own * _HELPS, best.get(one.text, (0.0, ""))[0]):
+                allowed = "where the robot and the ground allow it"
+                advice = f"the limit of {text} keeps it open: give {option}, {allowed}"
+                if not is_answered:
+                    times = f"{reached / own:.1f} times as much" if own > 0.0 else "something"
+                    advice = f"the limit of {text} holds it back most: {option}, {allowed}, tells {times}"
+                best[one.text] = reached, advice
+    return tuple(
+        replace(one, because=best[one.question][1]) if one.question in best else one for one in reasons
+    )
 
 
 def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:

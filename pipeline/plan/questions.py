@@ -173,11 +173,31 @@ class Answerable:
             shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, remaining, reserve))
         return np.asarray(np.min(shares, axis=0)) * self._cover(weight)
 
+    def rate(self, weight: Floats) -> float:
+        """What a drive reaches, larger for more: a block t, or the inverse of an interval."""
+        measured = float(self.measure(weight))
+        return measured if isinstance(self.question, Separation) else 1.0 / measured
+
+    def format_reached(self, weight: Floats) -> str:
+        """What a drive reaches, as text."""
+        measured = float(self.measure(weight))
+        if isinstance(self.question, Separation):
+            enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
+        else:
+            bound = float(self.bound(weight))
+            enough = bound <= self.question.goal
+            what = f"+- {measured:.2g}, up to {bound:.2g}"
+        if enough and (lacking := self.list_lacking(weight)):
+            return f"{what}, without {enumerate_texts(lacking)}"
+        return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
+
     def list_lacking(self, weight: Floats) -> list[str]:
         """Excitation that the question's effects declare to need and the drive lacks, in words."""
         return [need.value for need, parts in self._list_needed() if not ((weight @ parts) > 0.0).all()]
 
     def _list_needed(self) -> list[tuple[Excitation, Floats]]:
+        if not self.groups.excited:
+            return []
         needs = {need for name in self.question.effects for need in find_effect(name).needs}
         return [(need, parts.astype(float)) for need, parts in self.groups.excited.items() if need in needs]
 
@@ -439,7 +459,7 @@ def leave_open(one: Answerable, weight: Floats) -> Impossible:
         one: the question.
         weight: how often each of its groups is driven, shape (k,); all zero: nothing is driven.
     """
-    reached = _format_reached(one, weight) if weight.any() else ""
+    reached = one.format_reached(weight) if weight.any() else ""
     return Impossible(one.question.text, one.question.effects, "", reached)
 
 
@@ -466,7 +486,7 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
     if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
         seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
         return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    at_best = f"expected {_format_reached(one, best)}"
+    at_best = f"expected {one.format_reached(best)}"
     because = _advise(one.question, longest_s)
     return replace(question, because=because, reached=at_best, needs_limits=True)
 
@@ -490,24 +510,8 @@ def _continue(
 
 
 def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:
-    """Whether a drive reaches more than another: a larger t, or a narrower interval."""
-    if not weight.any():
-        return False
-    these = float(one.measure(weight)), float(one.measure(than))
-    return these[0] > these[1] if isinstance(one.question, Separation) else these[0] < these[1]
-
-
-def _format_reached(one: Answerable, weight: Floats) -> str:
-    measured = float(one.measure(weight))
-    if isinstance(one.question, Separation):
-        enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
-    else:
-        bound = float(one.bound(weight))
-        enough = bound <= one.question.goal
-        what = f"+- {measured:.2g}, up to {bound:.2g}"
-    if enough and (lacking := one.list_lacking(weight)):
-        return f"{what}, without {enumerate_texts(lacking)}"
-    return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
+    """Whether a drive reaches more than another."""
+    return bool(weight.any()) and one.rate(weight) > one.rate(than)
 
 
 def _advise(question: Question, longest_s: float) -> str:

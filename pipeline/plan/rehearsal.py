@@ -14,7 +14,7 @@ from pipeline.estimation import Comparison, Input, Problem, State, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.intervals import count_repeats
-from pipeline.estimation.parts import Part, locate_windows
+from pipeline.estimation.parts import Part, average_windows, locate_windows
 from pipeline.estimation.problem import average_sustained, measure_largest
 from pipeline.estimation.state import Free, pick_columns, weigh_columns
 from pipeline.models import Effect, Model, Place, Timing
@@ -148,14 +148,14 @@ class Rehearsal:
 
 
 _REACHED = 0.99
-"""Quantile of half-second means that counts as reached: single samples and jumps of poses are not."""
+"""Quantile of measured half-second means that counts as reached: jumps of poses are not."""
 _MOVED = 0.05
 """Least speed [m/s], yaw rate [rad/s] and acceleration [m/s^2] that count as driving in this way."""
 
 
 def measure_reached(problem: Problem) -> Reached:
-    """What the driving of runs reached: commanded speeds, and the measured acceleration."""
-    parts: dict[str, list[Floats]] = {"speed": [], "turn": [], "lateral": [], "acceleration": []}
+    """What the driving of runs reached: commanded speed and yaw rate, and measured accelerations."""
+    parts: dict[str, list[Floats]] = {"speed": [], "turn": [], "acceleration": [], "lateral": []}
     for comparison in problem.comparisons:
         vehicle, series = comparison.context.vehicle, comparison.run.commands
         if series is None:
@@ -165,21 +165,23 @@ def measure_reached(problem: Problem) -> Reached:
         live = np.maximum(ahead, turned) > _MOVED
         parts["speed"].append(ahead[live])
         parts["turn"].append(turned[live])
-        parts["lateral"].append((ahead * turned)[live])
-        still = comparison.predict_velocity((), Timing())
-        moved = comparison.find_residuals((), Timing())[:, 0]
-        moved = moved + locate_windows(comparison).average(comparison, still.x)
+        ideal = comparison.predict_velocity((), Timing())
+        moved = comparison.find_residuals((), Timing())
+        moved = moved + average_windows(comparison, ideal, locate_windows(comparison))
+        driven = np.abs(moved[:, [0, 2]]).max(axis=1) > _MOVED
+        parts["lateral"].append(np.abs(moved[driven, 0] * moved[driven, 2]))
         times = comparison.windows.times[:, 0]
         apart = times[2:] - times[:-2]
-        near = (apart > 0.0) & (apart < 2.0 * WINDOW_S)
-        parts["acceleration"].append(np.abs(moved[2:] - moved[:-2])[near] / apart[near])
+        near = (apart > 0.0) & (apart < 2.0 * WINDOW_S) & driven[1:-1]
+        parts["acceleration"].append(np.abs(moved[2:, 0] - moved[:-2, 0])[near] / apart[near])
 
-    def find(name: str) -> float:
+    def find(name: str, quantile: float) -> float:
         values = np.concatenate([*parts[name], np.zeros(0)])
-        most = float(np.quantile(values, _REACHED)) if values.size else 0.0
+        most = float(np.quantile(values, quantile)) if values.size else 0.0
         return float(f"{most:.2g}") if most > _MOVED else math.nan
 
-    return Reached(find("speed"), find("turn"), find("acceleration"), find("lateral"))
+    commanded = (find(name, 1.0) for name in ("speed", "turn"))
+    return Reached(*commanded, *(find(name, _REACHED) for name in ("acceleration", "lateral")))
 
 
 def start_state(effects: Sequence[Effect]) -> State:

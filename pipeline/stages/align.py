@@ -23,7 +23,7 @@ from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle, list_presets
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.drive import interpolate_readings
+from pipeline.stages.drive import Drive, interpolate_readings
 from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_choice import find_steady_gain
@@ -378,11 +378,8 @@ def measure_body_multiplier(commands: pl.DataFrame, vehicle: Vehicle) -> float |
     live = commands.filter(pl.all_horizontal(pl.col(name).is_finite() for name in asked_for))
     if live.is_empty():
         return None
-    inputs = {
-        name: np.nan_to_num(live[name].cast(pl.Float64).to_numpy())
-        for name in ("left", "right", "sideways")
-        if name in live.columns
-    }
+    driven = [name for name in Drive.list_signals() if name in live.columns and not name.startswith("body")]
+    inputs = {name: np.nan_to_num(live[name].cast(pl.Float64).to_numpy()) for name in driven}
     rolled = vehicle.kinematics.forward(inputs, vehicle)
     label = arrays.number_stretches(live["t"].to_numpy() - float(live["t"][0]), ANSWERS_S)
     number = np.unique(label, return_inverse=True)[1]

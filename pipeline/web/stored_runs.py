@@ -123,9 +123,7 @@ KINDS = {
 _TIME = "60s"
 
 
-def write_run_plan(
-    store: Store, manifest: Manifest, area: str, notify: Callable[[str], object] = str
-) -> None:
+def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable[[str], None]) -> None:
     """Plan the drive that decides the open questions of a stored run; this takes many seconds.
 
     Args:
