@@ -227,7 +227,8 @@ def make_plan(
     largest = find_largest(knowledge, request.limits, request.time_s)
     models = _list_models(knowledge, [*questions, *later], largest, request.seed)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
-    notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open questions")
+    plural = "s" * (len(questions) != 1)
+    notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open question{plural}")
     chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
     best, order, gain = _rehearse(knowledge, questions, request.area, [], models), [], 0.0
     for attempt, reserve in enumerate(_RESERVES if chooser is not None else (), start=1):
