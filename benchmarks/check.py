@@ -139,10 +139,12 @@ def play_null(seed: int, pairs: int, out: Path | None) -> None:
             print(f"  {number} {kind}: {error}", flush=True)
             continue
         alike = compare(found.sides, simulated=True)
-        kept = [[one.numbers.values.tolist(), one.numbers.covariance.tolist()]
+        names = list(found.changes)
+        rows = [found.sides.names.index(name) for name in names]
+        kept = [[one.numbers.values[rows].tolist(), one.numbers.covariance[np.ix_(rows, rows)].tolist()]
                 for one in (*found.sides.before, *found.sides.after)]  # fmt: skip
         add_row(out, {"seed": number, "kind": kind, "changed": tell(found), "within": tell(alike),
-                      "names": found.sides.names, "sides": kept})  # fmt: skip
+                      "names": names, "sides": kept})  # fmt: skip
         for what, check in (("ALARM", found), ("within", alike)):
             if tell(check):
                 print(f"  {number} {kind} {what}: {'; '.join(tell(check))}", flush=True)

@@ -1,8 +1,11 @@
 """`slip check` on readings that `benchmarks/check.py null --out FILE` kept: alarms, and power as it says.
 
-Run: python benchmarks/check_again.py null|power FILE [--trials N] [--seed N]
+Run: python benchmarks/check_again.py null|drawn|power FILE [--trials N] [--seed N] [--others N]
 
 - `null`: the pairs judged again under the spreads that the catalogue declares now.
+- `drawn`: pairs without a change whose numbers are drawn: the errors and correlations of a kept pair, and a
+  spread between runs for each number as the catalogue declares; `--others` further runs of it are known.
+  Printed is how many are called changed, and how many likely changed.
 - `power`: groups of three runs a side with the errors and correlations of kept runs and half of the declared
   spreads; one number is shifted. Printed is the share of groups in which it is found, beside what the check
   says of itself, for five causes at four sizes. No run is simulated: thousands of trials take minutes.
@@ -13,6 +16,7 @@ from __future__ import annotations
 import argparse
 import math
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +26,8 @@ from json_lines import read_rows
 from pipeline.core.arrays import Floats
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
 from pipeline.job.check import find_usual_spread
-from pipeline.job.stored_fits import ERRORS, USUAL_LOG_RATIO
+from pipeline.job.check_text import LIKELY
+from pipeline.job.stored_fits import USUAL_LOGARITHMS
 from pipeline.models.catalogue import find_effect
 
 KINDS = ("closed", "natural", "sets")
@@ -38,8 +43,8 @@ FEWEST = 3
 
 def find_usual(name: str) -> float:
     """Scale of the prior of a number's spread between runs."""
-    if name in ERRORS:
-        return USUAL_LOG_RATIO
+    if name in USUAL_LOGARITHMS:
+        return USUAL_LOGARITHMS[name]
     effect, _, parameter = name.partition(".")
     return find_usual_spread(find_effect(effect)().parameter(parameter))
 
@@ -63,6 +68,33 @@ def judge_pairs(rows: list[dict[str, Any]]) -> None:
         print(f"{kind:<10}{counts}")
     counts = f"{pairs.total():4d} pairs   alarms {alarms.total():3d}   were runs alike {within.total():3d}"
     print(f"all       {counts}")
+
+
+def play_drawn(rows: list[dict[str, Any]], trials: int, seed: int, others: int) -> None:
+    draw = np.random.default_rng([seed, 41])
+    alarms = likely = within = 0
+    for _ in range(trials):
+        row = rows[int(draw.integers(len(rows)))]
+        usual = np.array([find_usual(name) for name in row["names"]])
+        sides = [read_side(row, 0, BEFORE), read_side(row, 1, AFTER)]
+        spread = usual * np.abs(draw.normal(size=usual.size))
+
+        def redraw(run: RunNumbers, spread: Floats = spread) -> RunNumbers:
+            known = np.where(run.known, 0.0, np.nan)
+            covariance = np.where(np.isfinite(run.covariance), run.covariance, 0.0)
+            error = draw.multivariate_normal(np.zeros(spread.size), covariance, method="svd")
+            return replace(run, values=known + error + spread * draw.normal(size=spread.size))
+
+        more = [redraw(sides[int(draw.integers(2))]) for _ in range(others)]
+        found = compare_sides([redraw(one) for one in sides], usual, others={"there": more} if more else {})
+        statuses = [one.status for one in found]
+        alarms += "changed" in statuses
+        differing = [one.p for one in found if one.status == "differs"]
+        likely += "changed" not in statuses and min(differing, default=1.0) <= LIKELY
+        within += bool(differing) or "changed" in statuses
+    told = f"{trials} drawn pairs without a change, {others} other runs: changed {alarms}"
+    rates = f"({alarms / trials:.1%}), likely changed {likely} ({likely / trials:.1%})"
+    print(f"{told} {rates}, beyond their own errors {within}")
 
 
 def draw_group(
@@ -128,14 +160,17 @@ def compare(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("part", choices=["null", "power"])
+    parser.add_argument("part", choices=["null", "drawn", "power"])
     parser.add_argument("file", type=Path)
     parser.add_argument("--trials", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--others", type=int, default=0, help="of `drawn`: further runs of the robot")
     asked = parser.parse_args()
     rows = read_rows(asked.file)
     if asked.part == "null":
         judge_pairs(rows)
+    elif asked.part == "drawn":
+        play_drawn(rows, asked.trials, asked.seed, asked.others)
     else:
         play_power(rows, asked.trials, asked.seed)
 

@@ -27,11 +27,15 @@ class Commands(Table):
     sideways = schemas.optional(
         "rad/s", "commanded speed of the wheels that moves to the left (mecanum, omni)"
     )
-    body_x = schemas.body("m/s", "commanded forward speed where the command is a Twist", nullable=True)
+    body_x = schemas.body(
+        "m/s", "commanded forward speed where a Twist is the command or is beside it", nullable=True
+    )
     body_y = schemas.body(
         "m/s", "commanded speed to the left where the command is a Twist (mecanum, omni)", nullable=True
     )
-    body_w = schemas.body("rad/s", "commanded yaw rate where the command is a Twist", nullable=True)
+    body_w = schemas.body(
+        "rad/s", "commanded yaw rate where a Twist is the command or is beside it", nullable=True
+    )
     left_aligned = schemas.optional("rad/s", "speed of the left wheels after corrections")
     right_aligned = schemas.optional("rad/s", "speed of the right wheels after corrections")
     sideways_aligned = schemas.optional(
@@ -136,7 +140,7 @@ class Power(Table):
 class Alignments(Table):
     """One row a run."""
 
-    VERSION: ClassVar[int] = 4
+    VERSION: ClassVar[int] = 5
 
     hold_time = schemas.optional("s", "the controller stops this long after its last command")
     command_scale = schemas.number(
@@ -145,6 +149,9 @@ class Alignments(Table):
     command_turn_scale = schemas.number("1", "factor by which the sides' difference was multiplied")
     track_multiplier = schemas.number(
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
+    )
+    body_multiplier = schemas.optional(
+        "1", "yaw rate of the commanded wheels at the nominal track over that of the body command; null without"
     )
     gyro_scale = schemas.optional(
         "1", "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro"

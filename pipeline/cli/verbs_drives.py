@@ -55,6 +55,7 @@ def plan(  # noqa: D417 - the runs document themselves
     max_speed: PositiveFloat | None = None,
     max_yaw_rate: PositiveFloat | None = None,
     max_acceleration: PositiveFloat | None = None,
+    max_lateral: PositiveFloat | None = None,
     topic: str | None = None,
     type_name: Annotated[str | None, Parameter(name="--type")] = None,
     terrain: str | None = None,
@@ -79,9 +80,10 @@ def plan(  # noqa: D417 - the runs document themselves
         wanted: what to decide; by default what is undecided, and in the time left all that is open.
         time: longest duration, for example 60s or 2min.
         area: free area: length along the initial heading, and width; the start is in its middle.
-        max_speed: highest speed [m/s].
+        max_speed: highest speed [m/s] (default of all limits: what the runs reached).
         max_yaw_rate: highest yaw rate [rad/s].
         max_acceleration: highest acceleration [m/s^2].
+        max_lateral: highest acceleration sideways, speed times yaw rate [m/s^2].
         topic: topic of the commands (default: the recorded one).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log of the drive.
@@ -121,6 +123,7 @@ def plan(  # noqa: D417 - the runs document themselves
         topic,
         type_name,
         seed,
+        max_lateral,
     )
     for name in {*wish.wanted} - {UNDECIDED, ALL}:
         find_effect(name)
@@ -129,10 +132,9 @@ def plan(  # noqa: D417 - the runs document themselves
         if gathered is None:
             studied = expect(chosen, terrain, known or results)
         else:
-            studied = study(recordings, chosen, terrain, known or results)
+            studied = study(recordings, chosen, terrain, known or results, progress)
         command = {} if gathered is None else gathered.command
-        progress("choosing manoeuvres")
-        planned = plan_drive(chosen, studied, wish, recordings, command)
+        planned = plan_drive(chosen, studied, wish, recordings, command, progress)
         made, forecast = planned.plan, studied.forecast
         others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
     asked = [question.text for question in planned.questions]
@@ -299,7 +301,7 @@ def format_plan(
         lines.append(f"then         {rest}")
     lines += [f"undecided    {text}" for text in made.list_impossible()]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    most = f"limits       {made.limits.format(steered=made.steered)}"
+    most = f"limits       {made.format_limits()}"
     if not made.manoeuvres:
         none = f"no drive on {ground} of level ground answers an open question: no file is written"
         return [f"drive        {none}", most, *lines]

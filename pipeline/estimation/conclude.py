@@ -23,6 +23,7 @@ from pipeline.estimation.ambiguity import (
     take_judged,
 )
 from pipeline.estimation.apportion import apportion, find_moments
+from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.constancy import find_change
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Unexplained
@@ -248,6 +249,7 @@ def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Con
     return replace(
         common, run=recording.name, effects=effects, immaterial=immaterial, findings=tuple(findings),
         timing=timing, when=tuple(one for one in common.when if one.run == number),
+        commanded_turn=measure_commanded_turn(context.runs[number], context.vehicle),
     )  # fmt: skip
 
 

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.ambiguity import Detectable, Undecided, Unobservable
     from pipeline.estimation.apportion import Moments, SlipBudget
+    from pipeline.estimation.commanded import CommandedTurn
     from pipeline.estimation.estimates import Unless
     from pipeline.models import ModelFile
 
@@ -343,6 +344,7 @@ class RunDiagnosis:
         budgets: causes of the slip and of the 2 s errors of the ideal model, for each input.
         estimates: parameters of all effects that these runs determine.
         learned: gain of a learned term beyond them, see `learned_as_json`; empty where nothing was judged.
+        commanded_turn: share of the commanded yaw rate that the robot reaches; None without a body command.
     """
 
     run: str
@@ -369,6 +371,7 @@ class RunDiagnosis:
     budgets: tuple[SlipBudget, ...] = ()
     estimates: tuple[EstimatedNumber, ...] = ()
     learned: Mapping[str, Json] = field(default_factory=dict)
+    commanded_turn: CommandedTurn | None = None
 
     def find_held(self, item: Undecided) -> str | None:
         """The candidate that the model contains, whose error is that of any of them; None without."""
@@ -432,6 +435,7 @@ class RunDiagnosis:
             "budget": [budget.to_json() for budget in self.budgets],
             "enough": format_enough(self.effects, self.findings) or None,
             "learned": dict(self.learned),
+            "commanded_turn": None if self.commanded_turn is None else self.commanded_turn.to_json(),
         }
 
 

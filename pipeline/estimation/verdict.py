@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from itertools import groupby, pairwise
 from typing import TYPE_CHECKING, TypeVar, cast
 
-from pipeline.core import enumerate_texts
+from pipeline.core import enumerate_texts, format_share
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors, format_excess
 from pipeline.estimation.ladder import ERRORS_OVER_2S
@@ -38,6 +39,8 @@ _MOST_CLAUSES = 3
 """Effects that a verdict names; others are in the table below it."""
 _MOST_ALTERNATIVES = 3
 """Alternatives of an effect that it names."""
+_SAME_MULTIPLIER = 0.05
+"""Absolute logarithm of a multiplier up to which the ideal yaw rate is the commanded one, but for errors."""
 _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
 
@@ -70,7 +73,8 @@ def format_verdict(diagnosis: Content) -> str:
     if len(ladder) == 1:
         return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
     clauses = _list_clauses(diagnosis)
-    rest = [text] if (text := "; ".join(filter(None, _list_open_ends(diagnosis)))) else []
+    rest = _list_commanded(diagnosis)
+    rest += [text] if (text := "; ".join(filter(None, _list_open_ends(diagnosis)))) else []
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
@@ -81,6 +85,18 @@ def format_verdict(diagnosis: Content) -> str:
         if len(verdict) <= _LONGEST:
             break
     return verdict
+
+
+def _list_commanded(diagnosis: Content) -> list[str]:
+    """What the robot does of the commanded yaw rate, where its controller commands other wheel speeds."""
+    turn = mapping_in(diagnosis, "commanded_turn")
+    share, multiplier = number_in(turn, "share"), number_in(turn, "controller_multiplier")
+    if share is None or multiplier is None or multiplier <= 0.0:
+        return []
+    if abs(math.log(multiplier)) < _SAME_MULTIPLIER:
+        return []
+    text = f"it turns at {format_share(share)} of the commanded rate"
+    return [f"{text}: its controller's multiplier is {multiplier:.3g}"]
 
 
 def _list_open_ends(diagnosis: Content) -> tuple[str, str, str]:

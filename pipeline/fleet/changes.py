@@ -4,27 +4,30 @@
 
 Each run gives estimates of p quantities with their covariance. A quantity has changed if the means of two
 groups differ by more than the errors of the runs and the spread between runs explain. The spread is estimated
-from groups of several runs; for single runs its prior is used. All spreads are weighted by their probability,
-so that few runs give wide intervals. If the errors of two quantities are correlated, the one whose change
-explains the difference alone is selected first; its change is then a free parameter in the tests of the
-others (forward selection, with Holm's correction for the remaining quantities at each step).
+from groups of several runs, also from other runs of the same vehicle; without any its prior is used. All
+spreads are weighted by their probability, so that few runs give wide intervals, as Student's t has them. If
+the errors of two quantities are correlated, the one whose change explains the difference alone is selected
+first; its change is then a free parameter in the tests of the others (forward selection, with Holm's
+correction for the remaining quantities at each step).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 
-from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Flags, Floats, normal_tail
 from pipeline.fleet.levels import weigh_run_spreads
 
-CHANCE = 0.025
-"""Probability that a check reports any change where there is none: one of forty checks of the same robot."""
+CHANCE = 0.02
+"""Level of a check's tests, so that it reports any change where there is none in at most one of forty checks:
+of 2,400 drawn pairs 2.8 % were called changed at a level of 0.025, as spreads of other quantities enter as
+means (`make check-again PART=drawn`)."""
 POWER = 0.8
 """Probability of detecting a change of the smallest reported size."""
 MOST_MORE = 30
@@ -78,7 +81,9 @@ class Change:
         p_within: the same if all runs of one side were alike: for these recordings alone.
         smallest: change that is detected with probability `POWER`.
         spread: spread between runs of a side.
-        is_default: whether that spread is the usual one, because fewer than three runs determine it.
+        freedom: degrees of freedom of that spread: runs that determine it, less one a group; with none it is
+            the usual one.
+        p_alone: probability of a difference as large in this quantity alone without a change.
         asked: the underlying test.
         outlook: what more runs would show.
     """
@@ -92,7 +97,8 @@ class Change:
     p_within: float = math.nan
     smallest: float = math.nan
     spread: float = math.nan
-    is_default: bool = True
+    freedom: int = 0
+    p_alone: float = math.nan
     asked: Asked | None = field(default=None, repr=False, compare=False)
     outlook: Outlook | None = field(default=None, repr=False, compare=False)
 
@@ -100,6 +106,11 @@ class Change:
     def difference(self) -> float:
         """After minus before."""
         return self.after - self.before
+
+    @property
+    def is_default(self) -> bool:
+        """Whether the spread is the usual one, because no runs determine it."""
+        return self.freedom == 0
 
     def find_power(self, change: float) -> float:
         """Probability of detecting a change while the other quantities stay; NaN for an unknown quantity."""
@@ -121,11 +132,13 @@ class _Spread:
         sizes: possible spreads, shape (k,).
         chances: probability of each, shape (k,).
         usual: scale of their prior; zero where runs are assumed alike.
+        freedom: runs that determine it, less one a group.
     """
 
     sizes: Floats
     chances: Floats
     usual: float
+    freedom: int = 0
 
     @property
     def square(self) -> float:
@@ -225,21 +238,31 @@ class Outlook:
         return Asked(0.0, deviations, chances, self.alarm).find_smallest()
 
 
-def compare_sides(runs: Sequence[RunNumbers], usual: Floats, *, alike: bool = False) -> list[Change]:
+def compare_sides(
+    runs: Sequence[RunNumbers],
+    usual: Floats,
+    *,
+    alike: bool = False,
+    others: Mapping[str, Sequence[RunNumbers]] = MappingProxyType({}),
+) -> list[Change]:
     """Compare the quantities of two groups of runs.
 
     Args:
         runs: runs of both sides, at least one of each.
         usual: scale of the half-normal prior of each quantity's spread between runs, positive, shape (p,).
         alike: whether runs of a side are assumed alike, so that only the errors of these recordings count.
+        others: further runs of the vehicle by group, such as a terrain: they tell the spread between runs.
     """
     size = _find_sizes(runs, usual)
-    scaled = [
-        RunNumbers(run.run, run.side, run.values / size, run.covariance / np.outer(size, size))
-        for run in runs
-    ]
+
+    def rescale(run: RunNumbers) -> RunNumbers:
+        return replace(run, values=run.values / size, covariance=run.covariance / np.outer(size, size))
+
+    scaled = [rescale(run) for run in runs]
+    groups: list[tuple[str, RunNumbers]] = [(run.side, run) for run in scaled]
+    groups += [(f"others {name}", rescale(run)) for name, group in others.items() for run in group]
     spreads = [
-        _learn_spread(scaled, index, float(scale)) for index, scale in enumerate((usual / size).tolist())
+        _learn_spread(groups, index, float(scale)) for index, scale in enumerate((usual / size).tolist())
     ]
     whole = _Sides(scaled, spreads)
     within = _Sides(scaled, [_Spread(np.zeros(1), np.ones(1), 0.0)] * usual.size)
@@ -258,13 +281,15 @@ def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
     return np.where(size > 0.0, size, usual)
 
 
-def _learn_spread(runs: Sequence[RunNumbers], index: int, usual: float) -> _Spread:
-    known = [run for run in runs if run.known[index]]
+def _learn_spread(runs: Sequence[tuple[str, RunNumbers]], index: int, usual: float) -> _Spread:
+    known = [(group, run) for group, run in runs if run.known[index]]
     if not known:
         return _Spread(np.array([usual]), np.ones(1), usual)
-    values = [float(run.values[index]) for run in known]
-    errors = [max(math.sqrt(run.covariance[index, index]), _LEAST_ERROR) for run in known]
-    return _Spread(*weigh_run_spreads(values, errors, [run.side for run in known], usual), usual)
+    values = [float(run.values[index]) for _, run in known]
+    errors = [max(math.sqrt(run.covariance[index, index]), _LEAST_ERROR) for _, run in known]
+    groups = [group for group, _ in known]
+    freedom = len(known) - len({*groups})
+    return _Spread(*weigh_run_spreads(values, errors, groups, usual), usual, freedom)
 
 
 class _Sides:
@@ -354,7 +379,6 @@ def _make_change(
     p, p_within = significant[index], seen[index]
     status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
-    count = sum(int(judged.counts[side][index]) for side in (BEFORE, AFTER))
     return Change(
         status,
         before,
@@ -365,7 +389,8 @@ def _make_change(
         p_within=p_within,
         smallest=size * smallest,
         spread=size * math.sqrt(judged.spreads[index].square),
-        is_default=count < FEWEST_OF_SPREAD,
+        freedom=judged.spreads[index].freedom,
+        p_alone=alone.p,
         asked=asked.rescale(size),
         outlook=judged.look_ahead(index, goal),
     )

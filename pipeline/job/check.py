@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -16,7 +17,18 @@ from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, re
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
-from pipeline.job.stored_fits import ERRORS, HEADING_ERROR, POSITION_ERROR, USUAL_LOG_RATIO, RunReading
+from pipeline.job.stored_fits import (
+    COMMANDED,
+    COMMANDED_TURN,
+    ERRORS,
+    HEADING_ERROR,
+    LOGARITHMS,
+    MULTIPLIER,
+    POSITION_ERROR,
+    USUAL_LOG_RATIO,
+    USUAL_LOGARITHMS,
+    RunReading,
+)
 from pipeline.models import write_text
 
 if TYPE_CHECKING:
@@ -137,7 +149,7 @@ def judge_limits(limits: Limits, sides: Sides, changes: Mapping[str, Change]) ->
     """
     judged: list[Judged] = []
     units = {label.name: label.parameter.unit for label in sides.labels}
-    names = list(sides.names)
+    names = [*units, *ERRORS]
     for key, bound in _list_bounds(limits):
         if key.startswith("slip."):
             judged += _judge_slip(key, bound, sides)
@@ -274,10 +286,11 @@ class Check:
 
     Attributes:
         sides: both sides.
-        changes: changes of all quantities by name, the errors last.
+        changes: changes of all quantities by name, the logarithms last.
         limits: outcomes of the limits; empty if none were given.
         moves: RMS shift of predictions over 2 s in AFTER by the changes, [m] and [rad]; None without changes.
         simulated: BEFORE is a simulation, whose runs have no spread.
+        commanded: share of the commanded yaw rate that the robot reaches, as a logarithm; None where unknown.
     """
 
     sides: Sides
@@ -285,11 +298,16 @@ class Check:
     limits: tuple[Judged, ...] = ()
     moves: tuple[float, float] | None = None
     simulated: bool = False
+    commanded: Change | None = None
 
     def list_status(self, status: str) -> list[str]:
         """Names of the quantities of a status, in order of increasing p-value."""
         names = [name for name, change in self.changes.items() if change.status == status]
         return sorted(names, key=lambda name: (self.changes[name].p, self.changes[name].p_within))
+
+    def count_others(self) -> int:
+        """Number of further runs of the vehicle that tell how much runs differ."""
+        return sum(map(len, self.sides.others.values()))
 
     def is_unseen(self, name: str) -> bool:
         """Whether no change of a quantity was shown, and one of its own size could have been missed.
@@ -297,7 +315,7 @@ class Check:
         That size is its distance from the neutral value, at least the usual one; of an error a doubling.
         """
         change = self.changes[name]
-        if change.status != "unchanged" or name in ERRORS:
+        if change.status != "unchanged" or name in LOGARITHMS:
             return change.status == "unchanged" and change.smallest > math.log(2.0)
         parameter = next(label.parameter for label in self.sides.labels if label.name == name)
         neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
@@ -321,7 +339,7 @@ class Check:
     @property
     def is_compared(self) -> bool:
         """Whether most of the model's numbers can be compared: a few do not show that nothing changed."""
-        unknown, numbers = self.list_status("unknown"), {*self.changes} - {*ERRORS}
+        unknown, numbers = self.list_status("unknown"), {*self.changes} - {*LOGARITHMS}
         return len(unknown) < len(self.changes) and 2 * len(numbers & {*unknown}) <= len(numbers)
 
 
@@ -365,15 +383,44 @@ def find_usual_spread(parameter: Parameter) -> float:
 def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
     """Compare two sides that were fitted with one model."""
     spreads = [find_usual_spread(label.parameter) for label in sides.labels]
-    usual = np.array([*spreads, *(USUAL_LOG_RATIO for _ in ERRORS)])
-    runs = [one.numbers for one in (*sides.before, *sides.after)]
-    shifts = compare_sides(runs, usual, alike=simulated)
-    bounds = [*(label.parameter.bounds for label in sides.labels), *((-math.inf, math.inf) for _ in ERRORS)]
+    usual = np.array([*spreads, *(USUAL_LOGARITHMS[name] for name in LOGARITHMS)])
+    names = [name for name in sides.names if name not in COMMANDED]
+    names += [MULTIPLIER] if _is_set_anew(sides) else []
+
+    def compare_named(some: Sequence[str]) -> list[Change]:
+        kept = [sides.names.index(name) for name in some]
+
+        def pick(one: RunReading) -> RunNumbers:
+            values, covariance = one.numbers.values[kept], one.numbers.covariance[np.ix_(kept, kept)]
+            return replace(one.numbers, values=values, covariance=covariance)
+
+        return compare_sides(
+            [pick(one) for one in (*sides.before, *sides.after)],
+            usual[kept],
+            alike=simulated,
+            others={name: [pick(one) for one in group] for name, group in sides.others.items()},
+        )
+
+    shifts = compare_named(names)
+    # It follows from the multiplier and the parameters, which are tested: no question of its own.
+    (commanded,) = compare_named([COMMANDED_TURN])
+    ends = {label.name: label.parameter.bounds for label in sides.labels}
     changes = {
-        name: _hold(change, *ends) for name, change, ends in zip(sides.names, shifts, bounds, strict=True)
+        name: _hold(change, *ends.get(name, (-math.inf, math.inf)))
+        for name, change in zip(names, shifts, strict=True)
     }
     judged = () if limits is None else tuple(judge_limits(limits, sides, changes))
-    return Check(sides, changes, judged, _measure_moves(sides, changes), simulated)
+    moves = _measure_moves(sides, changes)
+    known = None if commanded.status == "unknown" else commanded
+    return Check(sides, changes, judged, moves, simulated, known)
+
+
+def _is_set_anew(sides: Sides) -> bool:
+    """Whether both sides know the controller's multiplier, and it is not the same in all runs."""
+    index = sides.names.index(MULTIPLIER)
+    values = [[one.numbers.values[index] for one in side] for side in (sides.before, sides.after)]
+    known = [[value for value in side if math.isfinite(value)] for side in values]
+    return all(known) and len({*itertools.chain(*known)}) > 1
 
 
 def keep_baseline(check: Check, path: Path) -> None:
@@ -437,17 +484,20 @@ def check_as_json(check: Check, lines: Sequence[tuple[str, str]]) -> dict[str, o
         tabulate_change(sides, name, change) | {"status": check.name_outcome(name)}
         for name, change in check.changes.items()
     ]
+    share = check.commanded
     moves = None if check.moves is None else {"position_m": check.moves[0], "heading_rad": check.moves[1]}
     return {
         "verdict": lines[0][1],
         "exit_code": check.code,
         "before": {"kind": sides.kind, "runs": [one.numbers.run for one in sides.before]},
         "after": {"kind": "runs", "runs": [one.numbers.run for one in sides.after]},
+        "others": [one.numbers.run for group in sides.others.values() for one in group],
         "terrains": {"before": list(sides.terrains[0]), "after": list(sides.terrains[1])},
         "input": sides.source.value,
         "simulated": check.simulated,
         "effects": list(sides.model.model.ids),
         "numbers": rows,
+        "commanded_turn": None if share is None else tabulate_change(sides, COMMANDED_TURN, share),
         "moves_predictions_over_2s": moves,
         "limits": [
             {"name": one.name, "limit": one.limit, "measured": one.measured, "outcome": one.outcome}
@@ -460,12 +510,13 @@ def check_as_json(check: Check, lines: Sequence[tuple[str, str]]) -> dict[str, o
 
 def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object]:
     """One quantity of a check in its unit; an error at the reference speed, its change as a fraction."""
-    is_error, pace = name in ERRORS, find_pace(sides)
-    unit = next((label.parameter.unit for label in sides.labels if label.name == name), "m")
+    is_logarithm = name in LOGARITHMS
+    unit = next((label.parameter.unit for label in sides.labels if label.name == name), "1")
     sizes = [change.before, change.after]
     parts = [change.low, change.high, change.smallest, change.spread]
-    if is_error:
-        unit = "m" if name == POSITION_ERROR else "rad"
+    if is_logarithm:
+        unit = {POSITION_ERROR: "m", HEADING_ERROR: "rad"}.get(name, "1")
+        pace = find_pace(sides) if name in ERRORS else 1.0
         sizes, parts = [pace * math.exp(one) for one in sizes], [math.expm1(one) for one in parts]
     before, after, low, high, smallest, spread = map(finite_or_none, (*sizes, *parts))
     return {
@@ -474,13 +525,15 @@ def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object
         "status": change.status,
         "before": before,
         "after": after,
-        "change_is": "share" if is_error else "difference",
+        "change_is": "share" if is_logarithm else "difference",
         "low": low,
         "high": high,
         "p": finite_or_none(change.p),
         "p_within_runs": finite_or_none(change.p_within),
+        "p_alone": finite_or_none(change.p_alone),
         "smallest_found": smallest,
         "spread_between_runs": spread,
         "spread_is_default": change.is_default,
+        "spread_freedom": change.freedom,
         "more_runs_a_side": change.count_missing(),
     }

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
@@ -20,9 +22,11 @@ from pipeline.estimation.comparison import Input, choose_input
 from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
 from pipeline.job.compared_runs import find_run_refusal
-from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis
+from pipeline.job.keys import UNKNOWN, agree_on_vehicle
+from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis, load_vehicle
 from pipeline.job.stored_fits import (
-    ERRORS,
+    COMMANDED,
+    LOGARITHMS,
     Label,
     RunReading,
     list_labels,
@@ -36,7 +40,7 @@ from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.parameter import is_of_one_run
-from pipeline.report.motion_view import read_model_text
+from pipeline.report.motion_view import load_motion_run, read_model_text
 
 if TYPE_CHECKING:
     from pipeline.job.keys import Owner
@@ -45,6 +49,8 @@ if TYPE_CHECKING:
     from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1
+_MOST_OF_SPREAD = 16
+"""Runs that determine a spread between runs: more take longer and change a limit by less than a twentieth."""
 _MOST = 0.5
 """Smallest fraction of a side's runs whose model has an effect: an effect of one run of many is its own."""
 _ROUNDING = 1e-6
@@ -104,6 +110,7 @@ class Sides:
         labels: compared parameters.
         before, after: estimates of the runs; a model file as BEFORE counts as one run with its values.
         notes: excluded runs with the reasons, and warnings.
+        others: further runs of the vehicle on the same terrains, by terrain: they tell how much runs differ.
     """
 
     kind: Kind
@@ -113,11 +120,12 @@ class Sides:
     before: tuple[RunReading, ...]
     after: tuple[RunReading, ...]
     notes: tuple[str, ...] = ()
+    others: Mapping[str, tuple[RunReading, ...]] = field(default_factory=dict)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the compared quantities, the errors last."""
-        return (*(label.name for label in self.labels), *ERRORS)
+        """Names of the quantities of each run, the logarithms last."""
+        return (*(label.name for label in self.labels), *LOGARITHMS)
 
     @property
     def terrains(self) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -174,6 +182,8 @@ def read_sides(
     sides: dict[Side, Sequence[MotionRun]] = {BEFORE: runs[: len(manifests)], AFTER: runs[len(manifests) :]}
     both = read_under(file, sides, source, known=known, starts=starts)
     slips = {one.run: measure_slip(one.read("slip"), both.source) for one in everything}
+    held = {*(_digest(one) for one in everything), *(one.sha256 for one in known)}
+    others = _read_others(_list_others(store, both, held), both, store)
     names: dict[type, Kind] = {Baseline: "baseline", ModelFile: "model"}
     return replace(
         both,
@@ -181,7 +191,39 @@ def read_sides(
         before=tuple(_note_slip(one, slips) for one in both.before),
         after=tuple(_note_slip(one, slips) for one in both.after),
         notes=(*notes_before, *notes_after, *both.notes),
+        others=others,
     )
+
+
+def _list_others(store: Store, sides: Sides, held: Collection[str]) -> list[Manifest]:
+    """Further runs of the vehicle on the terrains of a check; none where enough runs are on its sides."""
+    room = _MOST_OF_SPREAD - len(sides.before) - len(sides.after)
+    terrains = {*itertools.chain(*sides.terrains)} - {UNKNOWN}
+    others: dict[str, Manifest] = {}
+    for manifest in store.survey().manifests if room > 0 and terrains else ():
+        is_here = manifest.details.get("terrain") in terrains
+        if is_here and manifest.part("vehicle").get("id") == sides.model.model.vehicle.id:
+            digest = _digest(manifest)
+            if digest and digest not in held and not find_run_refusal(manifest):
+                others.setdefault(digest, manifest)
+    return [*others.values()][-room:] if room > 0 else []
+
+
+def _read_others(
+    manifests: Sequence[Manifest], sides: Sides, store: Store
+) -> dict[str, tuple[RunReading, ...]]:
+    """Estimates of further runs by terrain; what cannot be fitted, and what is alone, tells no spread."""
+    vehicle = sides.model.model.vehicle
+    readings: dict[str, list[RunReading]] = {}
+    for manifest in manifests:
+        own = _find_model(manifest, store, is_needed=False) or ()
+        start = sides.model.model.swap(*(effect for effect in own if effect.id in sides.model.model))
+        with contextlib.suppress(SlipError):
+            agree_on_vehicle(vehicle, {manifest.run: load_vehicle(manifest)}, None)
+            run = load_motion_run(manifest, vehicle)
+            reading = read_run(run, start, sides.source, sides.labels, BEFORE)
+            readings.setdefault(reading.terrain, []).append(reading)
+    return {terrain: tuple(runs) for terrain, runs in readings.items() if len(runs) > 1}
 
 
 def _leave_out_refused(manifests: Sequence[Manifest], side: Side) -> tuple[list[Manifest], list[str]]:
@@ -317,7 +359,7 @@ def _read_model(file: ModelFile, labels: Sequence[Label]) -> RunReading:
 
     Without any interval they count as exact. Else those that are not fixed and have none are undetermined.
     """
-    count = len(labels) + len(ERRORS)
+    count = len(labels) + len(LOGARITHMS)
     values, deviations = np.full(count, np.nan), np.full(count, np.nan)
     for index, label in enumerate(labels):
         is_stated = not file.intervals or label.name in file.intervals
@@ -376,22 +418,27 @@ def read_baseline(path: Path) -> Baseline:
         what = f"this is not a baseline: {shorten(str(error))}"
         raise JobError("bad_baseline", what, where=str(path), hint=hint) from error
     file = parse_model(stored.model, path)
-    names = (*(label.name for label in list_labels(file.model, file.per_run)), *ERRORS)
-    count = len(names)
+    names = (*(label.name for label in list_labels(file.model, file.per_run)), *LOGARITHMS)
+    # Baselines of before the commanded rate end with the errors.
+    known = tuple(stored.numbers)
+    count = len(known)
     fits = all(
         len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
         for run in stored.runs
     )
-    readings = tuple(map(_open_run, stored.runs)) if fits else ()
-    is_ours = stored.format == BASELINE_FORMAT and tuple(stored.numbers) == names
+    is_ours = stored.format == BASELINE_FORMAT and known in {names, names[: -len(COMMANDED)]}
+    readings = tuple(_open_run(run, len(names)) for run in stored.runs) if fits and is_ours else ()
     if not (is_ours and readings and all(map(_is_sound, readings))):
         what = "the baseline is of another version, or its numbers are not those of fits of its model"
         raise JobError("bad_baseline", what, where=str(path), hint=hint)
     return Baseline(file, Input(stored.input), names, readings)
 
 
-def _open_run(run: _StoredRun) -> RunReading:
-    values, covariance = (_array(one) for one in (run.values, run.covariance))
+def _open_run(run: _StoredRun, size: int) -> RunReading:
+    """A stored run; quantities that its baseline lacks are unknown."""
+    lacking = size - len(run.values)
+    values = np.pad(_array(run.values), (0, lacking), constant_values=math.nan)
+    covariance = np.pad(_array(run.covariance), (0, lacking), constant_values=math.nan)
     slip = _array(run.slip)
     numbers = RunNumbers(run.run, BEFORE, values, covariance)
     return RunReading(numbers, run.sha256, run.terrain, run.pace, (float(slip[0]), float(slip[1])))
@@ -402,7 +449,7 @@ def _is_sound(reading: RunReading) -> bool:
     rows = np.flatnonzero(reading.numbers.known)
     covariance = reading.numbers.covariance[np.ix_(rows, rows)]
     size = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    logarithms = np.append(reading.numbers.values[-len(ERRORS) :], reading.slip[0])
+    logarithms = np.append(reading.numbers.values[-len(LOGARITHMS) :], reading.slip[0])
     if not (size > 0.0).all() or not reading.pace > 0.0 or (np.abs(logarithms) > _MOST_LOGARITHM).any():
         return False
     correlation = covariance / np.outer(size, size)

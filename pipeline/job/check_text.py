@@ -9,8 +9,16 @@ from xml.etree import ElementTree as ET
 
 from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
 from pipeline.estimation.verdict import name_effect
+from pipeline.fleet.changes import Change
 from pipeline.job.check import Check, find_pace
-from pipeline.job.stored_fits import ERRORS, POSITION_ERROR, Label
+from pipeline.job.stored_fits import (
+    ERRORS,
+    HEADING_ERROR,
+    LOGARITHMS,
+    MULTIPLIER,
+    POSITION_ERROR,
+    Label,
+)
 from pipeline.models.effect import Place
 from pipeline.models.parameter import Level
 
@@ -21,16 +29,24 @@ STATUSES = ("changed", "differs", "unchanged", "unknown")
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
+LIKELY = 0.2
+"""Largest p at which a change is called likely: at most one check in five of an unchanged robot says so."""
+_LEAST_SHARE = 0.01
+"""Smallest share of cases that is printed as a number."""
 _LEAST_P = 1e-4
 """Smallest p value that is printed."""
-_ERROR_NAMES = {True: "position error over 2 s", False: "heading error over 2 s"}
+_NAMES = {
+    POSITION_ERROR: "position error over 2 s",
+    HEADING_ERROR: "heading error over 2 s",
+    MULTIPLIER: "the controller's multiplier",
+}
 
 
 def format_verdict(check: Check) -> str:
     """State the changes, and whether they exceed the spread between runs, in one to four sentences."""
     changed, differs = check.list_status("changed"), check.list_status("differs")
-    named = [name for name in changed if name not in ERRORS]
-    sentences = []
+    named = [name for name in changed if name not in LOGARITHMS]
+    sentences = _format_commanded(check)
     if named and check.simulated:
         sentences.append(f"{_format_simulated(check, named)}{_format_moves(check)}")
     elif named:
@@ -40,12 +56,7 @@ def format_verdict(check: Check) -> str:
     rest = "and no effect of the model explains it: run slip diagnose on AFTER"
     sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if not changed and differs:
-        listed = enumerate_texts(
-            [f"{_name(check, name)} {_format_pair(check, name)}" for name in differs[:_MOST_NAMED]]
-        )
-        sentences.append(
-            f"No conclusion: the recordings differ in {listed}, but within the spread between runs"
-        )
+        sentences.append(_format_doubts(check, differs[:_MOST_NAMED]))
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "No conclusion: no quantity is known on both sides"
@@ -54,6 +65,49 @@ def format_verdict(check: Check) -> str:
         sentences.append(f"No change shown in {known} {noun}{few}" if known else nothing)
     sentences += [*_format_limits(check), *_format_power(check)]
     return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
+
+
+def _format_commanded(check: Check) -> list[str]:
+    """What the robot does of the commanded yaw rate, and the controller's multiplier, where that changed."""
+    changed = check.list_status("changed")
+    if MULTIPLIER not in changed and (check.commanded is None or not {*changed} - {*ERRORS}):
+        return []
+    clauses = _list_commanded(check)
+    if MULTIPLIER in changed:
+        p = _format_p(check.changes[MULTIPLIER].p, 1)
+        clauses.append(f"the controller's multiplier {_format_pair(check, MULTIPLIER)} ({p})")
+    return ["; ".join(clauses)] if clauses else []
+
+
+def _list_commanded(check: Check) -> list[str]:
+    """What the robot does of the commanded yaw rate, where it differs by more than the recordings' errors."""
+    change = check.commanded
+    if change is None or change.status not in {"changed", "differs"}:
+        return []
+    nearer = "better" if abs(change.after) < abs(change.before) else "worse"
+    return [f"the robot turns at {_format_shares(change)} of the commanded rate: {nearer}"]
+
+
+def _format_shares(change: Change) -> str:
+    before, after = (format_share(math.exp(one)) for one in (change.before, change.after))
+    return f"{before.removesuffix(' %')} -> {after}"
+
+
+def _format_doubts(check: Check, differs: Sequence[str]) -> str:
+    """What differs between the recordings, and how often runs without a change differ by as much."""
+    changes = [check.changes[name] for name in differs]
+    listed = enumerate_texts(
+        [
+            f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(change.p_within, 1)})"
+            for name, change in zip(differs, changes, strict=True)
+        ]
+    )
+    least = min(change.p_alone for change in changes)
+    often = format_share(max(least, _LEAST_SHARE), 1)
+    rate = f"{'less than ' if least < _LEAST_SHARE else ''}{often}"
+    opening = "Likely changed" if min(change.p for change in changes) <= LIKELY else "No conclusion"
+    chance = f"runs without a change differ by as much in {rate} of cases"
+    return f"{opening}: the recordings differ in {listed}; {chance}"
 
 
 def _format_simulated(check: Check, named: Sequence[str]) -> str:
@@ -87,6 +141,8 @@ def _format_pair(check: Check, name: str) -> str:
         show = format_length if name == POSITION_ERROR else format_angle
         before, after = (show(pace * math.exp(one)) for one in (change.before, change.after))
         return f"{before} -> {after}"
+    if name == MULTIPLIER:
+        return f"{math.exp(change.before):.3g} -> {math.exp(change.after):.3g}"
     label = _find(check, name)
     unit = suffix_unit(label.parameter.unit)
     return f"{change.before:.3g} -> {change.after:.3g}{unit}"
@@ -97,8 +153,8 @@ def _find(check: Check, name: str) -> Label:
 
 
 def _name(check: Check, name: str) -> str:
-    if name in ERRORS:
-        return _ERROR_NAMES[name == POSITION_ERROR]
+    if name in LOGARITHMS:
+        return _NAMES[name]
     label = _find(check, name)
     alone = len(label.effect.parameters) == 1
     return (
@@ -145,7 +201,7 @@ def _format_power(check: Check) -> list[str]:
     asked = [
         name
         for name, change in check.changes.items()
-        if change.status in {"unchanged", "differs"} and name not in ERRORS
+        if change.status in {"unchanged", "differs"} and name not in LOGARITHMS
     ]
     if not asked or check.list_status("changed"):
         return []
@@ -153,9 +209,10 @@ def _format_power(check: Check) -> list[str]:
     text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
     count = len(check.sides.after) + (len(check.sides.before) if check.sides.kind != "model" else 0)
     default = any(check.changes[name].is_default for name in asked)
+    others = f" and {check.count_others()} others of the vehicle" if check.count_others() else ""
     spread = " at the default spread between runs" if default and not check.simulated else ""
     runs = "this run" if count == 1 else f"these {count} runs"
-    first = f"A change of less than {text} is not detectable with {runs}{spread}"
+    first = f"A change of less than {text} is not detectable with {runs}{others}{spread}"
     differs = check.list_status("differs")
     missing = check.changes[(differs or asked)[0]].count_missing()
     if missing is None:
@@ -189,8 +246,14 @@ def list_lines(check: Check) -> list[Line]:
             lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
             if status != "unknown":
                 lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
+    if check.commanded is not None:
+        share = f"the robot turns at {_format_shares(check.commanded)} of the commanded yaw rate"
+        lines.append(("commanded", share))
     lines += [("may be", text) for text in _list_readings(check)]
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
+    others = [one.numbers.run for group in check.sides.others.values() for one in group]
+    if others:
+        lines.append(("others", f"{len(others)} tell how much runs differ: {', '.join(others)}"))
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
         before, after = (" and ".join(one) for one in check.sides.terrains)
         lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
@@ -215,7 +278,7 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
         return f"{name:<{names}}  {why} {lacking}"
     text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
     within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
-    size = "a factor of two" if name in ERRORS else "a change of its own size"
+    size = "a factor of two" if name in LOGARITHMS else "a change of its own size"
     few = f"; too few runs to detect {size}" if check.is_unseen(name) else ""
     return f"{text}  {_format_p(change.p)}{within}{few}"
 
@@ -223,12 +286,13 @@ def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
 def _format_resolution(check: Check, name: str) -> str:
     """Smallest detectable change of a quantity, and the spread between runs."""
     change = check.changes[name]
-    show = _format_ratio if name in ERRORS else _format_size
+    show = _format_ratio if name in LOGARITHMS else _format_size
     text = f"detectable change {show(change.smallest)}"
     text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
     if check.simulated:
         return text
-    source = "(default)" if change.is_default else "(these runs)"
+    known = f"these runs and {check.count_others()} others" if check.count_others() else "these runs"
+    source = "(default)" if change.is_default else f"({known})"
     return f"{text}; spread between runs {show(change.spread)} {source}"
 
 
@@ -250,7 +314,7 @@ def _list_readings(check: Check) -> list[str]:
     before, after = check.sides.terrains
     level = Level.RUN if before == after else Level.TERRAIN
     names = dict.fromkeys(
-        name.partition(".")[0] for name in check.list_status("changed") if name not in ERRORS
+        name.partition(".")[0] for name in check.list_status("changed") if name not in LOGARITHMS
     )
     effects = {label.effect.id: label.effect for label in check.sides.labels}
     return [

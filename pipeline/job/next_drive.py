@@ -196,7 +196,8 @@ class Wish:
         time_s: longest duration [s].
         wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for undecided effects first and, in the remaining
             time, all open questions.
-        speed_mps, yaw_rate_radps, acceleration_mps2: limits; None for those of the vehicle.
+        speed_mps, yaw_rate_radps, acceleration_mps2, lateral_mps2: limits; None for what the runs reached, or
+            without runs for those of the vehicle.
         topic, type_name: topic and type of the played commands; None for those of the recorded command.
         seed: seed of the random draws.
     """
@@ -210,6 +211,7 @@ class Wish:
     topic: str | None = None
     type_name: str | None = None
     seed: int = 0
+    lateral_mps2: float | None = None
 
 
 @dataclass(frozen=True)
@@ -227,6 +229,7 @@ def plan_drive(
     wish: Wish,
     recordings: Sequence[Recording] = (),
     command: Mapping[str, object] | None = None,
+    notify: Callable[[str], object] = str,
 ) -> Planned:
     """Plan the drive that best answers the open questions.
 
@@ -236,23 +239,28 @@ def plan_drive(
         wish: request of the user.
         recordings: the runs that the knowledge comes from.
         command: choice of the first run's command, from `read_command`.
+        notify: called with what is being done.
 
     Raises:
         SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
-    from pipeline.plan import choose_limits  # noqa: PLC0415 - heavy
+    from pipeline.plan import Reached, choose_limits  # noqa: PLC0415 - heavy
     from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan.rehearsal import measure_reached  # noqa: PLC0415 - heavy
 
     knowledge, diagnosis = studied.knowledge, studied.diagnosis
+    reached = Reached() if knowledge.problem is None else measure_reached(knowledge.problem)
     limits = choose_limits(
         vehicle,
-        None if knowledge.problem is None else knowledge.problem.largest,
+        reached,
         speed_mps=wish.speed_mps,
         yaw_rate_radps=wish.yaw_rate_radps,
         acceleration_mps2=wish.acceleration_mps2,
+        lateral_mps2=wish.lateral_mps2,
     )
     is_ambiguous = diagnosis is not None and bool(diagnosis.undecided)
     wanted = wish.wanted or (UNDECIDED if is_ambiguous else ALL,)
+    notify("fitting the alternatives of open questions")
     questions = tuple(ask(knowledge, wanted, limits, wish.time_s, diagnosis))
     later: list[Question] = []
     if is_ambiguous and not wish.wanted:
@@ -268,12 +276,17 @@ def plan_drive(
         wish.topic or topic,
         wish.type_name or type_name,
         wish.seed,
+        tuple(reached.list_used(limits)),
     )
-    return Planned(make_plan(knowledge, questions, request, later), questions, limits)
+    return Planned(make_plan(knowledge, questions, request, later, notify), questions, limits)
 
 
 def study(
-    recordings: Sequence[Recording], vehicle: Vehicle, terrain: str | None = None, known: Path | None = None
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    terrain: str | None = None,
+    known: Path | None = None,
+    notify: Callable[[str], None] | None = None,
 ) -> Studied:
     """Diagnose runs jointly, and fit the identified and the undecided effects.
 
@@ -283,6 +296,7 @@ def study(
         terrain: terrain to drive on; the fleet's prior for it is combined with runs on this terrain, and
             replaces the estimates of runs on other terrains.
         known: results folder of the fleet; needed with a terrain.
+        notify: called with what is being done.
 
     Raises:
         SlipError: nothing can be estimated, or a run has no commands.
@@ -292,7 +306,7 @@ def study(
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
 
-    diagnosis = diagnose_runs(recordings, vehicle).runs[0]
+    diagnosis = diagnose_runs(recordings, vehicle, notify=notify).runs[0]
     if diagnosis.proposal is None:
         why = find_refusal(diagnosis.to_json()) or "the log cannot be judged"
         what = f"{why}, so that nothing can be planned from it"

@@ -13,6 +13,7 @@ import polars as pl
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows, jackknife_deviation, student_quantile
 from pipeline.estimation.additions import explain_refusals
+from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
 from pipeline.estimation.fit import Fitted, fit_model
@@ -262,9 +263,28 @@ HEADING_ERROR = "error.heading"
 ERRORS = (POSITION_ERROR, HEADING_ERROR)
 """Logarithms of the errors over 2 s [m, rad] divided by the speed of the run [m/s]: a change of these is not
 explained by any parameter of the model."""
+COMMANDED_TURN = "commanded.turn"
+MULTIPLIER = "controller.multiplier"
+COMMANDED = (COMMANDED_TURN, MULTIPLIER)
+"""Logarithms of the share of the commanded yaw rate that the robot reaches, and of the multiplier of its
+controller: unknown without a body command."""
+LOGARITHMS = (*ERRORS, *COMMANDED)
+"""Quantities beside the parameters, in their order; all are compared as logarithms."""
 USUAL_LOG_RATIO = 0.4
 """Root mean square of the prior of such a logarithm's spread between runs on one terrain: the spread of the
 Warthog recordings (`make bench-check PART=real`)."""
+USUAL_LOG_SHARE = 0.18
+"""The same of the share of the commanded yaw rate: that of seven runs of a Warthog on three terrains."""
+MULTIPLIER_ERROR = 0.01
+"""Standard deviation of the logarithm of a multiplier that is measured by the wheels: that of simulated runs
+of one controller. It is a setting: from run to run it differs by no more."""
+USUAL_LOGARITHMS = {
+    POSITION_ERROR: USUAL_LOG_RATIO,
+    HEADING_ERROR: USUAL_LOG_RATIO,
+    COMMANDED_TURN: USUAL_LOG_SHARE,
+    MULTIPLIER: MULTIPLIER_ERROR,
+}
+"""Root mean square of the prior of each spread between runs."""
 _LEAST_SQUARE = 1e-12
 """Lower bound of a mean square error [m^2, rad^2], to keep its logarithm finite."""
 _LEAST_SLIP = 1e-6
@@ -313,7 +333,7 @@ class RunReading:
     """Estimates of a run with the model of a check.
 
     Attributes:
-        numbers: estimates of the labels and of `ERRORS`, in that order.
+        numbers: estimates of the labels and of `LOGARITHMS`, in that order.
         sha256: hash of the recording.
         terrain: terrain of the run.
         pace: root mean square ideal speed [m/s]; a yaw rate of 1 rad/s counts as 1 m/s.
@@ -348,7 +368,7 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
     problem = Problem([run], model.vehicle, source)
     fitted = fit_model(problem, model)
     names = [label.name for label in labels]
-    count = len(names) + len(ERRORS)
+    count = len(names) + len(LOGARITHMS)
     values, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
     for part, fit in zip(problem.parts, fitted.fits, strict=True):
         if not fit.free:
@@ -368,6 +388,9 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
         np.fill_diagonal(correlation, 1.0)
         covariance[np.ix_(rows, rows)] = correlation * np.outer(deviations, deviations)
     errors, pace = _measure_errors(fitted)
+    turn = measure_commanded_turn(run, model.vehicle)
+    if turn is not None:
+        errors += [(math.log(turn.share), turn.deviation), (math.log(turn.multiplier), MULTIPLIER_ERROR)]
     for index, (value, deviation) in enumerate(errors, start=len(names)):
         values[index], covariance[index, index] = value, deviation**2
     covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0

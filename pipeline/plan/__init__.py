@@ -9,15 +9,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import SlipError
 from pipeline.core.arrays import Complex, Floats
-from pipeline.models.parameter import Largest
 from pipeline.sources import Vehicle
 
 if TYPE_CHECKING:
@@ -82,42 +81,104 @@ def is_steered(vehicle: Vehicle) -> bool:
     return vehicle.kinematics.has_inputs("speed", "steering")
 
 
+@dataclass(frozen=True)
+class Reached:
+    """What the driving of runs reached, each NaN where they hardly moved in this way.
+
+    Attributes:
+        speed_mps, yaw_rate_radps: commanded.
+        acceleration_mps2: of the body, measured.
+        lateral_mps2: measured speed times measured yaw rate.
+    """
+
+    speed_mps: float = math.nan
+    yaw_rate_radps: float = math.nan
+    acceleration_mps2: float = math.nan
+    lateral_mps2: float = math.nan
+
+    def list_used(self, limits: Limits) -> list[str]:
+        """Limits that are what the runs reached, in words."""
+        pairs = {
+            "speed": (self.speed_mps, limits.speed_mps),
+            "yaw rate": (self.yaw_rate_radps, limits.turn),
+            "acceleration": (self.acceleration_mps2, limits.acceleration_mps2),
+            "sideways": (self.lateral_mps2, limits.lateral_mps2),
+        }
+        return [name for name, (reached, limit) in pairs.items() if reached == limit]
+
+
 def choose_limits(
     vehicle: Vehicle,
-    largest: Largest | None = None,
+    reached: Reached | None = None,
     *,
     speed_mps: float | None = None,
     yaw_rate_radps: float | None = None,
     acceleration_mps2: float | None = None,
+    lateral_mps2: float | None = None,
 ) -> Limits:
-    """Limits of the request, else of the preset, else the largest commands of the run.
+    """Limits of the request, else what the runs reached, else of the preset, else usual ones.
 
     Args:
         vehicle: with its preset's limits.
-        largest: largest commands of a run; None without a run.
+        reached: by the driving of the runs so far; None without a run.
         speed_mps: requested limit; never above the preset's.
         yaw_rate_radps: requested limit; never above the preset's.
         acceleration_mps2: requested limit.
+        lateral_mps2: requested limit of speed times yaw rate.
 
     Raises:
         PlanError: ``no_limits``, the largest speed of the vehicle is not known.
     """
-    known = vehicle.max_speed_mps or (largest.speed if largest is not None and largest.speed > 0.0 else None)
-    if speed_mps is None and known is None:
+    driven = reached or Reached()
+
+    def choose(asked: float | None, done: float, most: float | None, usual: float) -> float:
+        wanted = asked or (done if math.isfinite(done) else most or usual)
+        return min(wanted, most or math.inf)
+
+    speed = choose(speed_mps, driven.speed_mps, vehicle.max_speed_mps, math.inf)
+    if math.isinf(speed):
         what = "the largest speed of the vehicle is not known"
         raise PlanError("no_limits", what, where=vehicle.id, hint="Give --max-speed.")
-    speed = min(speed_mps or math.inf, known or math.inf)
-    acceleration = acceleration_mps2 or min(_USUAL_ACCELERATION_MPS2, speed)
+    usual = min(_USUAL_ACCELERATION_MPS2, speed)
+    acceleration = choose(acceleration_mps2, driven.acceleration_mps2, None, usual)
+    lateral = choose(lateral_mps2, driven.lateral_mps2, None, _LATERAL_MPS2)
     if is_steered(vehicle):
         turn = vehicle.max_steering_rad or _USUAL_STEERING_RAD
-        return Limits(
-            speed, turn, acceleration, turn / _TURN_RISE_S, yaw_rate_radps=yaw_rate_radps or math.inf
-        )
-    # The defaults are exceeded only if the preset or the request states higher limits.
+        rate = yaw_rate_radps or math.inf
+        return Limits(speed, turn, acceleration, turn / _TURN_RISE_S, lateral, rate)
     fastest = 2.0 * speed / (vehicle.track_width_m or 1.0)
-    most = vehicle.max_yaw_rate_radps or min(yaw_rate_radps or _USUAL_YAW_RATE_RADPS, fastest)
-    turn = min(yaw_rate_radps or math.inf, most)
-    return Limits(speed, turn, acceleration, turn / _TURN_RISE_S)
+    usual = min(_USUAL_YAW_RATE_RADPS, fastest)
+    turn = choose(yaw_rate_radps, driven.yaw_rate_radps, vehicle.max_yaw_rate_radps, usual)
+    if vehicle.max_yaw_rate_radps is None and math.isnan(driven.yaw_rate_radps):
+        turn = min(turn, fastest)
+    return Limits(speed, turn, acceleration, turn / _TURN_RISE_S, lateral)
+
+
+_RAISED = 2.0
+"""Factor on a limit to see whether it keeps a question open."""
+
+
+def list_raised(vehicle: Vehicle, limits: Limits) -> Iterator[tuple[str, Limits, str]]:
+    """Limits raised one by one, within the vehicle's own: option with its value, all limits, the old one."""
+    sideways = _RAISED * limits.lateral_mps2
+    yield (
+        f"--max-lateral {sideways:.3g}",
+        replace(limits, lateral_mps2=sideways),
+        (f"{limits.lateral_mps2:.3g} m/s^2 sideways"),
+    )
+    faster = _RAISED * limits.acceleration_mps2
+    yield (
+        f"--max-acceleration {faster:.3g}",
+        replace(limits, acceleration_mps2=faster),
+        (f"{limits.acceleration_mps2:.3g} m/s^2"),
+    )
+    speed = min(_RAISED * limits.speed_mps, vehicle.max_speed_mps or math.inf)
+    if speed > limits.speed_mps:
+        yield f"--max-speed {speed:.3g}", replace(limits, speed_mps=speed), f"{limits.speed_mps:.3g} m/s"
+    turn = min(_RAISED * limits.turn, vehicle.max_yaw_rate_radps or math.inf)
+    if turn > limits.turn and not is_steered(vehicle):
+        raised = replace(limits, turn=turn, turn_rate=turn / _TURN_RISE_S)
+        yield f"--max-yaw-rate {turn:.3g}", raised, f"{limits.turn:.3g} rad/s"
 
 
 @dataclass(frozen=True)

@@ -1,14 +1,14 @@
 """A plan: manoeuvres chosen for questions, and the expected gain of the whole."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from pipeline.core import finite_or_none, format_share, pick
+from pipeline.core import enumerate_texts, finite_or_none, format_share, pick
 from pipeline.core.arrays import Complex, Floats
 from pipeline.models import Effect, list_effects
 from pipeline.models.parameter import Largest
@@ -26,6 +26,7 @@ from pipeline.plan import (
     is_steered,
     join,
     list_manoeuvres,
+    list_raised,
     wait,
 )
 from pipeline.plan.questions import (
@@ -50,6 +51,8 @@ _RESERVES = (1.1, 1.4, 1.8)
 # Multiple of the goals; more driving adds nothing. Spare time is driven if it narrows an interval by a tenth.
 _AMPLE = 2.0
 _LEAST_GAIN = 0.1
+# Factor on what is reached from which a raised limit is named: less is not worth a harder drive.
+_HELPS = 1.25
 # A shorter rest is not reported.
 _LEAST_REST_S = 5.0
 
@@ -102,6 +105,7 @@ class Plan:
         wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
             has other inputs.
         ways: paths of the models, base first, positions x + iy [m] at 20 Hz, shape (models, n).
+        as_driven: limits that are what the runs reached, in words.
     """
 
     vehicle: str
@@ -120,6 +124,12 @@ class Plan:
     spare_gain: float
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
+    as_driven: tuple[str, ...] = ()
+
+    def format_limits(self) -> str:
+        """All limits, and which of them are what the runs reached."""
+        text = self.limits.format(steered=self.steered)
+        return f"{text} ({enumerate_texts(self.as_driven)} as the runs reached)" if self.as_driven else text
 
     def format_rest(self) -> str:
         """Use of the time after the last decision, or why it is not driven; empty without a drive."""
@@ -150,6 +160,7 @@ class Plan:
             "runs": list(self.runs),
             **pick(self, "home_m", "spare_s", "spare_gain"),
             "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
+            "limits_as_driven": list(self.as_driven),
             "area": asdict(self.area),
             "safety": list(SAFETY),
             "topic": self.topic,
@@ -181,6 +192,7 @@ class Request:
         runs: names of the logs that the knowledge is based on.
         topic, type_name: topic on which the commands will be played, and its type.
         seed: seed of the draws of parameters.
+        as_driven: limits that are what the runs reached, in words.
     """
 
     limits: Limits
@@ -190,10 +202,15 @@ class Request:
     topic: str = "/cmd_vel"
     type_name: str = "geometry_msgs/msg/Twist"
     seed: int = 0
+    as_driven: tuple[str, ...] = ()
 
 
 def make_plan(
-    knowledge: Knowledge, questions: Sequence[Question], request: Request, later: Sequence[Question] = ()
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    request: Request,
+    later: Sequence[Question] = (),
+    notify: Callable[[str], object] = str,
 ) -> Plan:
     """Choose manoeuvres that answer questions, and compute the expected gain of the whole.
 
@@ -202,6 +219,7 @@ def make_plan(
         questions: to answer.
         request: time, area and limits.
         later: questions for the time that remains after the others are answered.
+        notify: called with what is being done.
 
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
@@ -209,9 +227,12 @@ def make_plan(
     largest = find_largest(knowledge, request.limits, request.time_s)
     models = _list_models(knowledge, [*questions, *later], largest, request.seed)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
+    plural = "s" * (len(questions) != 1)
+    notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open question{plural}")
     chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
     best, order, gain = _rehearse(knowledge, questions, request.area, [], models), [], 0.0
-    for reserve in _RESERVES if chooser is not None else ():
+    for attempt, reserve in enumerate(_RESERVES if chooser is not None else (), start=1):
+        notify(f"choosing manoeuvres, attempt {attempt} of at most {len(_RESERVES)}")
         chosen = chooser.choose(reserve) if chooser is not None else []
         trial = _rehearse(knowledge, questions, request.area, [library[number] for number in chosen], models)
         if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
@@ -222,6 +243,7 @@ def make_plan(
         asked = [*questions, *(later if not best.impossible else ())]
         if len(asked) > len(questions):
             chooser = _make_chooser(knowledge, asked, request, library, models)
+        notify("filling the time that is left")
         longer = chooser.extend(order, _AMPLE)
         fuller = _rehearse(knowledge, asked, request.area, [library[number] for number in longer], models)
         # Questions of second priority may stay open without a report.
@@ -237,10 +259,14 @@ def make_plan(
         undriven = tuple(replace(one, reached="") for one in best.impossible)
         best, order = replace(best, manoeuvres=(), starts=(), impossible=undriven), []
     if chooser is not None:
-        reasons = tuple(explain_open(one, chooser, order) for one in best.impossible)
-        best = replace(best, impossible=reasons)
+        reasons = []
+        for number, one in enumerate(best.impossible, start=1):
+            notify(f"what keeps open questions open: {number} of {len(best.impossible)}")
+            reasons.append(explain_open(one, chooser, order))
+        best = replace(best, impossible=_name_limits(reasons, knowledge, questions, request, notify))
     commands, ways = best.commands, best.ways
     return Plan(
+        as_driven=request.as_driven,
         vehicle=knowledge.vehicle.id,
         runs=request.runs,
         manoeuvres=tuple((one.name, at) for one, at in zip(best.manoeuvres, best.starts, strict=True)),
@@ -257,6 +283,50 @@ def make_plan(
         spare_gain=round(gain, 4),
         wheels=_turn_wheels(commands, knowledge),
         ways=ways,
+    )
+
+
+def _name_limits(
+    reasons: Sequence[Impossible],
+    knowledge: Knowledge,
+    questions: Sequence[Question],
+    request: Request,
+    notify: Callable[[str], object],
+) -> tuple[Impossible, ...]:
+    """Open questions; where no room and no time answers one, with the limit that holds it back most.
+
+    All manoeuvres are rehearsed with one limit after the other raised.
+    """
+    still = {one.question for one in reasons if one.needs_limits}
+    asked = [one for one in questions if one.text in still]
+    if not asked:
+        return tuple(reasons)
+
+    def look(limits: Limits) -> list[tuple[float, bool]]:
+        """By question: how much all manoeuvres reach, larger for more, and whether that answers it."""
+        library = list_manoeuvres(knowledge.vehicle, limits)
+        edges = np.concatenate(([0.0], np.cumsum([one.commands.duration_s for one in library])))
+        commands = join([one.commands for one in library])
+        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, edges[:-1])
+        every = np.ones(edges.size - 1)
+        judged = Judge(rehearsal, knowledge, edges).judge(asked)
+        return [(one.rate(every), float(one.answer(every)) >= 1.0) for one in judged]
+
+    notify("what the limits of the commands keep open")
+    before = [reached for reached, _ in look(request.limits)]
+    best: dict[str, tuple[float, str]] = {}
+    for option, limits, text in list_raised(knowledge.vehicle, request.limits):
+        notify(f"whether the limit of {text} keeps questions open")
+        for one, own, (reached, is_answered) in zip(asked, before, look(limits), strict=True):
+            if reached > max(own * _HELPS, best.get(one.text, (0.0, ""))[0]):
+                allowed = "where the robot and the ground allow it"
+                advice = f"the limit of {text} keeps it open: give {option}, {allowed}"
+                if not is_answered:
+                    times = f"{reached / own:.1f} times as much" if own > 0.0 else "something"
+                    advice = f"the limit of {text} holds it back most: {option}, {allowed}, tells {times}"
+                best[one.text] = reached, advice
+    return tuple(
+        replace(one, because=best[one.question][1]) if one.question in best else one for one in reasons
     )
 
 

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -23,7 +24,7 @@ from pipeline.plan.rehearsal import Knowledge, Rehearsal
 from pipeline.run import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.store.files import replace_file
+from pipeline.store.files import TEMPORARY, replace_file
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
@@ -80,17 +81,21 @@ def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
         what = f"commands of this vehicle cannot be written as {plan.type_name}"
         hint = f"Give --type as one of {', '.join(types)}; {WHEELS} on --topic '/LEFT, /RIGHT'."
         raise PlanError("wrong_type", what, where=plan.topic, hint=hint)
-    toml, csv, mcap = (folder / name for name in _NAMES)
+    toml, csv, mcap = _NAMES
+    texts = {csv: _format_csv(plan), toml: _format_toml(plan), **({PAGE: page} if page else {})}
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        _write_mcap(plan, mcap)
-        pages = [(folder / PAGE, page)] if page else []
-        for path, text in ((csv, _format_csv(plan)), (toml, _format_toml(plan)), *pages):
-            replace_file(path, text.encode())
+        # All are whole before the first takes its place: an interrupted plan leaves the earlier one.
+        with tempfile.TemporaryDirectory(prefix=TEMPORARY, dir=folder) as drafts:
+            _write_mcap(plan, Path(drafts) / mcap)
+            for name, text in texts.items():
+                replace_file(Path(drafts) / name, text.encode())
+            for name in (mcap, *texts):
+                (Path(drafts) / name).replace(folder / name)
     except OSError as error:
         what = f"the plan cannot be written ({error.strerror})"
         raise PlanError("cannot_write", what, where=str(folder), hint="Choose another --folder.") from None
-    return (toml, csv, mcap, *(path for path, _ in pages))
+    return tuple(folder / name for name in (*_NAMES, *([PAGE] if page else [])))
 
 
 def read_promises(path: Path) -> Promised:

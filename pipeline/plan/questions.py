@@ -8,14 +8,14 @@ end at rest add up.
 """
 
 import math
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, suffix_unit
-from pipeline.core.arrays import STRETCH_S, Floats, Ints
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, enumerate_texts, suffix_unit
+from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.error_regions import find_goal
 from pipeline.models import Excitation, find_effect, list_effects
@@ -120,11 +120,13 @@ class Groups:
         stretch: number of each group's stretch of driving, ascending from 0, shape (k,); a block t needs
             several stretches.
         before_s: duration of the logs so far [s].
+        excited: by kind of excitation, what of it each group contains, shape (k, parts).
     """
 
     seconds: Floats
     stretch: Ints
     before_s: float = 0.0
+    excited: Mapping[Excitation, Flags] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -163,13 +165,48 @@ class Answerable:
         if isinstance(self.question, Precision):
             shown = self.evidence[0].normal[:, self.question.number, self.question.number]
             share = (self.question.goal / reserve / self.bound(weight)) ** 2
-            return np.minimum(share, 1.0) * self._spread_out(weight, shown, reserve)
+            return np.minimum(share, 1.0) * self._spread_out(weight, shown, reserve) * self._cover(weight)
         shares = []
         for one in self.evidence:
             remaining = one.separate(weight)
             decided = 0.25 * np.sum(weight * remaining, axis=-1) / (reserve * DECIDED_T) ** 2
             shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, remaining, reserve))
-        return np.asarray(np.min(shares, axis=0))
+        return np.asarray(np.min(shares, axis=0)) * self._cover(weight)
+
+    def rate(self, weight: Floats) -> float:
+        """What a drive reaches, larger for more: a block t, or the inverse of an interval."""
+        measured = float(self.measure(weight))
+        return measured if isinstance(self.question, Separation) else 1.0 / measured
+
+    def format_reached(self, weight: Floats) -> str:
+        """What a drive reaches, as text."""
+        measured = float(self.measure(weight))
+        if isinstance(self.question, Separation):
+            enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
+        else:
+            bound = float(self.bound(weight))
+            enough = bound <= self.question.goal
+            what = f"+- {measured:.2g}, up to {bound:.2g}"
+        if enough and (lacking := self.list_lacking(weight)):
+            return f"{what}, without {enumerate_texts(lacking)}"
+        return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
+
+    def list_lacking(self, weight: Floats) -> list[str]:
+        """Excitation that the question's effects declare to need and the drive lacks, in words."""
+        return [need.value for need, parts in self._list_needed() if not ((weight @ parts) > 0.0).all()]
+
+    def _list_needed(self) -> list[tuple[Excitation, Floats]]:
+        if not self.groups.excited:
+            return []
+        needs = {need for name in self.question.effects for need in find_effect(name).needs}
+        return [(need, parts.astype(float)) for need, parts in self.groups.excited.items() if need in needs]
+
+    def _cover(self, weight: Floats) -> Floats:
+        """Share of the excitation that the question's effects declare to need, shape (...)."""
+        parts = [known for _, known in self._list_needed()]
+        if not parts:
+            return np.ones(weight.shape[:-1])
+        return np.asarray((weight @ np.hstack(parts) > 0.0).mean(axis=-1))
 
     def _spread_out(self, weight: Floats, shown: Floats, reserve: float) -> Floats:
         """Fraction of the required stretches, from each group's contribution, shape (..., k)."""
@@ -185,13 +222,20 @@ class Answerable:
         return np.asarray(np.minimum(stretches / (reserve * FEWEST_OF_SPREAD), 1.0))
 
     def _count_freedom(self, weight: Floats) -> Floats:
-        shown = self.groups.seconds
+        """Blocks of the jackknife less one: those that carry the information of logs so far and of the drive.
+
+        A drive that tells nothing of a parameter adds no block.
+        """
+        shown, known = self.groups.seconds, self.groups.before_s
         if isinstance(self.question, Precision):
-            shown = np.diagonal(self.evidence[0].normal, axis1=1, axis2=2)[:, self.question.number]
-        power = weight @ shown**2
-        known = (weight @ shown) ** 2 / np.where(power > 0.0, power, np.inf)
-        blocks = np.minimum(known, weight @ self.groups.seconds / _BLOCK_S) + self.groups.before_s / _BLOCK_S
-        return np.asarray(np.maximum(blocks - 1.0, 1.0))
+            number = self.question.number
+            shown = np.diagonal(self.evidence[0].normal, axis1=1, axis2=2)[:, number]
+            known = float(self.evidence[0].prior[number, number]) if self.groups.before_s else 0.0
+        earlier = self.groups.before_s / _BLOCK_S
+        power = weight @ shown**2 + (known**2 / earlier if earlier else 0.0)
+        blocks = (weight @ shown + known) ** 2 / np.where(power > 0.0, power, np.inf)
+        driven = weight @ self.groups.seconds / _BLOCK_S + earlier
+        return np.asarray(np.maximum(np.minimum(blocks, driven) - 1.0, 1.0))
 
 
 class Judge:
@@ -212,7 +256,8 @@ class Judge:
         self.noise = knowledge.noise
         self.size = edges.size - 1
         stretch = edges[:-1] // STRETCH_S if stretches else np.arange(self.size)
-        self.groups = Groups(np.diff(edges), stretch.astype(np.int64), knowledge.driven_s)
+        excited = rehearsal.find_excitation(edges)
+        self.groups = Groups(np.diff(edges), stretch.astype(np.int64), knowledge.driven_s, excited)
         self._group = [
             np.clip(np.searchsorted(edges, part.times[:, 1], side="left") - 1, 0, self.size - 1)
             for part in self.problem.parts
@@ -388,12 +433,14 @@ class Impossible:
         effects: ids of the effects concerned.
         because: the reason.
         reached: block t or interval that the plan reaches; where no drive decides it, that of the best one.
+        needs_limits: whether no drive within the limits of the commands that was tried decides it.
     """
 
     question: str
     effects: tuple[str, ...]
     because: str
     reached: str = ""
+    needs_limits: bool = False
 
 
 def list_reasons(questions: Sequence[Impossible]) -> list[str]:
@@ -412,7 +459,7 @@ def leave_open(one: Answerable, weight: Floats) -> Impossible:
         one: the question.
         weight: how often each of its groups is driven, shape (k,); all zero: nothing is driven.
     """
-    reached = _format_reached(one, weight) if weight.any() else ""
+    reached = one.format_reached(weight) if weight.any() else ""
     return Impossible(one.question.text, one.question.effects, "", reached)
 
 
@@ -439,8 +486,9 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
     if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
         seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
         return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    at_best = f"expected {_format_reached(one, best)}"
-    return replace(question, because=_advise(one.question, longest_s), reached=at_best)
+    at_best = f"expected {one.format_reached(best)}"
+    because = _advise(one.question, longest_s)
+    return replace(question, because=because, reached=at_best, needs_limits=True)
 
 
 def _continue(
@@ -462,22 +510,8 @@ def _continue(
 
 
 def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:
-    """Whether a drive reaches more than another: a larger t, or a narrower interval."""
-    if not weight.any():
-        return False
-    these = float(one.measure(weight)), float(one.measure(than))
-    return these[0] > these[1] if isinstance(one.question, Separation) else these[0] < these[1]
-
-
-def _format_reached(one: Answerable, weight: Floats) -> str:
-    measured = float(one.measure(weight))
-    if isinstance(one.question, Separation):
-        enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
-    else:
-        bound = float(one.bound(weight))
-        enough = bound <= one.question.goal
-        what = f"+- {measured:.2g}, up to {bound:.2g}"
-    return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
+    """Whether a drive reaches more than another."""
+    return bool(weight.any()) and one.rate(weight) > one.rate(than)
 
 
 def _advise(question: Question, longest_s: float) -> str:

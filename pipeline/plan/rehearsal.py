@@ -9,19 +9,20 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
-from pipeline.core.arrays import Complex, Floats
+from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.estimation import Comparison, Input, Problem, State, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.fit import Fitted, PartFit
 from pipeline.estimation.intervals import count_repeats
-from pipeline.estimation.parts import Part
-from pipeline.estimation.problem import measure_largest
+from pipeline.estimation.parts import Part, average_windows, locate_windows
+from pipeline.estimation.problem import average_sustained, measure_largest
 from pipeline.estimation.state import Free, pick_columns, weigh_columns
 from pipeline.models import Effect, Model, Place, Timing
-from pipeline.models.parameter import Largest
-from pipeline.plan import Commands, PlanError, is_steered
+from pipeline.models.parameter import Excitation, Largest
+from pipeline.plan import Commands, PlanError, Reached, is_steered
 from pipeline.run import Alignment, GyroFit, MotionRun, Track
-from pipeline.run.signals import DriveSeries, Velocity
+from pipeline.run.signals import STILL_MPS, DriveSeries, Velocity, name_inputs
+from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 
 # Commands rehearsed: a run that has not been driven yet, with the poses that a model predicts.
@@ -83,6 +84,28 @@ class Rehearsal:
         """Largest commands."""
         return measure_largest((self._run,), self.vehicle)
 
+    def find_excitation(self, edges: Floats) -> dict[Excitation, Flags]:
+        """What the commands between each two edges excite, by kind: columns for its parts, shape (k, parts).
+
+        Whether commands are large, small, different or changing enough, the information on a question says.
+        """
+        asked, size = self.predict(()), edges.size - 1
+        group = np.clip(np.searchsorted(edges, self._comparison.grid.times, side="right") - 1, 0, size - 1)
+
+        def happens(*parts: Flags) -> Flags:
+            counts = [np.bincount(group, part, minlength=size) > 0.0 for part in parts]
+            return np.column_stack(counts)
+
+        ahead, back = asked.x > STILL_MPS, asked.x < -STILL_MPS
+        left, right = asked.w > STILL_MPS, asked.w < -STILL_MPS
+        return {
+            Excitation.DRIVING: happens(ahead | back),
+            Excitation.TURNING: happens(left, right),
+            Excitation.BOTH_SIGNS: happens(ahead, back),
+            Excitation.STEERING: happens(left, right),
+            Excitation.SIDEWAYS: happens(np.abs(asked.y) > STILL_MPS),
+        }
+
     def predict(self, effects: Sequence[Effect]) -> Velocity:
         """Body velocity of a model on the time grid."""
         return self._comparison.predict_velocity(effects, Timing())
@@ -122,6 +145,43 @@ class Rehearsal:
             driven = self.predict([effect for effect in effects if effect.place <= Place.DRIVE])
             run = replace(run, wheels=_read_wheels(times, driven, self.vehicle))
         return Problem([run], self.vehicle, Input.COMMAND)
+
+
+_REACHED = 0.99
+"""Quantile of measured half-second means that counts as reached: jumps of poses are not."""
+_MOVED = 0.05
+"""Least speed [m/s], yaw rate [rad/s] and acceleration [m/s^2] that count as driving in this way."""
+
+
+def measure_reached(problem: Problem) -> Reached:
+    """What the driving of runs reached: commanded speed and yaw rate, and measured accelerations."""
+    parts: dict[str, list[Floats]] = {"speed": [], "turn": [], "acceleration": [], "lateral": []}
+    for comparison in problem.comparisons:
+        vehicle, series = comparison.context.vehicle, comparison.run.commands
+        if series is None:
+            continue
+        asked = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
+        ahead, turned = (np.abs(average_sustained(series.times, asked[channel])) for channel in (0, 2))
+        live = np.maximum(ahead, turned) > _MOVED
+        parts["speed"].append(ahead[live])
+        parts["turn"].append(turned[live])
+        ideal = comparison.predict_velocity((), Timing())
+        moved = comparison.find_residuals((), Timing())
+        moved = moved + average_windows(comparison, ideal, locate_windows(comparison))
+        driven = np.abs(moved[:, [0, 2]]).max(axis=1) > _MOVED
+        parts["lateral"].append(np.abs(moved[driven, 0] * moved[driven, 2]))
+        times = comparison.windows.times[:, 0]
+        apart = times[2:] - times[:-2]
+        near = (apart > 0.0) & (apart < 2.0 * WINDOW_S) & driven[1:-1]
+        parts["acceleration"].append(np.abs(moved[2:, 0] - moved[:-2, 0])[near] / apart[near])
+
+    def find(name: str, quantile: float) -> float:
+        values = np.concatenate([*parts[name], np.zeros(0)])
+        most = float(np.quantile(values, quantile)) if values.size else 0.0
+        return float(f"{most:.2g}") if most > _MOVED else math.nan
+
+    commanded = (find(name, 1.0) for name in ("speed", "turn"))
+    return Reached(*commanded, *(find(name, _REACHED) for name in ("acceleration", "lateral")))
 
 
 def start_state(effects: Sequence[Effect]) -> State:

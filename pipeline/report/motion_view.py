@@ -32,7 +32,7 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *("latency", "held", "active", "terrain"),
     ),
     "alignments": (
-        *("hold_time", "command_scale", "command_turn_scale", "track_multiplier"),
+        *("hold_time", "command_scale", "command_turn_scale", "track_multiplier", "body_multiplier"),
         *("gyro_scale", "gyro_bias", "heading_delay"),
         *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
         *("recorded_modulus_command", "recorded_modulus_measured"),

@@ -170,6 +170,20 @@ class Sources:
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
     power: PowerSource | None = None
 
+    @property
+    def body_beside(self) -> DriveSource | None:
+        """The body command that is recorded beside commanded wheels; None where there is none."""
+        if self.command is None or self.command.form not in {DriveForm.SIDES, DriveForm.JOINTS}:
+            return None
+        drives = (self.command, self.wheels)
+        taken = {signal.topic for one in drives if one is not None for signal in one.signals}
+        for one in self.others.get("command", ()):
+            if isinstance(one, DriveSource) and one.form is DriveForm.BODY:
+                topics = {signal.topic for signal in one.signals}
+                if len(topics) == 1 and not topics & taken and not MEASURED.search(min(topics).lower()):
+                    return one
+        return None
+
     def separated(self) -> Sources:
         """The same, but with measured wheels from another topic than the pose."""
         pose = None if self.pose is None else self.pose.topic

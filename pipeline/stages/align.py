@@ -18,14 +18,15 @@ from numpy.typing import NDArray
 from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
 from pipeline.run import Alignment, GyroFit, read_drive, tabulate_alignment
-from pipeline.run.signals import STILL_MPS
+from pipeline.run.signals import ANSWERS_S, STILL_MPS
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle, list_presets
 from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
-from pipeline.stages.drive import interpolate_readings
+from pipeline.stages.drive import Drive, interpolate_readings
 from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
 from pipeline.stages.incidents import find_incidents
+from pipeline.stages.pose_choice import find_steady_gain
 from pipeline.stages.pose_faults import align_poses, find_bad_stretches
 from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.trust import (
@@ -170,7 +171,12 @@ def _align(
     findings += late_starts
     corrected = {**tables, "commands": asked}
     alignment = Alignment(
-        hold, scale.scale, scale.turn_scale, scale.track_multiplier, recorded_moduli=grid.recorded
+        hold,
+        scale.scale,
+        scale.turn_scale,
+        scale.track_multiplier,
+        recorded_moduli=grid.recorded,
+        body_multiplier=_find_body_multiplier(commands, vehicle, scale, body_commanded=body_commanded),
     )
     poses, alignment = align_poses(
         {**corrected, "slip": grid.steps},
@@ -344,6 +350,53 @@ def measure_command_scale(samples: Samples, vehicle: Vehicle) -> CommandScale:
     )
     finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
     return CommandScale(1.0, 1.0, multiplier, (finding,))
+
+
+def _find_body_multiplier(
+    commands: pl.DataFrame, vehicle: Vehicle, scale: CommandScale, *, body_commanded: bool
+) -> float | None:
+    """See `Alignment.body_multiplier`; a command in another scale has none."""
+    if commands.is_empty() or not scale.scale == scale.turn_scale == 1.0:
+        return None
+    return scale.track_multiplier if body_commanded else measure_body_multiplier(commands, vehicle)
+
+
+def measure_body_multiplier(commands: pl.DataFrame, vehicle: Vehicle) -> float | None:
+    """Yaw rate of commanded wheels at the nominal track over that of the body command beside them.
+
+    Args:
+        commands: table `commands` as extracted.
+        vehicle: geometry.
+
+    Returns:
+        None without a body command, or where the wheels were not commanded by it: their ratio is not
+        constant, or their speeds are not the same.
+    """
+    asked_for = ("left", "right", "body_x", "body_w")
+    if not {*asked_for} <= {*commands.columns}:
+        return None
+    live = commands.filter(pl.all_horizontal(pl.col(name).is_finite() for name in asked_for))
+    if live.is_empty():
+        return None
+    driven = [name for name in Drive.list_signals() if name in live.columns and not name.startswith("body")]
+    inputs = {name: np.nan_to_num(live[name].cast(pl.Float64).to_numpy()) for name in driven}
+    rolled = vehicle.kinematics.forward(inputs, vehicle)
+    label = arrays.number_stretches(live["t"].to_numpy() - float(live["t"][0]), ANSWERS_S)
+    number = np.unique(label, return_inverse=True)[1]
+    count = np.bincount(number)
+
+    def compare(name: str, wheels: Floats) -> float | None:
+        asked = live[name].to_numpy()
+        return find_steady_gain(np.bincount(number, wheels) / count, np.bincount(number, asked) / count)
+
+    ahead, turned = compare("body_x", rolled[0]), compare("body_w", rolled[2])
+    if (
+        turned is None
+        or turned <= 0.0
+        or (ahead is not None and abs(np.log(max(ahead, _LEAST_RATIO))) > _SCALED)
+    ):
+        return None
+    return round(turned, 6)
 
 
 def _explain_scale(samples: Samples, steps: Floats, forward: float, vehicle: Vehicle) -> CommandScale:

@@ -101,8 +101,11 @@ class _Extraction:
         self.where = where
         self.frames = ("", "")
         self._orders: dict[str, Ints] = {}
-        joined = map(self._join_channels, dict.fromkeys(columns.topic for columns in topics))
-        stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
+        # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
+        beside = sources.body_beside
+        aside = None if beside is None else beside.signals[0].topic
+        names = dict.fromkeys(columns.topic for columns in topics if columns.topic != aside)
+        stamped = [reading.with_stamps(c) for c in map(self._join_channels, names) if c is not None]
         # All texts of a topic may be unreadable.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
@@ -363,7 +366,20 @@ class _Extraction:
 
     @cached_property
     def _commands(self) -> pl.DataFrame:
-        return self._drive_table(self.sources.command, self.configuration.command, held=True)
+        table = self._drive_table(self.sources.command, self.configuration.command, held=True)
+        beside = self.sources.body_beside
+        columns = None if beside is None else self._join_channels(beside.signals[0].topic)
+        if beside is None or columns is None or table.is_empty():
+            return table
+        order = np.argsort(columns.log_time, kind="stable")
+        at = np.searchsorted(columns.log_time[order], table["log_time"].to_numpy(), side="right") - 1
+        values = {
+            name: read_signal(columns, beside, number, DriveSection(), self.vehicle)[order][at]
+            for number, name in enumerate(("body_x", "body_w"))
+        }
+        return table.with_columns(
+            pl.Series(name, np.where(at >= 0, value, np.nan)).fill_nan(None) for name, value in values.items()
+        )
 
     def _drive_table(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
         if source is None:

@@ -396,7 +396,7 @@ def fit_controller(
     )
     sums = (np.append(0.0, np.cumsum(commands[name].to_numpy()[:-1] * held)) for name in ("body_x", "body_w"))
     distance, turn = (np.diff([np.interp(at, asked, total) for at in spans], axis=0)[0] for total in sums)
-    radius, over = _steady_gain(distance, rolled), _steady_gain(turn, turned)
+    radius, over = find_steady_gain(distance, rolled), find_steady_gain(turn, turned)
     if not radius or not over or radius <= 0.0 or over <= 0.0:
         return None
     geometry = {"wheel_radius_m": radius, "track_width_m": radius / over}
@@ -405,7 +405,7 @@ def fit_controller(
     return geometry if fits else None
 
 
-def _steady_gain(moved: Floats, driven: Floats) -> float | None:
+def find_steady_gain(moved: Floats, driven: Floats) -> float | None:
     """Weighted median of moved over driven; None if the ratio is not constant."""
     gain = _median_gain(moved, driven)
     if gain is None:

@@ -220,9 +220,8 @@ def list_wanted(
         types: type name by topic.
         rivals: other sources to read for comparison.
     """
-    every = [
-        source for source in (sources.command, sources.wheels, sources.pose, *rivals) if source is not None
-    ]
+    roles = (sources.command, sources.wheels, sources.pose, sources.body_beside, *rivals)
+    every = [source for source in roles if source is not None]
     signals: list[Signal] = []
     for source in every:
         signals += (

@@ -2,6 +2,8 @@
 
 import hashlib
 import secrets
+import shutil
+import tempfile
 import threading
 import time
 from collections.abc import AsyncIterator, Callable
@@ -65,12 +67,13 @@ class Workers:
         self._one_at_a_time = threading.Lock()
         self._closed = threading.Event()
 
-    def run(self, errand: Errand, notify: Callable[[str], None]) -> Entry:
+    def run(self, errand: Errand, notify: Callable[[str], None], cancelled: threading.Event) -> Entry:
         """Run a task to its end.
 
         Args:
             errand: the task.
             notify: callback, called with the name of each stage.
+            cancelled: when it is set, the worker process is ended.
 
         Raises:
             SlipError: the task failed, or its process was lost.
@@ -84,6 +87,10 @@ class Workers:
             while not future.done():
                 if self._closed.is_set():
                     raise WorkbenchError("closing", "the server is ending", hint="Start it again.")
+                if cancelled.is_set():
+                    self._executor.close()
+                    self._executor = None
+                    raise WorkbenchError("cancelled", "it was cancelled", hint="Start it again.")
                 wait([future], timeout=_LOOK_S)
                 noted = _read_notes(errand)
                 if noted not in {"", stage}:
@@ -127,7 +134,7 @@ def work_on_errand(task: Task) -> Report:
         if task.basis == DIAGNOSE:
             write_diagnosis(task.options.out, find_run(store, entry.run))
         elif isinstance(task, Errand) and task.basis == PLAN:
-            write_run_plan(store, find_run(store, entry.run), task.area)
+            write_run_plan(store, find_run(store, entry.run), task.area, partial(_note, task))
         else:
             return Report(entry=_analyze(task, entry))
         return Report(entry=replace(entry, state="done"))
@@ -136,16 +143,17 @@ def work_on_errand(task: Task) -> Report:
         return Report(entry=replace(entry, code=error.code, reason=reason, hint=error.hint))
 
 
+def _note(task: Task, stage: str) -> None:
+    """Report what is being done, which is optional."""
+    with suppress(OSError):
+        if isinstance(task, Errand) and task.notes is not None:
+            task.notes.write_text(stage, encoding="utf-8")
+
+
 def _analyze(task: Task, entry: Entry) -> Entry:
     from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
 
-    def notify(stage: str) -> None:
-        # Reporting the stage is optional.
-        with suppress(OSError):
-            if isinstance(task, Errand) and task.notes is not None:
-                task.notes.write_text(stage, encoding="utf-8")
-
-    outcome = analyze_log(task.path, task.options, notify)
+    outcome = analyze_log(task.path, task.options, partial(_note, task))
     update_datasets(Store(task.options.out))
     return replace(entry, state="lossy" if outcome.lossy else "done", run=outcome.manifest.run)
 
@@ -184,6 +192,8 @@ class Job:
         lossy: whether the log had losses.
         upload: the log, until it is analyzed, or while the user must choose its vehicle.
         sha256: hash of the log.
+        is_stored: whether it works on a stored run, which stays as it is: it can be cancelled.
+        cancelled: set when the user cancels it.
     """
 
     id: str
@@ -198,6 +208,13 @@ class Job:
     lossy: bool = False
     upload: Upload | None = None
     sha256: str = ""
+    is_stored: bool = False
+    cancelled: threading.Event = field(default_factory=threading.Event)
+
+    @property
+    def stops(self) -> bool:
+        """Whether it can be cancelled."""
+        return self.is_stored and not self.done
 
     def notify(self, stage: str) -> None:
         """Start a stage."""
@@ -218,6 +235,7 @@ class Job:
             "run": self.run,
             "error": self.error,
             "done": self.done,
+            "stops": self.stops,
             "lossy": self.lossy,
         }
 
@@ -253,8 +271,10 @@ class Jobs:
         return [job.show() for job in reversed(tuple(self._jobs.values()))]
 
     def dismiss(self, name: str) -> None:
-        """Remove a job that has ended."""
+        """Remove a job that has ended; cancel one that works on a stored run, which leaves its results."""
         job = self._jobs.get(name)
+        if job is not None and job.stops:
+            job.cancelled.set()
         if job is not None and job.done:
             self._forget(job)
 
@@ -344,10 +364,11 @@ class Jobs:
             raise WorkbenchError(
                 "busy", "that is being done already", where=manifest.run, hint="Wait for it."
             )
-        job = Job(secrets.token_hex(4), name)
+        job = Job(secrets.token_hex(4), name, is_stored=True)
         job.notify(stage)
         self._add(job)
-        self._begin(job, partial(self._make_errand, manifest, basis, area))
+        notes = Path(tempfile.mkdtemp(prefix="slip-")) / "stage" if basis == PLAN else None
+        self._begin(job, partial(self._make_errand, manifest, basis, area, notes), notes)
         return job
 
     def _add(self, job: Job) -> None:
@@ -366,12 +387,12 @@ class Jobs:
         job.notify("read")
         self._begin(job, partial(self._make_analysis, upload, job.sha256, vehicle))
 
-    def _begin(self, job: Job, prepare: Callable[[], Errand]) -> None:
-        threading.Thread(target=self._do, args=(job, prepare), daemon=True).start()
+    def _begin(self, job: Job, prepare: Callable[[], Errand], notes: Path | None = None) -> None:
+        threading.Thread(target=self._do, args=(job, prepare, notes), daemon=True).start()
 
-    def _do(self, job: Job, prepare: Callable[[], Errand]) -> None:
+    def _do(self, job: Job, prepare: Callable[[], Errand], notes: Path | None) -> None:
         try:
-            entry = self._workers.run(prepare(), job.notify)
+            entry = self._workers.run(prepare(), job.notify, job.cancelled)
             job.run, job.lossy = entry.run, entry.state == "lossy"
         except SlipError as error:
             code, upload = error.code, job.upload
@@ -390,7 +411,11 @@ class Jobs:
             if job.upload is not None and not waits:
                 self._uploads.remove(job.upload)
                 job.upload = None
+            if notes is not None:
+                shutil.rmtree(notes.parent, ignore_errors=True)
             job.done = True
+            if job.cancelled.is_set():
+                self._forget(job)
 
     def _make_analysis(self, upload: Upload, sha256: str, vehicle: str | None) -> Errand:
         store = Store(self._results)
@@ -403,7 +428,7 @@ class Jobs:
         log = see_log(upload.path)
         return Errand(path=upload.path, log=log, basis=ANALYZE, options=options, notes=upload.notes)
 
-    def _make_errand(self, manifest: Manifest, basis: str, area: str) -> Errand:
+    def _make_errand(self, manifest: Manifest, basis: str, area: str, notes: Path | None) -> Errand:
         options = Options(out=self._results, run=manifest.run)
         log = LogSighting(path=manifest.run, size=0, mtime_ns=0, inode=0, seen_ns=0)
-        return Errand(path=manifest.folder, log=log, basis=basis, options=options, notes=None, area=area)
+        return Errand(path=manifest.folder, log=log, basis=basis, options=options, notes=notes, area=area)

@@ -131,7 +131,7 @@ const showJobs = (jobs) => {
     job.error && h("p", {}, job.error.message),
     job.error && askVehicle(job),
     job.run && h("button", { type: "button", onclick: () => open_(job.run) }, job.lossy ? "Open (log had losses)" : "Open"),
-    job.done && h("button", { type: "button", class: "drop", title: "close this notice", "aria-label": `close the notice of ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
+    (job.done || job.stops) && h("button", { type: "button", class: "drop", title: job.done ? "close this notice" : "cancel", "aria-label": job.done ? `close the notice of ${job.name}` : `cancel the ${job.name}`, data: { keep: `dismiss ${job.id}` }, onclick: () => dismiss(job) }, "×"))));
   for (const job of jobs) if (job.done && job.run && !job.error && !leaving.has(job.id)) leaving.set(job.id, setTimeout(() => dismiss(job).catch(() => {}), NOTICE_MS));
   if (focus) find("jobs").querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };

@@ -123,13 +123,14 @@ KINDS = {
 _TIME = "60s"
 
 
-def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
+def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable[[str], None]) -> None:
     """Plan the drive that decides the open questions of a stored run; this takes many seconds.
 
     Args:
         store: the results.
         manifest: manifest of the run.
         area: free area, as `20x10m`.
+        notify: called with what is being done.
 
     Raises:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
@@ -139,8 +140,8 @@ def write_run_plan(store: Store, manifest: Manifest, area: str) -> None:
 
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))
-    studied = study([recording], vehicle)
-    planned = plan_drive(vehicle, studied, wish, [recording], read_command(manifest))
+    studied = study([recording], vehicle, notify=notify)
+    planned = plan_drive(vehicle, studied, wish, [recording], read_command(manifest), notify)
     leave_plan(store, manifest, planned.plan)
 
 

@@ -149,3 +149,40 @@ def test_units_do_not_matter() -> None:
         assert two.status == one.status
         assert two.p == pytest.approx(one.p, rel=1e-6)
         assert two.smallest == pytest.approx(one.smallest * size, rel=1e-6)
+
+
+def test_other_runs_of_the_robot_decide_what_a_pair_alone_does_not() -> None:
+    draw = np.random.default_rng(12)
+    shift = np.array([0.6, 0.0, 0.0, 0.0])
+    pair = draw_runs(draw, 1, shift=shift, error=0.02, spread=0.05)
+    others = {"grass": draw_runs(draw, 8, error=0.02, spread=0.05)}
+
+    alone, *_ = compare_sides(pair, USUAL)
+    known, *_ = compare_sides(pair, USUAL, others=others)
+
+    assert (alone.status, alone.freedom) == ("differs", 0)
+    # Sixteen runs of one ground: fifteen degrees of freedom, whatever side they are drawn for.
+    assert (known.status, known.freedom) == ("changed", 15)
+    assert known.spread < 0.1 < alone.spread
+    assert known.smallest < 0.5 * alone.smallest
+    assert known.p_alone < alone.p_alone
+
+
+def test_other_runs_that_differ_much_keep_a_pair_undecided() -> None:
+    draw = np.random.default_rng(13)
+    pair = draw_runs(draw, 1, shift=np.array([0.6, 0.0, 0.0, 0.0]), error=0.02)
+    wide = {"grass": draw_runs(draw, 8, error=0.02, spread=0.6)}
+
+    assert compare_sides(pair, USUAL, others=wide)[0].status == "differs"
+
+
+def test_pairs_beside_other_runs_raise_few_alarms() -> None:
+    draw = np.random.default_rng(14)
+    alarms = 0
+    for _ in range(200):
+        spread = 0.3 * abs(float(draw.normal()))
+        others = {"grass": draw_runs(draw, 4, spread=spread)}
+        alarms += bool(list_changed(compare_sides(draw_runs(draw, 1, spread=spread), USUAL, others=others)))
+
+    # 2.5 % of 200 are 5; nine or more come by chance once in thirty such tests.
+    assert alarms <= 8

@@ -7,23 +7,35 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
+
+from motion_runs import simulate
+
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
-from pipeline.estimation import Named, RunDiagnosis, Value, load_recording
+from pipeline.estimation import Input, Named, Problem, RunDiagnosis, Value, load_recording
 from pipeline.estimation.ambiguity import Undecided, Unobservable
-from pipeline.models import find_effect
+from pipeline.models import Excitation, find_effect
+from pipeline.plan import Commands, Reached, choose_limits
 from pipeline.plan.plan import ExpectedGain
 from pipeline.plan.plan_files import Promised, check_plan
 from pipeline.plan.questions import DECIDED_T, Answerable, Evidence, Groups, Precision, Separation, ask_apart
-from pipeline.plan.rehearsal import Hypothesis, assume, learn
-from pipeline.simulate import Program
+from pipeline.plan.rehearsal import Hypothesis, Rehearsal, Senses, assume, learn, measure_reached
+from pipeline.simulate import Program, find_vehicle
 from pipeline.sources import find_preset
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
 
 
 def test_what_a_refit_leaves_is_the_residual_of_least_squares() -> None:
@@ -233,3 +245,85 @@ def test_an_effect_that_there_is_not_is_refused_before_anything_is_worked_out(
     assert ended.value.code == FAILED
     assert "choosing manoeuvres" not in (said := capsys.readouterr().err)
     assert "no effect is called 'foo'" in said
+
+
+def _answer(
+    names: tuple[str, ...],
+    normal: list[float],
+    prior: float,
+    excited: Mapping[Excitation, NDArray[np.bool_]] = MappingProxyType({}),
+) -> Answerable:
+    """A question on one number, with this information of groups of ten seconds and of the logs so far."""
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    question = Precision("k", names, model, 0, 0.1)
+    size = len(normal)
+    evidence = Evidence(
+        np.array(normal).reshape(-1, 1, 1), np.zeros((size, 1)), np.zeros(size), np.array([[prior]])
+    )
+    return Answerable(question, (evidence,), Groups(np.full(size, 10.0), np.arange(size), 20.0, excited))
+
+
+def test_a_drive_that_tells_nothing_of_a_number_narrows_no_interval() -> None:
+    # The logs know it to 0.02, too few blocks of which are known to promise 0.1: driving on is no evidence.
+    nothing = _answer(("wheel_radius",), [1e-9] * 8, 2500.0)
+    idle, driven = np.zeros(8), np.ones(8)
+    assert float(nothing.bound(driven)) == pytest.approx(float(nothing.bound(idle)))
+    telling = _answer(("wheel_radius",), [2500.0] * 8, 2500.0)
+    assert float(telling.bound(driven)) < 0.5 * float(telling.bound(idle))
+    assert float(telling.answer(driven)) == 1.0
+
+
+@pytest.mark.parametrize("effect", ["wheel_radius", "effective_track", "lateral_drift", "yaw_misalignment"])
+def test_nothing_is_promised_without_what_its_effect_declares_to_need(effect: str) -> None:
+    excited = {need: np.ones((8, 1), dtype=bool) for need in Excitation}
+    drive = np.ones(8)
+    assert float(_answer((effect,), [2500.0] * 8, 2500.0, excited=excited).answer(drive)) == 1.0
+    for need in find_effect(effect).needs:
+        lacking = {**excited, need: np.zeros((8, 1), dtype=bool)}
+        one = _answer((effect,), [2500.0] * 8, 2500.0, excited=lacking)
+        assert float(one.answer(drive)) < 1.0
+        assert need.value in one.format_reached(drive)
+
+
+def test_what_commands_excite_is_read_off_them() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    still, drive = np.zeros(100), np.full(100, 0.5)
+    # Ten seconds of spinning to the left, then of driving forward.
+    commands = Commands(np.append(still, drive), np.append(drive, still))
+    rehearsal = Rehearsal(commands, vehicle, Senses(), np.zeros(1))
+    excited = rehearsal.find_excitation(np.array([0.0, 5.0, 10.0]))
+    assert excited[Excitation.DRIVING].tolist() == [[False], [True]]
+    assert excited[Excitation.TURNING].tolist() == [[True, False], [False, False]]
+    assert excited[Excitation.BOTH_SIGNS].tolist() == [[False, False], [True, False]]
+    # Level ground has no slopes, and how large a command must be is told by the information on a question.
+    assert not {Excitation.SLOPE, Excitation.LARGE, Excitation.SMALL} & {*excited}
+
+
+def test_limits_are_what_the_runs_reached() -> None:
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
+    reached = Reached(0.6, 0.4, 1.7, 0.2)
+    limits = choose_limits(vehicle, reached)
+    assert (limits.speed_mps, limits.turn) == (0.6, 0.4)
+    assert (limits.acceleration_mps2, limits.lateral_mps2) == (1.7, 0.2)
+    assert reached.list_used(limits) == ["speed", "yaw rate", "acceleration", "sideways"]
+    # What is asked for goes before, and the vehicle's own limits before both.
+    asked = choose_limits(vehicle, reached, speed_mps=50.0, acceleration_mps2=0.3, lateral_mps2=5.0)
+    assert asked.speed_mps == vehicle.max_speed_mps
+    assert (asked.acceleration_mps2, asked.lateral_mps2, asked.turn) == (0.3, 5.0, 0.4)
+    # A run that only turned has reached no speed.
+    assert choose_limits(vehicle, Reached(yaw_rate_radps=0.4)).speed_mps == vehicle.max_speed_mps
+
+
+@pytest.mark.parametrize(("speed", "turn"), [(0.3, 0.5), (0.8, 0.2)])
+def test_what_a_run_reached_is_measured(speed: float, turn: float) -> None:
+    slow = replace(find_vehicle("husky"), max_speed_mps=speed, max_turn_radps=turn)
+    made = simulate({}, duration_s=60.0, vehicle=slow, program=Program("smooth"))
+    preset = find_preset("husky_a200")
+    assert preset is not None
+    reached = measure_reached(Problem([made], preset, Input.COMMAND))
+    assert 0.5 * speed < reached.speed_mps <= 1.01 * speed
+    assert 0.5 * turn < reached.yaw_rate_radps <= 1.01 * turn
+    assert 0.05 < reached.acceleration_mps2 < 3.0
+    assert not reached.lateral_mps2 > speed * turn

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from test_workbench_upload import files_below
 from workbench_server import LIMITS, PATIENCE_S, RUN, Workbench
-from workbench_works import work_poisoned
+from workbench_works import work_poisoned, work_slowly
 
 from pipeline.logs.writer import LogWriter
 
@@ -166,3 +166,31 @@ def test_what_a_killed_server_has_left_goes_when_the_next_one_starts(
     third.close()
     assert not own.exists()
     assert (outside / ".lock").exists()
+
+
+def test_a_plan_tells_what_it_does_and_ends_when_it_is_cancelled(results: Path, hidden_log: Path) -> None:
+    server = Workbench(results, work=work_slowly)
+    try:
+        before = files_below(results)
+        server.post("/api/plan", run=RUN, area="20x10m")
+        end = time.monotonic() + PATIENCE_S
+        while (job := _find_only_job(server)) is None or job["words"] != "rehearsing manoeuvres":
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert job["stops"]
+        server.request("POST", f"/api/dismiss?id={job['id']}", b"{}")
+        while _find_only_job(server) is not None:
+            assert time.monotonic() < end
+            time.sleep(0.05)
+        assert files_below(results) == before
+        # The next task gets a new worker.
+        server.request("POST", "/api/upload?name=good.mcap", hidden_log.read_bytes())
+        (good,) = server.wait_for_jobs()
+        assert (good["error"], good["run"]) == (None, RUN)
+    finally:
+        server.close()
+
+
+def _find_only_job(server: Workbench) -> dict[str, object] | None:
+    jobs = cast("list[dict[str, object]]", server.get("/api/jobs")["jobs"])
+    return jobs[0] if jobs else None
