@@ -69,7 +69,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 43
+VERSION = 44
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 

@@ -304,10 +304,8 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
         formula, suggested = str(rest.get("formula") or ""), format_suggestion(rest)
-        words = "; ".join(
-            filter(None, [format_unexplained(rest), suggested and f"suggested term: {suggested}"])
-        )
-        yield "unexplained", words, formula
+        example = f"; suggested term: {suggested}" if suggested else ""
+        yield "unexplained", f"{format_unexplained(rest)}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
