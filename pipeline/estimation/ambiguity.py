@@ -84,9 +84,6 @@ def find_undecided(selection: Selection, final: CandidateModel) -> list[Undecide
             rival = selection.enter(candidate.state) if candidate.is_rough else candidate
             if _does_the_same(selection, without, final, rival):
                 by_name.setdefault(new[0], rival)
-        for name, rival in _list_at_one_speed(selection, without, final, effect):
-            by_name.setdefault(name, rival)
-            alike.append(name)
         known = dict.fromkeys([*by_name, *alike])
         # An effect with more parameters is no rival, even where a simpler rival exists.
         names = [name for name in known if name in alike or not _is_extended(selection, name, effect)]
@@ -185,7 +182,7 @@ def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undeci
 def _list_alike(
     selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
 ) -> list[str]:
-    """Ids of alternatives despite more parameters: smooth forms, and effects not separable in one motion."""
+    """Ids of alternatives despite more parameters: smooth forms, and what one motion or speed leaves open."""
     known = {candidate.id for candidate in selection.candidates}
     softer = [
         (other.id, selection.enter(without.state.add(other)))
@@ -200,22 +197,9 @@ def _list_alike(
         and selection.is_sound(rival)
     ]
     same = effect.same_in_one_motion if selection.largest.is_one_motion else ()
-    return alike + [name for name in same if name in known]
-
-
-def _list_at_one_speed(
-    selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
-) -> list[tuple[str, CandidateModel]]:
-    """What a single commanded speed does not tell from an effect, whichever fits the transients better."""
-    if not selection.largest.is_one_speed:
-        return []
-    others = [
-        candidate().make_usual(selection.largest)
-        for candidate in selection.candidates
-        if candidate.id in effect.same_at_one_speed and candidate.id not in final.ids
-    ]
-    rivals = [(other.id, selection.enter(without.state.add(other))) for other in others]
-    return [(name, rival) for name, rival in rivals if _does_the_same(selection, without, final, rival)]
+    # Whichever fits the transients better: what a drive does at another speed is not known.
+    same += effect.same_at_one_speed if selection.largest.is_one_speed else ()
+    return alike + [name for name in dict.fromkeys(same) if name in known.difference(final.ids)]
 
 
 def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:

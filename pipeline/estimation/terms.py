@@ -338,7 +338,7 @@ def join_formula(terms: Sequence[FormulaEffect]) -> FormulaEffect:
             fixed |= {name} if is_fixed else set()
         texts.setdefault(channel, []).append(text)
     formulas = {channel: " + ".join(parts) for channel, parts in texts.items()}
-    return FormulaEffect(SUGGESTION, formulas, tuple(parameters), fixed=fixed, **values)
+    return FormulaEffect(SUGGESTION, formulas, tuple(parameters), fixed=fixed).change(**values)
 
 
 def _rename(text: str, old: str, new: str) -> str:

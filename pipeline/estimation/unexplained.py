@@ -365,7 +365,8 @@ def _suggest(judgement: Judgement, formula: FormulaEffect) -> tuple[str, Mapping
     with suppress(MotionError):
         step = judge_whole(judgement.problem, model)
         if lowers_errors(judgement.whole.errors, step.errors):
-            return format_effect(step.fitted.model.effect(formula.id)), errors_as_json(step.errors)
+            reached = cast("Mapping[str, Json]", errors_as_json(step.errors))
+            return format_effect(step.fitted.model.effect(formula.id)), reached
     return None
 
 

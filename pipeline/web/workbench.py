@@ -183,10 +183,10 @@ def rank_offers(editor: Editor, diagnosis: Mapping[str, object] | None) -> list[
     prepared, step = editor.prepared, editor.session.step
     file = None if diagnosis is None else read_model_text(diagnosis)
     intervals = {} if file is None else file.intervals
-    offered = [one for one in editor.found if explain_refusal(one, intervals) is None]
-    offered = [one for one in offered if one.id not in step.order]
+    missing = (one for one in editor.found if one.id not in step.order)
+    sound = Model(prepared.vehicle, tuple(one for one in missing if explain_refusal(one, intervals) is None))
     with prepared.lock:
-        offered = prepared.problem.active_effects(Model(prepared.vehicle, tuple(offered)))
+        offered = prepared.problem.active_effects(sound)
         before = prepared.score(switch_off(editor.model, step.off), step.timing)
         model = switch_off(editor.begin(editor.model), step.off)
         ranked = rank_named(prepared.measure_errors, model, before, offered)
