@@ -55,6 +55,7 @@ from pipeline.estimation.ladder import (
     judge_model,
     ladder_as_json,
     list_order,
+    list_raising,
     note_fit,
 )
 from pipeline.estimation.learned_step import learn_beyond
@@ -118,11 +119,16 @@ def summarize(
         doubted = {one.id: d for one in described if (d := find_doubt(one, context.conditions.exceeded))}
         new = {name: one for name, one in doubted.items() if not _is_needed(one, judgement)}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
-        if not new and not small:
+        # What screen and page show of the model that is written raises no error either.
+        raising = [] if new or small else [one for one in _list_raising(judgement) if one in on_ground]
+        excluded = {*new, *(one.id for one in small), *raising}
+        if not excluded:
             break
         doubts += new.values()
         immaterial += small
-        taken = [e for e in taken if e.id not in {*new, *(one.id for one in small)}]
+        idle += raising
+        taken = [effect for effect in taken if effect.id not in excluded]
+        undecided = [item for item in undecided if item.candidates[0] not in excluded]
     unexplained = residual_structure.describe(paths, judgement, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
@@ -178,6 +184,10 @@ def summarize(
             number for one in judgements.values() for number in list_estimates(context, one, named)
         ),
     )
+
+
+def _list_raising(judgement: Judgement | None) -> list[str]:
+    return [] if judgement is None else list_raising(judgement)
 
 
 def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:

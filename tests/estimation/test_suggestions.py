@@ -54,6 +54,7 @@ def test_no_term_of_a_formula_depends_on_place_or_time(*, sideways: bool) -> Non
         ((0.995, 1.0), False, False),
         ((0.98, 1.0), False, True),
         ((1.03, 0.91), False, True),
+        ((1.03, 0.997), True, False),
         ((1.12, 0.98), False, False),
     ],
 )
