@@ -338,23 +338,23 @@ def describe(paths: Sequence[Explored], judgement: Judgement | None, lead: str =
     """
     body = paths[0]
     selection, final = body.search.selection, body.search.final
-    terms = collect_terms(final)
-    if terms:
+    causes: list[tuple[float, Unexplained]] = []
+    if terms := collect_terms(final):
         without = selection.drop(final, [term.id for term in terms])
         share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
-        found = _name_signal(body, without.fit.residual - final.fit.residual, share)
+        signal = without.fit.residual - final.fit.residual
+        found = _name_signal(body, signal, share)
         if judgement is not None and (suggested := _suggest(judgement, join_formula(terms))):
             return replace(found, formula=suggested[0], reached=suggested[1])
-        # Without a formula the share is that of one channel.
+        # Without a formula it is one cause of several, and the share that of one channel.
         channel = CHANNELS.index(found.channel)
         before, after = (float((one.held[:, channel] ** 2).mean()) for one in (without, final))
-        return replace(found, share=1.0 - after / before)
-    causes: list[tuple[float, Unexplained]] = []
+        causes += _weigh(body, signal, replace(found, share=1.0 - after / before))
     for path in paths:
         known, lasting = _find_explainable(path), _find_lasting(path, lead)
-        causes += [] if known is None else [known]
+        causes += known
         # What can be predicted is not said to be motion that nothing predicts.
-        if lasting is not None and (known is None or lasting[1].channel != known[1].channel):
+        if lasting is not None and all(one.channel != lasting[1].channel for _, one in known):
             causes.append(lasting)
     return max(causes, key=lambda item: item[0])[1] if causes else None
 
@@ -381,21 +381,26 @@ def is_felt(channel: str, size: float, part: float) -> bool:
     return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
 
 
-def _find_explainable(path: Explored) -> tuple[float, Unexplained] | None:
-    """What can be predicted from what was recorded, and its size against the motion asked for."""
+def _find_explainable(path: Explored) -> list[tuple[float, Unexplained]]:
+    """What can be predicted from what was recorded, with its size against the motion asked for, if any."""
     explainable = path.explainable
     if explainable is None or not is_explainable(explainable):
-        return None
+        return []
     selection = path.search.selection
     signal = explainable.predicted * np.where(explainable.shares > 0.0, selection.weights.scale, 0.0)
     cause = _name_signal(path, signal, 0.0)
     channel = CHANNELS.index(cause.channel)
-    cause = replace(cause, share=float(explainable.shares[channel]))
+    return _weigh(path, signal, replace(cause, share=float(explainable.shares[channel])))
+
+
+def _weigh(path: Explored, signal: Floats, cause: Unexplained) -> list[tuple[float, Unexplained]]:
+    """A cause with the size of its push against the motion asked for; empty where nobody feels it."""
+    channel = CHANNELS.index(cause.channel)
     size = float(np.sqrt((signal[:, channel] ** 2).mean()))
-    part = size / float(measure_asked(selection)[channel])
+    part = size / float(measure_asked(path.search.selection)[channel])
     # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
     least = LEAST_OF_DRIVE if path.search.path == "wheels" else 0.0
-    return (part, cause) if part >= least and is_felt(cause.channel, size, part) else None
+    return [(part, cause)] if part >= least and is_felt(cause.channel, size, part) else []
 
 
 def _name_signal(body: Explored, signal: Floats, share: float) -> Unexplained:
