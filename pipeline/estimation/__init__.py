@@ -49,7 +49,6 @@ from pipeline.estimation.unexplained import (
     Explainable,
     boost_residuals,
     collect_terms,
-    find_places,
     list_window_signals,
     measure_asked,
     search_formula,
@@ -206,11 +205,11 @@ def _explore(
 
 def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
     search = search_body(context, source, known, budget)
-    comparisons = search.selection.part.comparisons
-    places = find_places(comparisons)
-    final = search_formula(search.selection, search.start, search.final, places)
+    final = search_formula(search.selection, search.final)
     # Where a formula explains the residual, boosting is skipped.
-    features = None if collect_terms(final) else list_window_signals(comparisons)[0]
+    features = None
+    if not collect_terms(final):
+        features = list_window_signals(search.selection.part.comparisons)[0]
     explainable = None if features is None else boost_residuals(search.selection, final, features)
     search = replace(search, final=final)
     return _gather(search, explainable)

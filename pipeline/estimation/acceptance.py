@@ -12,7 +12,7 @@ import numpy as np
 
 from pipeline.core import format_share, suffix_unit
 from pipeline.core.arrays import Floats, robust_spreads
-from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, judge_whole
+from pipeline.estimation.ladder import Judgement, LadderStep, compare_losses, judge_whole, raises_errors
 from pipeline.estimation.parts import CLIP, count_seconds
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
@@ -383,7 +383,7 @@ def find_idle(
     """Effects that raise the 2 s errors, and those of the drivetrain that reduce no error.
 
     They are taken out one by one, the one that raises the errors most first: without it others may be needed,
-    or help no longer.
+    or help no longer. From the first input no effect may raise them: that model is written.
 
     Args:
         model: with all effects.
@@ -391,16 +391,21 @@ def find_idle(
         duties: inputs from which an effect must serve predictions, by id; others stay.
         drive: ids of the effects of the drivetrain.
     """
-    idle = list[str]()
+    idle, leading = list[str](), next(iter(problems))
     while rest := [name for name in duties if name not in idle]:
         part, raised = model.keep(name for name in model.ids if name not in idle), dict[str, float]()
         for source, problem in problems.items():
             with suppress(MotionError):
                 whole = judge_whole(problem, part)
-                for name in (one for one in rest if source in duties[one] and one in whole.effects):
+                judged = [one for one in rest if source is leading or source in duties[one]]
+                for name in (one for one in judged if one in whole.effects):
                     with suppress(MotionError):
                         without = whole.drop(name)
-                        if _is_idle(whole, without, is_of_drive=name in drive):
+                        if source not in duties[name]:
+                            is_idle = raises_errors(without.errors, whole.errors)
+                        else:
+                            is_idle = _is_idle(whole, without, is_of_drive=name in drive)
+                        if is_idle:
                             size = math.prod(whole.errors.ratios(without.errors)[3:])
                             raised[name] = max(raised.get(name, 0.0), size)
         if not raised:
@@ -410,9 +415,9 @@ def find_idle(
 
 
 def _is_idle(step: LadderStep, below: LadderStep, *, is_of_drive: bool) -> bool:
-    """Whether the geometric mean 2 s error rises, or a drivetrain effect lowers no error by `LEAST_GAIN`."""
+    """Whether an effect raises the 2 s errors, or one of the drivetrain lowers no error by `LEAST_GAIN`."""
     reached = step.errors.ratios(below.errors)[3:]
-    if math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
+    if raises_errors(below.errors, step.errors) or math.sqrt(math.prod(reached)) > 1.0 + LEAST_GAIN:
         return True
     return is_of_drive and min(compare_losses(step.held_out, below.held_out), *reached) > 1.0 - LEAST_GAIN
 

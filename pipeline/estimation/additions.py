@@ -15,10 +15,18 @@ import numpy as np
 from pipeline.core import format_share
 from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
 from pipeline.estimation.evidence import Evidence, learn_noise, tile_windows
-from pipeline.estimation.fit import Fitted, fit_model
-from pipeline.estimation.folds import Errors, HeldOut, hold_out, number_predictions, score
+from pipeline.estimation.fit import Fitted
+from pipeline.estimation.folds import Errors, HeldOut, number_predictions
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import CHANCE, LadderStep, format_rises, list_rises
+from pipeline.estimation.ladder import (
+    CHANCE,
+    LadderStep,
+    format_rises,
+    judge_whole,
+    list_rises,
+    lowers_errors,
+    raises_errors,
+)
 from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.parts import make_weights
 from pipeline.estimation.selection import PRICE, Context
@@ -33,7 +41,6 @@ if TYPE_CHECKING:
     from pipeline.core.arrays import Floats
     from pipeline.estimation.problem import Problem
     from pipeline.estimation.proposals import Candidate
-    from pipeline.estimation.state import State
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.parameter import Conditions
 
@@ -56,6 +63,7 @@ class Addition:
         remaining: remaining share of the 2 s errors: that of position times that of heading.
         refusal: why it does not help; None where it helps.
         twins: ids of effects that reduce the error of the run equally.
+        helps: whether it lowers an error by more than chance.
     """
 
     effect: Effect
@@ -63,25 +71,34 @@ class Addition:
     remaining: float
     refusal: str | None = None
     twins: tuple[str, ...] = ()
+    helps: bool = True
 
 
-def rank_named(problem: Problem, state: State, named: Sequence[Effect]) -> list[Addition]:
-    """Effects of a diagnosis that a model lacks, the largest error reduction first.
+def rank_named(
+    judge: Callable[[Model], Errors], model: Model, before: Errors, named: Sequence[Effect]
+) -> list[Addition]:
+    """What a diagnosis has beyond a model, the largest error reduction first.
 
-    They are scored with the values of the diagnosis; nothing is fitted.
+    What raises the errors is left out: it may help once others are in the model.
 
     Args:
-        problem: the run.
-        state: the model.
-        named: effects of the diagnosis, with their values.
+        judge: held-out errors of a model, fitted: what it has once the effect was added.
+        model: the model.
+        before: its errors.
+        named: effects and the suggested formula of the diagnosis, with their values.
     """
-    active = problem.active_effects(Model(problem.vehicle, tuple(named)))
-    missing = [effect for effect in active if effect.id not in state.ids]
-    before = score(problem, state).pooled if missing else None
     additions = []
-    for effect in missing:
-        errors = score(problem, state.add(effect)).pooled
-        additions.append(Addition(effect, errors, _measure_remaining(before or errors, errors)))
+    for effect in (one for one in named if one.id not in model):
+        errors = judge(model + effect)
+        if not raises_errors(before, errors):
+            additions.append(
+                Addition(
+                    effect,
+                    errors,
+                    _measure_remaining(before, errors),
+                    helps=lowers_errors(before, errors),
+                )
+            )
     return sorted(additions, key=lambda one: one.remaining)
 
 
@@ -109,37 +126,34 @@ class Tries:
 
     def __init__(self, problem: Problem, model: Model) -> None:
         self._problem, self._model = problem, model
-        self._base = fit_model(problem, model)
-        self._held = hold_out(problem, self._base)
+        self._base = judge_whole(problem, model)
         self._moves: dict[str, Floats] = {}
-        self.before = self._held.pooled
-        self.candidates = list_promising(problem, self._base)
+        self.before = self._base.errors
+        self.candidates = list_promising(problem, self._base.fitted)
 
     def try_each(self) -> Iterator[Addition | None]:
         """Each candidate, fitted and judged; None for one that cannot be fitted to this run."""
         for candidate in self.candidates:
             try:
-                fitted = fit_model(self._problem, self._model + candidate())
-                held = hold_out(self._problem, fitted)
+                after = judge_whole(self._problem, self._model + candidate())
             except (MotionError, ArithmeticError, ValueError):
                 yield None
                 continue
-            yield self._judge(candidate.id, fitted, held)
+            yield self._judge(candidate.id, after)
 
-    def _judge(self, name: str, fitted: Fitted, held: HeldOut) -> Addition | None:
-        effect = next((one for one in fitted.state.effects if one.id == name), None)
+    def _judge(self, name: str, after: LadderStep) -> Addition | None:
+        effect = next((one for one in after.fitted.state.effects if one.id == name), None)
         if effect is None:
             return None
-        before, after = LadderStep(self._base, self._held), LadderStep(fitted, held)
         reasons = explain_refusals(
             self._problem,
-            before,
+            self._base,
             after,
-            lambda: estimate_intervals(self._problem, fitted).shared_intervals,
+            lambda: estimate_intervals(self._problem, after.fitted).shared_intervals,
         )
-        remaining = _measure_remaining(self.before, held.pooled)
-        self._moves[name] = _unit(held.residuals - self._held.residuals, self._held.residuals)
-        return Addition(effect, held.pooled, remaining, reasons.get(name))
+        remaining, held = _measure_remaining(self.before, after.errors), self._base.held_out.residuals
+        self._moves[name] = _unit(after.held_out.residuals - held, held)
+        return Addition(effect, after.errors, remaining, reasons.get(name))
 
     def fold(self, additions: Sequence[Addition]) -> list[Addition]:
         """Helpful effects, largest reduction first; twins are listed under the one with fewest parameters."""

@@ -182,7 +182,7 @@ def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undeci
 def _list_alike(
     selection: Selection, without: CandidateModel, final: CandidateModel, effect: Effect
 ) -> list[str]:
-    """Ids of alternatives despite more parameters: smooth forms, and effects not separable in one motion."""
+    """Ids of alternatives despite more parameters: smooth forms, and what one motion or speed leaves open."""
     known = {candidate.id for candidate in selection.candidates}
     softer = [
         (other.id, selection.enter(without.state.add(other)))
@@ -197,7 +197,9 @@ def _list_alike(
         and selection.is_sound(rival)
     ]
     same = effect.same_in_one_motion if selection.largest.is_one_motion else ()
-    return alike + [name for name in same if name in known]
+    # Whichever fits the transients better: what a drive does at another speed is not known.
+    same += effect.same_at_one_speed if selection.largest.is_one_speed else ()
+    return alike + [name for name in dict.fromkeys(same) if name in known.difference(final.ids)]
 
 
 def _is_as_good(selection: Selection, final: CandidateModel, rival: CandidateModel) -> bool:

@@ -33,8 +33,6 @@ from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
-from pipeline.estimation.proposals import TERM
-from pipeline.estimation.verdict import FORMULA
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -127,22 +125,16 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
         length_scale_m: of the slip modulus [m].
     """
     problem, fitted = judgement.problem, judgement.fitted
-    players: dict[str, set[str]] = {}
-    for name in fitted.model.ids:
-        players.setdefault(FORMULA if name.startswith(TERM) else name, set()).add(name)
-
+    players = fitted.model.ids
     known = {frozenset(players): judgement.whole.held_out}
-    known[frozenset()] = judgement.ladder.steps[0].held_out
+    known[frozenset()] = judgement.ideal.held_out
     # Models with the same first effects are adjacent, so that their common prediction is computed once.
-    asked = sorted(list_subsets(tuple(players)) - known.keys(), key=lambda one: [p in one for p in players])
-    models = [
-        fitted.state.drop([n for player in players if player not in one for n in players[player]])
-        for one in asked
-    ]
+    asked = sorted(list_subsets(players) - known.keys(), key=lambda one: [p in one for p in players])
+    models = [fitted.state.drop([name for name in players if name not in one]) for one in asked]
     known |= dict(zip(asked, map_parallel(partial(score, problem), models), strict=True))
     stretches = _find_stretches(problem)
     losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
-    split = share_out(tuple(players), losses)
+    split = share_out(players, losses)
     floor = judgement.floor
     x, y, w = floor.velocity_rms
     floors = (x**2 + y**2 + (length_scale_m * w) ** 2, floor.t_mrmse_m**2, floor.r_mrmse_rad**2)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import math
 from dataclasses import replace
-from types import MappingProxyType
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
@@ -57,6 +56,7 @@ from pipeline.estimation.ladder import (
     judge_model,
     ladder_as_json,
     list_order,
+    list_raising,
     note_fit,
 )
 from pipeline.estimation.learned_step import learn_beyond
@@ -102,32 +102,35 @@ def summarize(
     taken, undecided = choose_reaching(context.problem, _gather(paths, clocks, context), undecided)
     open_ids = {item.candidates[0] for item in undecided}
     known = frozenset().union(*(path.search.selection.given for path in paths))
-    terms = [effect for effect in body.search.final.state.effects if is_term(effect.id)]
     inputs = tuple(dict.fromkeys((source, Input(body.search.path))))
-    on_ground = {e.id: _path_of(e, paths) is body for e in (*taken, *terms) if e.id not in known}
-    idle = _list_idle(context, inputs, _join(context, [*taken, *terms], open_ids), on_ground)
-    taken, terms = ([effect for effect in some if effect.id not in idle] for some in (taken, terms))
-    undecided = [item for item in undecided if item.candidates[0] not in idle]
-    judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids)
-    added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
+    on_ground = {e.id: _path_of(e, paths) is body for e in taken if e.id not in known}
+    idle: list[str] = []
     doubts: list[Mapping[str, Json]] = []
     immaterial: list[Named] = []
     while True:
+        # The values of the other effects, and what they bring, change without those that were left out.
+        useless = _list_idle(context, inputs, _join(context, taken, open_ids), on_ground)
+        idle += useless
+        taken = [effect for effect in taken if effect.id not in useless]
+        undecided = [item for item in undecided if item.candidates[0] not in useless]
+        judgements = _judge_ways(context, inputs, taken, open_ids)
+        added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
         judgement = judgements.get(source.value)
         described = _name_all(added, context, paths, judgement)
         doubted = {one.id: d for one in described if (d := find_doubt(one, context.conditions.exceeded))}
         new = {name: one for name, one in doubted.items() if not _is_needed(one, judgement)}
         small = [one for one in described if one.id not in new and one.moves and not one.moves.is_material]
-        if not new and not small:
+        # What screen and page show of the model that is written raises no error either.
+        raising = [] if new or small else [one for one in _list_raising(judgement) if one in on_ground]
+        excluded = {*new, *(one.id for one in small), *raising}
+        if not excluded:
             break
         doubts += new.values()
         immaterial += small
-        excluded = {*new, *(one.id for one in small)}
-        # The values of the other effects change without these.
-        taken, added = ([e for e in some if e.id not in excluded] for some in (taken, added))
-        judgements = _judge_ways(context, inputs, [*taken, *terms], open_ids, judgements)
-    judgement = judgements.get(source.value)
-    unexplained = residual_structure.describe(paths, lead := _find_lead(paths, judgement))
+        idle += raising
+        taken = [effect for effect in taken if effect.id not in excluded]
+        undecided = [item for item in undecided if item.candidates[0] not in excluded]
+    unexplained = residual_structure.describe(paths, judgement, lead := _find_lead(paths, judgement))
     part, start = context.problem.whole, body.search.start
     residual = part.find_residuals(start.state)
     places = find_places(part.comparisons)
@@ -160,7 +163,7 @@ def summarize(
             *note_cut(body.search.selection.budget),
             *note_grounds(context),
             *doubts,
-            *(note_idle(name) for name in idle if not is_term(name)),
+            *map(note_idle, idle),
         ),
         ladder=() if judgement is None else tuple(_list_steps(judgement)),
         noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
@@ -182,6 +185,10 @@ def summarize(
             number for one in judgements.values() for number in list_estimates(context, one, named)
         ),
     )
+
+
+def _list_raising(judgement: Judgement | None) -> list[str]:
+    return [] if judgement is None else list_raising(judgement)
 
 
 def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
@@ -286,12 +293,8 @@ def _list_idle(
         model: with all effects.
         on_ground: whether an effect acts on the ground, not in the drivetrain, by id; others stay.
     """
-    # A formula is no cause: it must serve predictions from every input. An encoder error affects both the
-    # ground and the drivetrain; from commands the two cancel.
-    duties = {
-        name: inputs if is_term(name) else inputs[-1:] if is_ground else inputs[:1]
-        for name, is_ground in on_ground.items()
-    }
+    # An encoder error affects both the ground and the drivetrain; from commands the two cancel.
+    duties = {name: inputs[-1:] if is_ground else inputs[:1] for name, is_ground in on_ground.items()}
     drive = {name for name, is_ground in on_ground.items() if not is_ground}
     return find_idle(model, {one: _find_problem(context, one) for one in inputs}, duties, drive)
 
@@ -301,12 +304,11 @@ def _judge_ways(
     inputs: Sequence[Input],
     effects: Sequence[Effect],
     open_ids: set[str],
-    wider: Mapping[str, Judgement] = MappingProxyType({}),
 ) -> dict[str, Judgement]:
-    """The model of these effects judged from each input to the body; ``wider`` is that of a larger model."""
+    """The model of these effects judged from each input to the body."""
     model = _join(context, effects, open_ids)
     # In sequence, so that the ground part of the model is fitted once for both.
-    judged = {source.value: _judge_path(context, model, wider, source) for source in inputs}
+    judged = {source.value: _judge_path(context, model, source) for source in inputs}
     return {name: one for name, one in judged.items() if one is not None}
 
 
@@ -327,12 +329,10 @@ def _join(context: Context, effects: Sequence[Effect], open_ids: set[str]) -> Mo
     return Model(context.vehicle, tuple(acting))
 
 
-def _judge_path(
-    context: Context, model: Model, wider: Mapping[str, Judgement], source: Input
-) -> Judgement | None:
+def _judge_path(context: Context, model: Model, source: Input) -> Judgement | None:
     """The model judged from one input to the body; None where that is not possible."""
     with contextlib.suppress(MotionError):
-        return judge_model(_find_problem(context, source), model, wider=wider.get(source.value))
+        return judge_model(_find_problem(context, source), model)
     return None
 
 
@@ -464,12 +464,7 @@ def _delay_poses(part: Part, state: State) -> Floats:
 
 
 def _list_steps(judgement: Judgement) -> list[Mapping[str, Json]]:
-    rungs = []
-    for step in ladder_as_json(judgement.ladder, judgement.floor):
-        ids = cast("list[str]", step["effects"])
-        names = list(dict.fromkeys("unexplained" if is_term(name) else name for name in ids))
-        rungs.append(cast("Mapping[str, Json]", {**step, "effects": names}))
-    return rungs
+    return cast("list[Mapping[str, Json]]", ladder_as_json(judgement.ladder, judgement.floor))
 
 
 def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
@@ -480,7 +475,7 @@ def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgeme
     wheels = paths[1].search
     if source is Input.COMMAND and measured is not None:
         described["measured"] = {
-            "effects": [name for name in measured.fitted.model.ids if not is_term(name)],
+            "effects": list(measured.fitted.model.ids),
             "ladder": cast("Json", _list_steps(measured)),
             "noise_floor": cast("Json", errors_as_json(measured.floor)),
         }

@@ -23,7 +23,6 @@ from pipeline.estimation.error_regions import format_errors
 from pipeline.estimation.folds import find_in_test, refit, refit_fold, score
 from pipeline.estimation.intervals import sum_blocks
 from pipeline.estimation.ladder import ERRORS_OVER_2S
-from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import CHANGE, name_effect
 
 if TYPE_CHECKING:
@@ -211,7 +210,7 @@ def _list_changes(index: int, part: Part, fit: PartFit) -> Iterator[_Change]:
     normals, pulls = numbers.normals / np.outer(size, size), numbers.gradients / size
     pulls = pulls - pulls.mean(axis=0)
     for column, number in enumerate(fit.free):
-        if not number.effect or is_term(number.effect) or not number.is_smooth:
+        if not number.effect or not number.is_smooth:
             continue
         statistics = _compare_sides(normals, pulls, column)[_MARGIN - 1 : blocks.count - _MARGIN]
         best = int(np.abs(statistics).argmax()) if statistics.size else 0

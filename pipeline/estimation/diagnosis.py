@@ -288,10 +288,12 @@ class Unexplained:
         channel: x, y or w.
         channels: every channel with structure.
         where: as text.
-        formula: a formula effect as text of a model file; None where none was found.
+        formula: a formula effect as text of a model file, a suggestion that no model holds; None where none
+            was found, or it does not lower the errors over 2 s.
         partial: signal that the structure depends on most: name, and mean error by value; empty where it
             depends on no recorded signal.
         path: of the search that identified it.
+        reached: held-out errors of the model with the formula; empty without one.
     """
 
     share: float
@@ -301,6 +303,7 @@ class Unexplained:
     formula: str | None
     partial: Mapping[str, Json]
     path: str
+    reached: Mapping[str, Json] = field(default_factory=dict)
 
     def to_json(self) -> dict[str, Json]:
         """The documented keys, and more."""
@@ -310,6 +313,7 @@ class Unexplained:
             "channels": list(self.channels),
             "where": self.where,
             "formula": self.formula,
+            "with_formula": dict(self.reached) or None,
             "partial_dependence": self.partial,
             "found_on": self.path,
         }

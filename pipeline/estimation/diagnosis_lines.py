@@ -10,7 +10,7 @@ from itertools import pairwise
 from typing import cast
 
 from pipeline.core import INPUT_WORDS, format_angle, format_length, format_part, format_share, mark_finding
-from pipeline.core.untrusted import number_in
+from pipeline.core.untrusted import mapping_in, number_in
 from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import DETECTED_SHARE, Undecided
 from pipeline.estimation.diagnosis import (
@@ -36,12 +36,10 @@ from pipeline.estimation.verdict import (
     CHANGE,
     SEARCH_CUT,
     format_verdict,
-    holds_formula,
     is_small,
     list_added,
     measure_excess,
     name_effect,
-    name_formula,
     name_group,
     split_main,
 )
@@ -69,7 +67,7 @@ _UNOBSERVABLE_SHOWN = 8
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
 _CHANNELS = {"x": "forward motion", "y": "lateral motion", "w": "yaw rate"}
-_VALUE = re.compile(r'^(\w+) = \{value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
+_VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
 _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
 """Inputs of formulas in words."""
 _FINDINGS_SHOWN = 4
@@ -259,9 +257,10 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         rows.append(format_learned_share(run.learned))
     if run.unexplained is None:
         return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
-    rows.append(format_unexplained(run.unexplained.to_json(), run.ladder))
-    rows += [f"{name_formula(run.ladder)}: {line}" for line in _list_formula(run.unexplained.formula or "")]
-    return [*rows, *_suggest_next_steps(run)]
+    rest = run.unexplained.to_json()
+    rows.append(format_unexplained(rest))
+    rows += [f"suggested term: {line}" for line in _list_formula(run.unexplained.formula or "")]
+    return [*rows, format_suggestion(rest), *_suggest_next_steps(run)]
 
 
 def _list_formula(text: str) -> Iterator[str]:
@@ -275,18 +274,24 @@ def _list_formula(text: str) -> Iterator[str]:
             yield ", ".join([line.replace('"', ""), *known])
 
 
-def format_unexplained(rest: Mapping[str, object], ladder: Sequence[Mapping[str, object]] = ()) -> str:
+def format_unexplained(rest: Mapping[str, object]) -> str:
     """The structure of the residual that no effect explains: its share of the residual, and its dependence.
 
     A formula is compared with the whole residual, all else with that of one channel.
     """
     share = number_in(rest, "share")
-    if holds_formula(ladder):
-        part = "part" if share is None else format_share(share)
-        return f"a formula explains {part} of the residual beyond the effects: {rest.get('where', '')}"
     channel = "" if rest.get("formula") else f" {_CHANNELS.get(str(rest.get('channel')), 'motion')}"
     what = f"{'part' if share is None else format_share(share)} of the residual{channel}"
     return f"{what} has a structure that the model does not explain: {rest.get('where', '')}"
+
+
+def format_suggestion(rest: Mapping[str, object]) -> str:
+    """What a suggested formula would bring; empty without one."""
+    reached = mapping_in(rest, "with_formula")
+    if not reached:
+        return ""
+    remaining = format_errors(reached)
+    return f"no model holds it until you add it (`slip serve`): {remaining} would remain over {HORIZON_S:g} s"
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:

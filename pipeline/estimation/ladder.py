@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from typing import Final
 
@@ -95,29 +96,40 @@ def find_share_removed(error: float, ideal: float, floor: float) -> float | None
     return (ideal - error) / room if room > _LEAST_ROOM * ideal else None
 
 
-def climb(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), known_steps: Sequence[LadderStep] = ()
-) -> Ladder:
+def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Ladder:
     """Build the ladder of a model's effects, that effect next which most lowers the errors over 2 s.
 
     All effects are fitted together. Errors with one more are predicted with the values of that fit; of
     effects that lower them alike, the earlier one of the model comes first. At each step all parameters are
-    refitted; the last step is the model itself. An effect that raises an error is also a step: `list_rises`
-    reports it.
+    refitted, from the values of the whole model; the last step is the model itself. An effect that raises an
+    error is also a step: `list_rises` reports it.
 
     Args:
         problem: the runs.
         model: model with the effects, whose values are the starts.
         per_run: as in `fit_model`.
-        known_steps: steps of a larger model, reused for the same effects, except for the last step.
     """
-    # The last step is the model that is written: unlike the steps before, it is fitted exactly.
-    whole = judge_whole(problem, model, per_run)
-    known = {frozenset(step.effects): step for step in known_steps}
+    return _climb_to(judge_whole(problem, model, per_run), per_run)
+
+
+def list_raising(judgement: Judgement) -> list[str]:
+    """Effects whose step raises the errors over 2 s, and without which the whole model has lower ones."""
+    raising: list[str] = []
+    for below, step in pairwise(judgement.ladder.steps):
+        if raises_errors(below.errors, step.errors):
+            (name,) = set(step.effects) - set(below.effects)
+            rest = judgement.fitted.model - name
+            without = judge_whole(judgement.problem, rest, judgement.per_run)
+            raising += [name] if raises_errors(without.errors, judgement.whole.errors) else []
+    return raising
+
+
+def _climb_to(whole: LadderStep, per_run: Sequence[str]) -> Ladder:
+    """The ladder up to a judged model: each step is what the model with only these effects is elsewhere."""
+    problem, model = whole.fitted.problem, whole.fitted.model
     steps, taken = list[LadderStep](), list[str]()
     while len(taken) < len(whole.effects):
-        step = known.get(frozenset(taken)) or fit_step(problem, whole.fitted, taken, per_run)
-        steps.append(step)
+        steps.append(judge_whole(problem, model.keep(taken), per_run))
         taken.append(_choose_next(problem, whole.fitted, taken, steps[0].errors))
     return Ladder((*steps, whole))
 
@@ -133,7 +145,11 @@ def _choose_next(problem: Problem, whole: Fitted, taken: Sequence[str], ideal: E
 
 
 def judge_whole(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> LadderStep:
-    """The exact fit of a model's effects that act on the input, with its held-out errors."""
+    """The exact fit of a model's effects that act on the input, with its held-out errors.
+
+    Whatever is said of a model's error on these runs is this; from the same values, it is the same to the
+    last digit.
+    """
     active = model.keep(effect.id for effect in problem.active_effects(model))
     fitted = fit_model(problem, active, per_run=per_run, exact=True)
     return LadderStep(fitted, hold_out(problem, fitted))
@@ -164,12 +180,11 @@ def list_order(steps: Sequence[LadderStep]) -> list[str]:
 def fit_step(
     problem: Problem, whole: Fitted, names: Sequence[str], per_run: Sequence[str] = ()
 ) -> LadderStep:
-    """The model with some of its effects, fitted from their values in the whole model."""
-    if names:
-        fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
-    else:
+    """The model with some of its effects, fitted from the whole model as far as a comparison needs it."""
+    if not names:
         # It has only delays: they are estimated as elsewhere, not from those of the whole model.
-        fitted = fit_model(problem, whole.model.ideal, exact=True)
+        return judge_whole(problem, whole.model.ideal)
+    fitted = fit_model(problem, whole.model.keep(names), per_run=per_run, start=whole)
     return LadderStep(fitted, hold_out(problem, fitted))
 
 
@@ -190,6 +205,21 @@ def list_rises(
         for name in ERRORS_OVER_2S
         if _as_written(errors, name) > _as_written(below, name) * (1.0 + forgiven)
     )
+
+
+def raises_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object]) -> bool:
+    """Whether a step raises both errors over 2 s, or one by more than chance and the other falls no more."""
+    if len(list_rises(below, errors)) == len(ERRORS_OVER_2S):
+        return True
+    return bool(list_rises(below, errors, CHANCE)) and not list_rises(errors, below, CHANCE)
+
+
+def lowers_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object]) -> bool:
+    """Whether a step lowers an error over 2 s by more than chance, and both together."""
+    if raises_errors(below, errors) or not list_rises(errors, below, CHANCE):
+        return False
+    after, before = (math.prod(_as_written(one, name) for name in ERRORS_OVER_2S) for one in (errors, below))
+    return after < before
 
 
 def _as_written(errors: Errors | Mapping[str, object], name: str) -> float:
@@ -224,15 +254,33 @@ class Judgement:
 
     Attributes:
         problem: the runs.
-        ladder: held-out errors from the ideal to the whole model.
-        whole: all effects of the model, fitted together, with their held-out errors.
+        physics: all effects of the model, fitted together, with their held-out errors.
         estimates: its parameters with intervals.
+        per_run: labels with one value per run.
+        learned: the same with a learned term on top; None without one.
     """
 
     problem: Problem
-    ladder: Ladder
-    whole: LadderStep
+    physics: LadderStep
     estimates: Estimates
+    per_run: tuple[str, ...] = ()
+    learned: LadderStep | None = None
+
+    @property
+    def whole(self) -> LadderStep:
+        """The whole model."""
+        return self.learned or self.physics
+
+    @cached_property
+    def ideal(self) -> LadderStep:
+        """The ideal model."""
+        return judge_whole(self.problem, self.physics.fitted.model.ideal)
+
+    @cached_property
+    def ladder(self) -> Ladder:
+        """Held-out errors from the ideal to the whole model."""
+        ladder = _climb_to(self.physics, self.per_run)
+        return ladder if self.learned is None else Ladder((*ladder.steps, self.learned))
 
     @property
     def fitted(self) -> Fitted:
@@ -245,21 +293,16 @@ class Judgement:
         return self.problem.floor
 
 
-def judge_model(
-    problem: Problem, model: Model, *, per_run: Sequence[str] = (), wider: Judgement | None = None
-) -> Judgement:
-    """Fit a model and build its ladder.
+def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:
+    """Fit a model.
 
     Args:
         problem: the runs.
         model: its effects at neutral values are searched, others start from their values.
         per_run: labels with one value per run.
-        wider: judgement of this model with more effects on the same runs: equal steps are reused.
     """
-    known = wider.ladder.steps if wider is not None and wider.problem is problem and not per_run else ()
-    ladder = climb(problem, model, per_run=per_run, known_steps=known)
-    whole = ladder.steps[-1]
-    return Judgement(problem, ladder, whole, estimate_intervals(problem, whole.fitted))
+    whole = judge_whole(problem, model, per_run)
+    return Judgement(problem, whole, estimate_intervals(problem, whole.fitted), tuple(per_run))
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:

@@ -32,10 +32,10 @@ from pipeline.estimation.ladder import (
     CHANCE,
     ERRORS_OVER_2S,
     Judgement,
-    Ladder,
     LadderStep,
     find_share_removed,
     format_rises,
+    judge_whole,
     list_rises,
     read_error,
 )
@@ -298,16 +298,10 @@ def make_learned_step(problem: Problem, fitted: Fitted, below: HeldOut) -> Learn
     return LearnedStep(ResidualTerm(term.inputs, bands), below, above, refusal)
 
 
-def hold_out_model(problem: Problem, fitted: Fitted) -> HeldOut:
-    """As `hold_out`, for a model whose learned term is retrained without the tested stretches."""
-    has_term = find_learned(fitted.state.effects) is not None
-    return hold_out(problem, fitted, learn_fold(problem) if has_term else None)
-
-
 def fit_and_hold_out(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> tuple[Fitted, HeldOut]:
     """Fit the physics of a model, retrain its learned term if it has one, and score both together."""
-    fitted = fit_model(problem, drop_learned(model), per_run=per_run, exact=True)
-    below = hold_out(problem, fitted)
+    physics = judge_whole(problem, drop_learned(model), per_run)
+    fitted, below = physics.fitted, physics.held_out
     if find_learned(model) is None:
         return fitted, below
     step = make_learned_step(problem, fitted, below)
@@ -338,7 +332,7 @@ def judge_learned_term(judgement: Judgement) -> Judgement:
     below = judgement.whole
     step = make_learned_step(judgement.problem, below.fitted, below.held_out)
     last = LadderStep(add_term(below.fitted, step.term), step.held_out)
-    return replace(judgement, ladder=Ladder((*judgement.ladder.steps, last)), whole=last)
+    return replace(judgement, learned=last)
 
 
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
@@ -466,7 +460,7 @@ def learn_beyond(judgement: Judgement) -> dict[str, Json]:
         step = LearnedStep(ResidualTerm(), below.held_out, below.held_out, at_floor)
     else:
         step = make_learned_step(judgement.problem, below.fitted, below.held_out)
-    return learned_as_json(step, judgement.ladder.steps[0].errors, floor)
+    return learned_as_json(step, judgement.ideal.errors, floor)
 
 
 def learned_as_json(step: LearnedStep, ideal: Errors, floor: Errors) -> dict[str, Json]:

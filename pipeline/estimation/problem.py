@@ -272,9 +272,19 @@ class Problem:
         return self.whole.find_run_residuals(state, run)
 
 
+_STANDS = 0.1
+"""Share of the largest commanded wheel speed up to which a wheel counts as standing."""
+_MOMENTS = 0.1
+"""Share of the commands at either end that may be ramps."""
+_ONE_SPEED = 0.8
+"""Ratio of commanded speeds above which they are one: a limit and a gain that agree at one of them differ by
+less than a fifth at the other, which lags of the drive hide."""
+
+
 def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
     """The largest inputs of runs: of commands if there are any, else of wheels."""
     speed = aside = turn = wheel = difference = 0.0
+    fastest = list[Floats]()
     for run in runs:
         series = run.commands or run.wheels
         if series is None:
@@ -283,11 +293,24 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(yaw_rate).max()))
         if series.sideways is not None:
             aside = max(aside, float(np.abs(sideways).max()))
-        wheel = max(wheel, float(find_fastest_wheel(series).max()))
+        fastest.append(find_fastest_wheel(series))
+        wheel = max(wheel, float(fastest[-1].max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
     moments, turns = _find_tenths(runs, vehicle)
     rim = vehicle.wheel_radius_m * wheel
-    return Largest(speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns, rim=rim)
+    return Largest(
+        speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns, rim=rim,
+        is_one_speed=_is_one_speed(np.concatenate(fastest or [np.zeros(0)]), wheel),
+    )  # fmt: skip
+
+
+def _is_one_speed(fastest: Floats, largest: float) -> bool:
+    """Whether speeds that are commanded while not standing are one, but for some moments."""
+    moving = fastest[fastest > _STANDS * largest]
+    if not moving.size:
+        return False
+    low, high = np.quantile(moving, (_MOMENTS, 1.0 - _MOMENTS))
+    return bool(low > _ONE_SPEED * high)
 
 
 def measure_exceeded(runs: Sequence[MotionRun], vehicle: Vehicle) -> dict[str, float]:

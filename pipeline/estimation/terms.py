@@ -11,9 +11,8 @@ import numpy as np
 from pipeline.core.arrays import Bytes, Floats, Ints
 from pipeline.core.machine_code import compiled
 from pipeline.estimation.proposals import TERM
-from pipeline.estimation.selection import CandidateModel, Selection
-from pipeline.models.effect import ANY, Parameter, Search
-from pipeline.models.formula import FormulaEffect
+from pipeline.models.effect import ANY, Parameter
+from pipeline.models.formula import FormulaEffect, make_parameter
 
 # Gradient boosting: small regression trees, each fitted to what those before it leave.
 #
@@ -196,21 +195,16 @@ def _part_rows(rows: Ints, bins: Bytes, split: int, aside: Ints) -> int:
     return front
 
 
-# Terms for what no effect of the catalogue takes: one-sided, world-frame and position-dependent formulas.
+# Terms for what no effect of the catalogue takes: one-sided and world-frame formulas.
 #
-# Every term is a formula effect with consistent units, in the syntax that a model file takes.
+# Every term is a formula effect with consistent units, in the syntax that a model file takes. None depends on
+# place or time: a pattern over the map of one run does not predict the next run over the same ground.
 
 CHANNELS = ("v_x", "v_y", "v_w")
+SUGGESTION = "unexplained"
+"""Id of the formula that is suggested for what no effect explains."""
 _WIDE = 50.0
 """Bound of a coefficient of a formula, in units of the usual one."""
-_WAVE_NUMBERS = np.geomspace(0.15, 6.0, 60)
-"""Wave numbers of a pattern on the ground that are tried [rad/m]: lengths of 1 to 40 m."""
-_ENOUGH = 400
-"""Windows on which wave numbers and directions are compared."""
-WAVES = 60 * 24
-"""Shapes that a wave is the best one of: wave numbers times directions."""
-_DIRECTIONS = np.linspace(0.0, np.pi, 24, endpoint=False)
-"""Directions of a pattern on the ground that are tried [rad]."""
 
 # Formula and its unit; the catalogue has the others (gains, squares, drifts, slopes).
 _SHAPES: Mapping[str, tuple[str, str]] = {
@@ -291,7 +285,7 @@ def _parse(term: Term) -> FormulaEffect:
 
 
 def list_terms(*, sideways: bool = False) -> tuple[Term, ...]:
-    """All terms that do not depend on where the vehicle is; ``sideways`` of one that drives so, too."""
+    """All terms; ``sideways`` of a vehicle that drives so, too."""
     shapes = {**_SHAPES, **_SIDEWAYS_SHAPES} if sideways else _SHAPES
     return tuple(
         _make_term(channel, name, text, unit)
@@ -323,107 +317,28 @@ def _divide(one: str, other: str) -> str:
     return table[one, other]
 
 
-def list_waves(
-    selection: Selection, models: Mapping[str, CandidateModel], places: Floats
-) -> tuple[Term, ...]:
-    """Terms that repeat across the map, with the wave numbers and directions that fit the residuals best.
-
-    Args:
-        selection: where models are judged.
-        models: whose residuals, by what tells their terms apart.
-        places: x, y [m] in the map at every window, shape (n, 2).
-    """
-    if np.ptp(places, axis=0).max() < 1.0:
-        return ()
-    lags = selection.part.find_ideal()[:, 0, :]
-    # Directions are counted from where the run began to head: which way the map lies must not matter.
-    headings = float(selection.part.comparisons[0].context.attitude[0, 2]) + _DIRECTIONS
-    # Windows overlap by half, and some hundreds of them tell a wave.
-    every = max(places.shape[0] // _ENOUGH, 2)
-    rests = [selection.weights.weigh(model.fit.residual)[::every] for model in models.values()]
-    factors = [lags[::every, 1 if name == "v_w" else 0] for name in CHANNELS]
-    asked = [(rest[:, channel], factor) for rest in rests for channel, factor in enumerate(factors)]
-    waves = iter(_find_waves(asked, places[::every], headings))
-    return tuple(
-        _make_wave(name, "w0" if name == "v_w" else "v0", mark, *next(waves))
-        for mark in models
-        for name in CHANNELS
-    )
-
-
-def _find_waves(
-    asked: Sequence[tuple[Floats, Floats]], places: Floats, headings: Floats
-) -> list[tuple[float, float]]:
-    """Wave number [1/m] and direction [rad] whose sine and cosine, times a factor, take most of a rest.
-
-    Args:
-        asked: rests, each with its factor, shape (n,) each.
-        places: x, y [m] in the map, shape (n, 2).
-        headings: the directions [rad], shape (h,).
-    """
-    best, strongest = [-1.0] * len(asked), [(1.0, 0.0)] * len(asked)
-    for heading in headings.tolist():
-        along = places @ np.array([np.cos(heading), np.sin(heading)])
-        phase = along[:, None] * _WAVE_NUMBERS
-        up, across = np.sin(phase), np.cos(phase)
-        for number, (rest, factor) in enumerate(asked):
-            sine, cosine = factor[:, None] * up, factor[:, None] * across
-            both = (sine**2).sum(axis=0), (cosine**2).sum(axis=0), (sine * cosine).sum(axis=0)
-            one, other = rest @ sine, rest @ cosine
-            taken = one**2 * both[1] - 2.0 * one * other * both[2] + other**2 * both[0]
-            taken /= np.maximum(both[0] * both[1] - both[2] ** 2, 1e-6 * both[0] * both[1] + 1e-12)
-            if taken.max() > best[number]:
-                best[number] = float(taken.max())
-                strongest[number] = (float(_WAVE_NUMBERS[taken.argmax()]), heading)
-    return strongest
-
-
-def _make_wave(channel: str, factor: str, mark: str, wave: float, heading: float) -> Term:
-    along = "q * (x * cos(h) + y * sin(h))"
-    size = {"a": "sine part", "b": "cosine part"}
-    parameters = [Parameter(n, "1", (-_WIDE, _WIDE), 0.0, about, 0.1, step=1e-3) for n, about in size.items()]
-    shape = (
-        ("q", "1/m", (0.5 * wave, 2.0 * wave), wave, "wave number"),
-        ("h", "rad", (heading - 0.3, heading + 0.3), heading, "direction in the map"),
-    )
-    parameters += [
-        Parameter(n, unit, bounds, value, about, value, search=Search.STARTS, starts=(value,), step=1e-3)
-        for n, unit, bounds, value, about in shape
-    ]
-    text = f"{factor} * (a * sin({along}) + b * cos({along}))"
-    return Term(f"{TERM}{channel[-1]}_{factor}_along{mark}", channel, text, tuple(parameters))
-
-
 def is_term(name: str) -> bool:
     """Whether an id is that of a term."""
     return name.startswith(TERM)
 
 
-def join_formula(terms: Sequence[FormulaEffect]) -> dict[str, object]:
-    """Several terms as one formula effect, ready for a model file.
-
-    Returns:
-        ``id``, a text for each channel, and the parameters {name: {value, unit, bounds}}.
-    """
+def join_formula(terms: Sequence[FormulaEffect]) -> FormulaEffect:
+    """Several terms as one formula, as a model file has it."""
     texts: dict[str, list[str]] = {}
-    parameters: dict[str, dict[str, object]] = {}
+    parameters, values, fixed = list[Parameter](), dict[str, float](), set[str]()
     for number, term in enumerate(terms, start=1):
         ((channel, text),) = term.formulas.items()
         for parameter in term.parameters:
-            name = f"{parameter.name}_{number}"
+            name, value = f"{parameter.name}_{number}", term.values[parameter.name]
             text = _rename(text, parameter.name, name)
-            parameters[name] = {
-                "value": float(f"{term.values[parameter.name]:.6g}"),
-                "unit": parameter.unit,
-                "bounds": list(parameter.bounds),
-                "fixed": parameter.name in term.fixed,
-            }
+            is_fixed = parameter.name in term.fixed
+            neutral = value if is_fixed else parameter.neutral
+            parameters.append(make_parameter(name, parameter.unit, parameter.bounds, neutral=neutral))
+            values[name] = value
+            fixed |= {name} if is_fixed else set()
         texts.setdefault(channel, []).append(text)
-    return {
-        "id": "unexplained",
-        **{channel: " + ".join(parts) for channel, parts in texts.items()},
-        "parameters": parameters,
-    }
+    formulas = {channel: " + ".join(parts) for channel, parts in texts.items()}
+    return FormulaEffect(SUGGESTION, formulas, tuple(parameters), fixed=fixed).change(**values)
 
 
 def _rename(text: str, old: str, new: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, cast
@@ -18,20 +19,21 @@ from pipeline.estimation.diagnosis import Json, Unexplained
 from pipeline.estimation.error_regions import CHANNELS, ERROR_WORDS, format_dependence
 from pipeline.estimation.evidence import Evidence
 from pipeline.estimation.floor import Makeup, split_residuals, take_own_past
-from pipeline.estimation.folds import find_near
+from pipeline.estimation.folds import errors_as_json, find_near
+from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.parts import Part, count_seconds
 from pipeline.estimation.search import choose, prune
 from pipeline.estimation.selection import CandidateModel, Selection
 from pipeline.estimation.terms import (
-    WAVES,
     bin_features,
     boost,
     is_term,
     join_formula,
     list_terms,
-    list_waves,
 )
+from pipeline.models import format_effect
 from pipeline.models.formula import FormulaEffect
+from pipeline.run import MotionError
 from pipeline.run.signals import RunContext
 from pipeline.run.windows import HORIZON_S, WINDOW_S
 
@@ -39,6 +41,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from pipeline.estimation import Explored
+    from pipeline.estimation.ladder import Judgement
 
 _MOST_TERMS = 3
 """Most terms of a formula: what needs more is no law."""
@@ -73,27 +76,21 @@ class Explainable:
     predicted: Floats
 
 
-def search_formula(
-    selection: Selection, start: CandidateModel, final: CandidateModel, places: Floats
-) -> CandidateModel:
+def search_formula(selection: Selection, final: CandidateModel) -> CandidateModel:
     """Try formulas where the catalogue has nothing, or where it only imitates one.
 
     Args:
         selection: where the catalogue's effects were judged.
-        start: the model that the search began with.
         final: the best model of them.
-        places: x, y [m] in the map at every window, shape (n, 2).
 
     Returns:
         The model with up to three terms, and without effects that only stood for them.
     """
-    waves = list_waves(selection, {"": final, "_first": start}, places)
     sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
     terms = list_terms(sideways=sideways)
     # A formula is the best one of all shapes that were looked at; effects stand for known physics.
-    count = len(terms) + WAVES * len(waves)
-    terms = (*terms, *waves)
-    wide = replace(selection, candidates=terms, shapes=dict.fromkeys((t.id for t in terms), count), rivals={})
+    shapes = dict.fromkeys((term.id for term in terms), len(terms))
+    wide = replace(selection, candidates=terms, shapes=shapes, rivals={})
     current = final
     for _ in range(_MOST_TERMS):
         if wide.budget.is_spent():
@@ -133,7 +130,7 @@ def _replace(selection: Selection, current: CandidateModel, evidence: Evidence) 
 def _is_simpler(selection: Selection, current: CandidateModel, rival: CandidateModel) -> bool:
     """Whether one term does what several effects do, or what one does, and significantly better.
 
-    As a term is the best of thousands, it is compared with an effect on data that neither was fitted to.
+    As a term is the best of many, it is compared with an effect on data that neither was fitted to.
     """
     added, dropped = set(rival.ids) - set(current.ids), set(current.ids) - set(rival.ids)
     if len(added) != 1 or selection.loss(rival) >= selection.loss(current):
@@ -327,28 +324,50 @@ _WORDS = {
 _BEYOND = ", and no term that was tried predicts it"
 
 
-def describe(paths: Sequence[Explored], lead: str = "") -> Unexplained | None:
+def describe(paths: Sequence[Explored], judgement: Judgement | None, lead: str = "") -> Unexplained | None:
     """Structure that no effect takes; None where there is none.
 
     Args:
         paths: that were explored.
+        judgement: of the effects; None where they could not be judged.
         lead: what the residual of the final model points to, see `conclude`; empty where to nothing.
 
-    Returns a formula where one was found; else the larger, against the motion that was asked for, of what can
-    be predicted from what was recorded and of motion that lasts though nothing that was recorded tells of it.
+    Returns a formula where one was found, as a suggestion: no model holds it. Else the larger, against the
+    motion that was asked for, of what can be predicted from what was recorded and of motion that lasts though
+    nothing that was recorded tells of it.
     """
     body = paths[0]
     selection, final = body.search.selection, body.search.final
-    terms = collect_terms(final)
-    if terms:
+    causes: list[tuple[float, Unexplained]] = []
+    if terms := collect_terms(final):
         without = selection.drop(final, [term.id for term in terms])
         share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
         signal = without.fit.residual - final.fit.residual
-        return _name_signal(body, signal, share, write_formula(join_formula(terms)))
-    causes: list[tuple[float, Unexplained]] = []
+        found = _name_signal(body, signal, share)
+        if judgement is not None and (suggested := _suggest(judgement, join_formula(terms))):
+            return replace(found, formula=suggested[0], reached=suggested[1])
+        # Without a formula it is one cause of several, and the share that of one channel.
+        channel = CHANNELS.index(found.channel)
+        before, after = (float((one.held[:, channel] ** 2).mean()) for one in (without, final))
+        causes += _weigh(body, signal, replace(found, share=1.0 - after / before))
     for path in paths:
-        causes += [one for one in (_find_explainable(path), _find_lasting(path, lead)) if one is not None]
+        known, lasting = _find_explainable(path), _find_lasting(path, lead)
+        causes += known
+        # What can be predicted is not said to be motion that nothing predicts.
+        if lasting is not None and all(one.channel != lasting[1].channel for _, one in known):
+            causes.append(lasting)
     return max(causes, key=lambda item: item[0])[1] if causes else None
+
+
+def _suggest(judgement: Judgement, formula: FormulaEffect) -> tuple[str, Mapping[str, Json]] | None:
+    """A formula as text of a model file, and the errors of the model with it; None where it is no help."""
+    model = judgement.fitted.model + formula
+    with suppress(MotionError):
+        step = judge_whole(judgement.problem, model)
+        if lowers_errors(judgement.whole.errors, step.errors):
+            reached = cast("Mapping[str, Json]", errors_as_json(step.errors))
+            return format_effect(step.fitted.model.effect(formula.id)), reached
+    return None
 
 
 def is_felt(channel: str, size: float, part: float) -> bool:
@@ -362,24 +381,29 @@ def is_felt(channel: str, size: float, part: float) -> bool:
     return size * HORIZON_S >= LEAST_TURN_RAD if channel == "w" else part >= LEAST_WAY_SHARE
 
 
-def _find_explainable(path: Explored) -> tuple[float, Unexplained] | None:
-    """What can be predicted from what was recorded, and its size against the motion asked for."""
+def _find_explainable(path: Explored) -> list[tuple[float, Unexplained]]:
+    """What can be predicted from what was recorded, with its size against the motion asked for, if any."""
     explainable = path.explainable
     if explainable is None or not is_explainable(explainable):
-        return None
+        return []
     selection = path.search.selection
     signal = explainable.predicted * np.where(explainable.shares > 0.0, selection.weights.scale, 0.0)
-    cause = _name_signal(path, signal, 0.0, None)
+    cause = _name_signal(path, signal, 0.0)
     channel = CHANNELS.index(cause.channel)
-    cause = replace(cause, share=float(explainable.shares[channel]))
+    return _weigh(path, signal, replace(cause, share=float(explainable.shares[channel])))
+
+
+def _weigh(path: Explored, signal: Floats, cause: Unexplained) -> list[tuple[float, Unexplained]]:
+    """A cause with the size of its push against the motion asked for; empty where nobody feels it."""
+    channel = CHANNELS.index(cause.channel)
     size = float(np.sqrt((signal[:, channel] ** 2).mean()))
-    part = size / float(measure_asked(selection)[channel])
+    part = size / float(measure_asked(path.search.selection)[channel])
     # Encoders have next to no noise: what their stamps and steps make of nothing can be predicted, too.
     least = LEAST_OF_DRIVE if path.search.path == "wheels" else 0.0
-    return (part, cause) if part >= least and is_felt(cause.channel, size, part) else None
+    return [(part, cause)] if part >= least and is_felt(cause.channel, size, part) else []
 
 
-def _name_signal(body: Explored, signal: Floats, share: float, formula: str | None) -> Unexplained:
+def _name_signal(body: Explored, signal: Floats, share: float) -> Unexplained:
     """What a push of x, y, w at every window depends on most."""
     sizes = np.sqrt(((signal / body.search.selection.weights.scale) ** 2).mean(axis=0))
     channel = int(np.argmax(sizes))
@@ -393,7 +417,7 @@ def _name_signal(body: Explored, signal: Floats, share: float, formula: str | No
         "unit": unit,
         "table": [{"at": round(at, 6), "mean_error": round(mean, 6)} for at, mean in table],
     }
-    return Unexplained(share, CHANNELS[channel], every, where, formula, partial, body.search.path)
+    return Unexplained(share, CHANNELS[channel], every, where, None, partial, body.search.path)
 
 
 def _find_lasting(path: Explored, lead: str) -> tuple[float, Unexplained] | None:
@@ -438,22 +462,6 @@ def _split(path: Explored) -> tuple[Makeup, Makeup, Makeup]:
 
 def _unit(channel: int) -> str:
     return "rad/s" if CHANNELS[channel] == "w" else "m/s"
-
-
-def write_formula(joined: Mapping[str, object]) -> str:
-    """A formula effect as text of a model file."""
-    lines = ["[[effect]]", f'id = "{joined["id"]}"']
-    lines += [f'{key} = "{joined[key]}"' for key in ("v_x", "v_y", "v_w") if key in joined]
-    parameters = joined["parameters"]
-    for name, entry in parameters.items() if isinstance(parameters, dict) else ():
-        low, high = entry["bounds"]
-        neutral = f", neutral = {entry['value']:g}" if entry["fixed"] or not low <= 0.0 <= high else ""
-        fixed = ", fixed = true" if entry["fixed"] else ""
-        lines.append(
-            f'{name} = {{value = {entry["value"]:g}, unit = "{entry["unit"]}", '
-            f"bounds = [{low:g}, {high:g}]{neutral}{fixed}}}"
-        )
-    return "\n".join(lines) + "\n"
 
 
 def summarize_disturbance(body: Explored, text: str) -> dict[str, Json]:

@@ -27,9 +27,7 @@ CHANGE = "changing_number"
 """The finding of a run during which a number of the model changes."""
 SEARCH_CUT = "search_cut"
 """The finding of a run whose budget ended the search for effects before it was complete."""
-FORMULA = "unexplained"
-"""What ladder and budget call the terms of a formula that no effect of the catalogue gives."""
-CAUSE_NAMES = {FORMULA: "formula in the model", "localization_noise": "localization noise"}
+CAUSE_NAMES = {"localization_noise": "localization noise"}
 """Causes of an error budget in words, where these differ from the id."""
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
@@ -80,7 +78,7 @@ def format_verdict(diagnosis: Content) -> str:
     for count in range(min(len(clauses), _MOST_CLAUSES), -1, -1):
         said = dict([*clauses.items()][:count])
         clause = f"{_join_clauses([*said.values()])}; " if count else ""
-        model = _name_model(ladder[-1], len(said.keys() - {FORMULA}))
+        model = _name_model(ladder[-1], count)
         verdict = _join(opening, f"{clause}with {model} in the model {remaining}", *rest)
         if len(verdict) <= _LONGEST:
             break
@@ -142,8 +140,7 @@ def rank_main(ladder: Sequence[Content]) -> dict[str, float]:
     """
     ranked = rank_effects(ladder)
     large = [number for number, share in enumerate(ranked.values()) if share >= _MAIN_SHARE]
-    first = next((number for number, name in enumerate(ranked) if name != FORMULA), 0)
-    return dict([*ranked.items()][: max([*large, first]) + 1])
+    return dict([*ranked.items()][: max([*large, 0]) + 1])
 
 
 def split_main(
@@ -216,8 +213,6 @@ def _list_clauses(diagnosis: Content) -> dict[str, str]:
         for one in objects_in(diagnosis, "effects")
         if one.get("clause") and one["id"] not in undecided and _is_determined(one)
     }
-    if where := str(mapping_in(diagnosis, "unexplained").get("where", "")).partition(":")[0]:
-        known[FORMULA] = f"the {where}"
     main = rank_main(objects_in(diagnosis, "ladder"))
     return {name: known[name] for name in main if name in known}
 
@@ -270,25 +265,10 @@ def _join_clauses(clauses: Sequence[str]) -> str:
 
 def _name_model(step: Content, shown: int) -> str:
     """The effects of the whole model in words, of which so many were just said."""
-    ids = _list_ids(step)
-    effects = [name for name in ids if name != FORMULA]
-    formula = "a fitted formula" if FORMULA in ids else ""
-    count = len(effects)
+    count = len(_list_ids(step))
     if count == shown:
-        words = {0: "", 1: "this", 2: "both"}.get(count, "these")
-    else:
-        words = {1: "one effect", 2: "two effects"}.get(count, "all effects")
-    return " and ".join(filter(None, [words, formula]))
-
-
-def holds_formula(ladder: Sequence[Content]) -> bool:
-    """Whether the written model holds the formula of a structure that no effect explains."""
-    return bool(ladder) and FORMULA in _list_ids(ladder[-1])
-
-
-def name_formula(ladder: Sequence[Content]) -> str:
-    """What the formula of an unexplained structure is: a part of the written model, or a proposal."""
-    return "formula in the model" if holds_formula(ladder) else "suggested term"
+        return {1: "this", 2: "both"}.get(count, "these")
+    return {1: "one effect", 2: "two effects"}.get(count, "all effects")
 
 
 def _compare(diagnosis: Content, before: str) -> str:

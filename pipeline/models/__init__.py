@@ -113,15 +113,24 @@ def format_model(file: ModelFile) -> str:
     for effect in file.model:
         if effect.id == LEARNED:
             continue
-        lines += ["", "[[effect]]", f"id = {format_value(effect.id)}"]
-        if isinstance(effect, FormulaEffect):
-            lines += [f"{channel} = {format_value(text)}" for channel, text in effect.formulas.items()]
-        lines += [_format_parameter(file, effect, parameter) for parameter in effect.parameters]
+        lines += ["", *_list_lines(effect, file)]
     if (term := find_learned(file.model)) is not None:
         lines += ["", *_LEARNED_HEAD, *_format_table("learned", learned_as_table(term))]
     if file.fit:
         lines += ["", "# What the values were fitted on.", *_format_table("fit", file.fit)]
     return "\n".join(lines) + "\n"
+
+
+def format_effect(effect: Effect) -> str:
+    """An effect as text of a model file, without intervals."""
+    return "\n".join(_list_lines(effect)) + "\n"
+
+
+def _list_lines(effect: Effect, file: ModelFile | None = None) -> list[str]:
+    lines = ["[[effect]]", f"id = {format_value(effect.id)}"]
+    if isinstance(effect, FormulaEffect):
+        lines += [f"{channel} = {format_value(text)}" for channel, text in effect.formulas.items()]
+    return lines + [_format_parameter(effect, parameter, file) for parameter in effect.parameters]
 
 
 def _format_vehicle(vehicle: Vehicle) -> list[str]:
@@ -147,10 +156,10 @@ def _lacks(values: Mapping[str, object], known: Mapping[str, object]) -> bool:
     return any(values[key] is None and known[key] is not None for key in _GEOMETRY)
 
 
-def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> str:
+def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | None) -> str:
     label, value = f"{effect.id}.{parameter.name}", effect.values[parameter.name]
     parts = [] if math.isnan(value) else [f"value = {_exactly(parameter.round(value))}"]
-    if label in file.intervals:
+    if file is not None and label in file.intervals:
         low, high = file.intervals[label]
         parts += [f"low = {format_value(low)}", f"high = {format_value(high)}"]
     parts.append(f"unit = {format_value(parameter.unit)}")
@@ -160,7 +169,7 @@ def _format_parameter(file: ModelFile, effect: Effect, parameter: Parameter) -> 
             parts.append(f"neutral = {_exactly(parameter.neutral)}")
     if parameter.name in effect.fixed:
         parts.append("fixed = true")
-    if label in file.per_run or effect.id in file.per_run:
+    if file is not None and not {label, effect.id}.isdisjoint(file.per_run):
         parts.append("per_run = true")
     return f"{_key(parameter.name)} = {{ {', '.join(parts)} }}"
 

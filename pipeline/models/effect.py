@@ -97,6 +97,7 @@ class Effect(ABC):
         confused_with: effects with nearly the same response at first order or under poor excitation.
         equivalent_to: effects that no recording in which `is_equivalent` holds distinguishes from it.
         same_in_one_motion: effects not distinguishable from it by driving straight only, or turning only.
+        same_at_one_speed: effects not distinguishable from it while one speed only is commanded.
         contains: effects that are special cases of it: it explains whatever they explain.
         acts_with: effects of which a model must have one for it to act; empty if it acts alone.
         companions: effects that usually act beside it, with which a search begins at once.
@@ -130,6 +131,7 @@ class Effect(ABC):
     equivalent_to: tuple[str, ...] = ()
     equivalent_when: str = ""
     same_in_one_motion: tuple[str, ...] = ()
+    same_at_one_speed: tuple[str, ...] = ()
     contains: tuple[str, ...] = ()
     acts_with: tuple[str, ...] = ()
     companions: tuple[str, ...] = ()

@@ -135,6 +135,7 @@ class Largest:
         sideways: speed to the left or right [m/s].
         turns: times [s] at the tenths of the turning; None for `moments`.
         rim: speed of the rim of a wheel [m/s]; 0 if not known.
+        is_one_speed: whether the fastest wheel is commanded one speed only, apart from standing.
     """
 
     speed: float
@@ -145,6 +146,7 @@ class Largest:
     sideways: float = 0.0
     turns: Floats | None = None
     rim: float = 0.0
+    is_one_speed: bool = False
 
     @property
     def fastest(self) -> float:

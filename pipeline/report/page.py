@@ -66,7 +66,7 @@ def view_glance(page: Page) -> dict[str, object]:
         "diagnosed": bool(report.diagnosis),
         "effects": [format_row(entry) for entry in main],
         "more_effects": len(minor) + report.small_groups,
-        **report.structure,
+        "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
         "split": _order_split(report),
         "step": list_steps(report)[0] if report.text("run") else None,
         "undecided": next(iter(report.undecided), None),

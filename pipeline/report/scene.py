@@ -86,15 +86,6 @@ class RunReport:
         return split_main(named, ladder, lambda entry: (entry.get("id"), bool(entry.get("corrected"))))
 
     @property
-    def structure(self) -> dict[str, object]:
-        """What no effect explains: as `formula` if the model holds one for it, else as `unexplained`."""
-        from pipeline.estimation.verdict import holds_formula  # noqa: PLC0415 - heavy
-
-        where = mapping_in(self.diagnosis, "unexplained").get("where")
-        held = holds_formula(self.ladder)
-        return {"formula": where if held else None, "unexplained": None if held else where}
-
-    @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
         from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy

@@ -9,9 +9,12 @@ from typing import TYPE_CHECKING
 from pipeline.core import split_interval
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.diagnosis import CAUSE
-from pipeline.estimation.diagnosis_lines import format_learned_share, format_unexplained
+from pipeline.estimation.diagnosis_lines import (
+    format_learned_share,
+    format_suggestion,
+    format_unexplained,
+)
 from pipeline.estimation.error_regions import format_remaining_error
-from pipeline.estimation.verdict import holds_formula, name_formula
 from pipeline.models.catalogue import list_effects, suggest_manoeuvre
 from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.report import (
@@ -307,10 +310,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "undecided", f"{names}: {advice}", ""
     rest = mapping_in(diagnosis, "unexplained")
     if rest:
-        formula = str(rest.get("formula") or "")
-        example = f"; {name_formula(report.ladder)}" if formula else ""
-        label = "formula" if holds_formula(report.ladder) else "unexplained"
-        yield label, f"{format_unexplained(rest, report.ladder)}{example}", formula
+        formula, suggested = str(rest.get("formula") or ""), format_suggestion(rest)
+        example = f"; suggested term: {suggested}" if suggested else ""
+        yield "unexplained", f"{format_unexplained(rest)}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
     small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]

@@ -23,15 +23,14 @@ from pipeline.estimation import (
     Problem,
     State,
     choose_input,
-    fit_model,
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.apportion import SlipBudget, apportion
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
-from pipeline.estimation.ladder import Judgement, Ladder, LadderStep, note_fit
-from pipeline.estimation.learned_step import fit_and_hold_out, hold_out_model
+from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
+from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.problem import predict_at_from
 from pipeline.estimation.selection import Context
 from pipeline.estimation.unexplained import find_places
@@ -118,6 +117,7 @@ class PreparedRun:
     stage: MotionStage
     lock: threading.RLock = field(default_factory=threading.RLock)
     _fits: OrderedDict[object, Judged] = field(default_factory=OrderedDict)
+    _errors: OrderedDict[object, Errors] = field(default_factory=OrderedDict)
     _second: Problem | None = None
 
     def judge(self, model: Model) -> Judged:
@@ -156,16 +156,20 @@ class PreparedRun:
             return noted if _list_keys(noted.model) == _list_keys(file.model) else file
 
     def _judge_ladder(self, model: Model) -> Judgement:
-        whole, ideal = self.judge(model), self.judge(Model(self.vehicle))
-        ladder = Ladder((ideal.ladder_step, whole.ladder_step))
-        return Judgement(self.problem, ladder, whole.ladder_step, whole.estimates)
+        whole = self.judge(model)
+        return Judgement(self.problem, whole.ladder_step, whole.estimates)
 
-    def judge_quickly(self, model: Model) -> Errors:
-        """Held-out errors of a fitted model, without intervals."""
+    def measure_errors(self, model: Model) -> Errors:
+        """Held-out errors of a model, fitted as `judge` does; without intervals."""
+        key = model.effects
         with self.lock:
-            return hold_out_model(
-                self.problem, fit_model(self.problem, model, exact=not model.effects)
-            ).pooled
+            if key in self._fits:
+                return self._fits[key].errors
+            if key not in self._errors:
+                self._errors[key] = fit_and_hold_out(self.problem, model)[1].pooled
+                while len(self._errors) > _MOST_FITS:
+                    self._errors.popitem(last=False)
+            return self._errors[key]
 
     def score(self, model: Model, timing: Sequence[float]) -> Errors:
         """Errors of a model with its present values: held out where a fit gave these, else as they are."""
@@ -327,16 +331,26 @@ class Editor:
         file: file of the session.
         prepared: the run.
         session: the session before the change.
+        found: what the diagnosis of the run found, with its values: where fits of these effects begin.
     """
 
     file: SessionFile
     prepared: PreparedRun
     session: Session
+    found: Sequence[Effect] = ()
 
     @property
     def model(self) -> Model:
         """The model before the change, including the effects that are switched off."""
         return self.file.parse(self.session.step.model).model
+
+    def begin(self, model: Model) -> Model:
+        """The model from which a fit begins: effects of the diagnosis have the values that it gives them.
+
+        So a model has the errors that the diagnosis gives it, whatever was fitted or set before, and in
+        whichever order its effects were added.
+        """
+        return model.swap(*(one for one in self.found if one.id in model and not model.effect(one.id).fixed))
 
     def add_effect(self, effect: Effect | str, *, anyway: bool = False) -> Session:
         """Add an effect to the model and fit the whole model.
@@ -344,18 +358,17 @@ class Editor:
         Raises:
             WorkbenchError: ``no_help``, see `add_effects`.
         """
-        made = find_effect(effect)() if isinstance(effect, str) else effect
+        named = {one.id: one for one in self.found}
+        made = (named.get(effect) or find_effect(effect)()) if isinstance(effect, str) else effect
         return self.add_effects([made], f"+ {made.id}", anyway=anyway)
 
-    def add_effects(
-        self, effects: Sequence[Effect], said: str, *, anyway: bool, begin: Model | None = None
-    ) -> Session:
-        """Add several effects to the model, or to it with other values, at once, and fit the whole model.
+    def add_effects(self, effects: Sequence[Effect], said: str, *, anyway: bool) -> Session:
+        """Add several effects to the model at once, and fit the whole model.
 
         Raises:
             WorkbenchError: ``no_help``, an effect is refused and ``anyway`` is false.
         """
-        model, step = begin or self.model, self.session.step
+        model, step = self.begin(self.model), self.session.step
         for made in effects:
             model = model + made
         changed = self.fit_anew(model, [*step.order, *(made.id for made in effects)], said)
@@ -373,7 +386,7 @@ class Editor:
         """Remove an effect and fit the rest."""
         step = self.session.step
         order, off = ([each for each in names if each != name] for names in (step.order, step.off))
-        return self.fit_anew(self.model - name, order, f"\u2212 {name}", off=off)
+        return self.fit_anew(self.begin(self.model) - name, order, f"\u2212 {name}", off=off)
 
     def fit(self) -> Session:
         """Fit all values that are not locked, starting from the present ones."""
@@ -439,7 +452,8 @@ class Editor:
         for count in range(len(shown)):
             ladder_step = known.get(tuple(shown[:count]))
             if ladder_step is None:
-                ladder_step = step_as_json(shown[:count], prepared.judge_quickly(fitted.keep(shown[:count])))
+                below = self.begin(fitted.keep(shown[:count]))
+                ladder_step = step_as_json(shown[:count], prepared.measure_errors(below))
             ladder.append(ladder_step)
         ladder.append(step_as_json(shown, whole.errors))
         delays = (prepared.run.alignment.heading_delay_s, whole.fitted.state.timing[0].wheel_delay_s)

@@ -81,13 +81,20 @@ const buildSlider = (pane, effect, parameter) => {
 
 // What to add -----------------------------------------------------------------------------------------------
 
-// What the diagnosis named comes first, as the server ranks it; what else the evidence shows only when all that is in.
+// What lowers the error most comes first: of the diagnosis, its formula among it, or of the other effects that were tried.
 const listRows = ({ session, named, trial, diagnosis }) => {
   const there = new Set(session.effects.map((effect) => effect.id));
   const equal = new Map((diagnosis?.undecided ?? []).map((entry) => [entry.in_model ?? entry.candidates?.[0], entry.candidates ?? []]));
   const rows = named.map((entry) => ({ ...entry, named: true, twins: (equal.get(entry.id) ?? []).filter((name) => name !== entry.id) }));
   const known = new Set([...there, ...rows.map((row) => row.id)]);
-  return [...rows, ...(trial?.found ?? []).filter((row) => !known.has(row.id))];
+  const all = [...rows, ...(trial?.found ?? []).filter((row) => !known.has(row.id))];
+  return all.sort((one, other) => Number(other.helps) - Number(one.helps) || one.left - other.left);
+};
+
+// The row to add next; null where nothing lowers the error, or not all that may is known.
+const findNext = (rows, running) => {
+  const best = rows.filter((row) => row.helps).sort((one, other) => one.left - other.left)[0] ?? null;
+  return best && (best.named || !running) ? best : null;
 };
 
 // While a hand is over the list, no row moves away from under it.
@@ -107,17 +114,17 @@ const buildNext = (pane) => {
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
   const running = trial && !trial.done;
-  const found = diagnosis?.unexplained?.formula ? buildFound(pane, diagnosis.unexplained, there) : null;
+  const next = findNext(rows, running);
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
-  const rest = diagnosis?.unexplained && !found ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
-  const build = (row, number) => buildRow(pane, row, number === 0 && (row.named || !running));
+  const rest = diagnosis?.unexplained && !diagnosis.unexplained.formula ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
+  const build = (row) => buildRow(pane, row, row === next);
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
-    h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build), found),
-    rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map((row) => build(row)))),
+    h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build)),
+    rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map(build))),
     missing.length > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, title: missing.join(", "), onclick: () => pane.addAll() }, `Add all ${missing.length} of the diagnosis`),
-    trial?.done && !rows.length && !found && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
+    trial?.done && !next && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     unless, undecided, rest, buildPlan(pane),
@@ -126,29 +133,22 @@ const buildNext = (pane) => {
 
 const buildRow = (pane, row, first) => {
   const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
-  const marks = [row.named && h("i", { class: "mark" }, "identified by the diagnosis, together with its other effects"),
+  const isFormula = row.formula.length > 0;
+  const words = isFormula ? row.formula.join("; ") : (row.sentence || row.about).split(CAUSE)[0];
+  const marks = [row.named && h("i", { class: "mark" }, isFormula ? "suggested by the diagnosis for what no effect explains" : "identified by the diagnosis, together with its other effects"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
       first && h("span", { class: "quiet" }, "Next"),
-      h("b", { title: row.sentence || row.about }, (row.sentence || row.about).split(CAUSE)[0]), h("span", { class: "quiet id" }, row.id),
+      h("b", { title: row.sentence || row.about }, words), h("span", { class: "quiet id" }, row.id),
       h("span", { class: "quiet falls" }, `position to ${change("t", sayLength)}, heading to ${change("r", sayAngle)}`),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
-    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => pane.add(row.id) }, "Add"));
-};
-
-const buildFound = (pane, unexplained, there) => {
-  const id = /^id = "(\w+)"/m.exec(unexplained.formula)?.[1] ?? "formula";
-  if (there.has(id)) return null;
-  const lines = unexplained.formula.split("\n").filter((line) => /^v_[xyw] = /.test(line)).map((line) => line.replaceAll('"', "").replace("=", "+="));
-  return h("li", { data: { effect: id } },
-    h("div", {}, h("b", {}, "a formula"), h("code", {}, lines.join("; ")), h("span", { class: "quiet" }, unexplained.where ?? ""), h("span", { class: "marks" }, h("i", { class: "mark" }, "identified by the diagnosis"))),
-    h("button", { type: "button", class: "add found", "aria-label": "add the formula of the diagnosis", data: { keep: "add found" }, onclick: () => pane.addFound() }, "Add"));
+    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => (row.named && isFormula ? pane.addFound() : pane.add(row.id)) }, "Add"));
 };
 
 const tellNothing = (session, diagnosis) => {
   if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is identified: the run is too short.";
-  const room = session.floor ? session.errors.t / session.floor.t : Infinity;
+  const room = session.floor ? Math.max(...["t", "r"].map((key) => session.errors[key] / session.floor[key])) : Infinity;
   if (room < 1.5) return "No effect is missing: the remaining error is at the noise floor.";
   return "No further effect of the catalogue reduces the error. The residual may be noise, or an effect that you can write as a formula.";
 };

@@ -222,9 +222,7 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
         "id": name,
         "about": summarize_effect(effect),
         "sentence": "" if effect.is_neutral else effect.describe_motion(file.model.vehicle, file.model),
-        "formula": [f"{key} += {text}" for key, text in effect.formulas.items()]
-        if isinstance(effect, FormulaEffect)
-        else [],
+        "formula": list_formulas(effect),
         "off": name in step.off,
         "without_m": step.without.get(name),
         "refused": step.refused.get(name),
@@ -234,6 +232,12 @@ def show_effect(file: ModelFile, name: str, step: Step) -> dict[str, object]:
             if math.isfinite(effect.values[parameter.name])
         ],
     }
+
+
+def list_formulas(effect: Effect) -> list[str]:
+    """What a formula adds to each channel; empty for an effect of the catalogue."""
+    formulas = effect.formulas if isinstance(effect, FormulaEffect) else {}
+    return [f"{key} += {text}" for key, text in formulas.items()]
 
 
 def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:

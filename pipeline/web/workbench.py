@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,9 +10,9 @@ from pathlib import Path
 from pipeline.core import SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
-from pipeline.estimation.terms import is_term
 from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model, write_model
+from pipeline.models.formula import FormulaEffect
 from pipeline.report.motion_view import read_model_text
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
@@ -24,6 +24,7 @@ from pipeline.web.session import (
     SessionFile,
     format_step,
     list_catalogue,
+    list_formulas,
     make_formula,
     show_session,
     summarize_effect,
@@ -166,26 +167,29 @@ def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str,
         "about": summarize_effect(effect),
         "sentence": "" if effect.is_neutral else effect.describe_motion(model.vehicle, model),
         "left": addition.remaining,
+        "helps": addition.helps,
+        "formula": list_formulas(effect),
         "twins": list(addition.twins),
         "from": {"t": before.t_mrmse_m, "r": before.r_mrmse_rad},
         "to": {"t": after.t_mrmse_m, "r": after.r_mrmse_rad},
     }
 
 
-def list_named(
-    prepared: PreparedRun, model: Model, timing: Sequence[float], diagnosis: Mapping[str, object] | None
-) -> list[dict[str, object]]:
-    """Effects that the diagnosis of a run identified and a model lacks, as JSON, the largest gain first."""
+def rank_offers(editor: Editor, diagnosis: Mapping[str, object] | None) -> list[dict[str, object]]:
+    """What the diagnosis of a run has beyond a session, as JSON, the largest gain first.
+
+    These are its effects and the formula that it suggests, each with the errors of the model once it is in.
+    """
+    prepared, step = editor.prepared, editor.session.step
     file = None if diagnosis is None else read_model_text(diagnosis)
-    if file is None:
-        return []
+    intervals = {} if file is None else file.intervals
+    missing = (one for one in editor.found if one.id not in step.order)
+    sound = Model(prepared.vehicle, tuple(one for one in missing if explain_refusal(one, intervals) is None))
     with prepared.lock:
-        state = prepared.state(model, timing)
-        before = prepared.score(model, timing)
-        # The formula of the diagnosis is offered separately.
-        named = [effect for effect in file.model if not is_term(effect.id)]
-        effects = [effect for effect in named if explain_refusal(effect, file.intervals) is None]
-        ranked = rank_named(prepared.problem, state, effects)
+        offered = prepared.problem.active_effects(sound)
+        before = prepared.score(switch_off(editor.model, step.off), step.timing)
+        model = switch_off(editor.begin(editor.model), step.off)
+        ranked = rank_named(prepared.measure_errors, model, before, offered)
     return [show_addition(one, before, model) for one in ranked]
 
 
@@ -219,7 +223,7 @@ class Sessions:
         with self._trials.waiting(), prepared.lock, evaluating(ask.run):
             session = open_session(file, prepared)
             if ask.action == "preview":
-                return self._preview(Editor(file, prepared, session), ask)
+                return self._preview(self._edit(file, prepared, session), ask)
             changed = keep_floor(self._change(file, prepared, session, ask), prepared)
             # A step that cannot be shown is not stored.
             shown = self._show(file, prepared, changed)
@@ -281,7 +285,7 @@ class Sessions:
         return file, session
 
     def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
-        editor = Editor(file, prepared, session)
+        editor = self._edit(file, prepared, session)
         if ask.action in _FITS and (refusal := find_refusal(read_summary(prepared.manifest))):
             hint = "No fit to it has a meaning: open another run."
             raise WorkbenchError("no_fit", refusal, where=ask.run, hint=hint)
@@ -306,10 +310,16 @@ class Sessions:
         }
         return changes[ask.action]()
 
+    def _edit(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Editor:
+        """The operations on a session, with what the diagnosis of its run found."""
+        diagnosis = read_diagnosis(self.results, prepared.manifest)
+        text = find_formula(diagnosis)
+        formula = () if text is None else file.parse(format_step(Model(prepared.vehicle), {}) + text).model
+        return Editor(file, prepared, session, (*_list_named(diagnosis), *formula))
+
     def _is_named(self, editor: Editor, ask: Ask) -> bool:
-        """Whether the model lacks an effect that the diagnosis tested together with all others."""
-        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
-        return ask.effect in {effect.id for effect in _list_missing(diagnosis, editor.session)}
+        """Whether the diagnosis tested an effect together with all others."""
+        return ask.effect in {effect.id for effect in editor.found}
 
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
         diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
@@ -324,38 +334,27 @@ class Sessions:
                 where=ask.run,
                 hint="Look for other effects." if is_diagnosed else "Diagnose it first.",
             )
-        # The joint fit begins with the values of the diagnosis, whatever was fitted or set before.
-        own = editor.model
-        known = [one for one in _list_named(diagnosis) if one.id in own and not own.effect(one.id).fixed]
-        said = f"+ all {len(missing)} of the diagnosis"
-        return editor.add_effects(missing, said, anyway=True, begin=own.swap(*known))
+        return editor.add_effects(missing, f"+ all {len(missing)} of the diagnosis", anyway=True)
 
     def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:
-        text = find_formula(read_diagnosis(self.results, editor.prepared.manifest))
-        if text is None:
+        formulas = [effect for effect in editor.found if isinstance(effect, FormulaEffect)]
+        if not formulas:
             raise WorkbenchError(
                 "no_formula", "no formula was found on this run", where=ask.run, hint="Diagnose it first."
             )
-        file, vehicle = editor.file, editor.prepared.vehicle
-        (formula,) = file.parse(format_step(Model(vehicle), {}) + text).model.effects
-        return editor.add_effect(formula, anyway=True)
+        return editor.add_effect(formulas[-1], anyway=True)
 
     def _begin_trial(self, editor: Editor, ask: Ask) -> Session:
         """Rank further effects to add.
 
-        Requires an explicit request if the diagnosis identified more effects.
+        Requires an explicit request while something that the diagnosis found helps.
         """
         file, session = editor.file, editor.session
-        model = switch_off(editor.model, session.step.off)
-        if ask.anyway or not self._list_named(editor.prepared, session, model):
+        model = switch_off(editor.begin(editor.model), session.step.off)
+        diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
+        if ask.anyway or not any(one["helps"] for one in rank_offers(editor, diagnosis)):
             self._trials.begin(editor.prepared, model, f"{file.slot} {file.run}")
         return session
-
-    def _list_named(self, prepared: PreparedRun, session: Session, model: Model) -> list[dict[str, object]]:
-        """Effects that the diagnosis of a run identified and the session does not contain."""
-        diagnosis = read_diagnosis(self.results, prepared.manifest)
-        named = list_named(prepared, model, session.step.timing, diagnosis)
-        return [entry for entry in named if entry["id"] not in session.step.order]
 
     def _preview(self, editor: Editor, ask: Ask) -> dict[str, object]:
         """Preview of a value while the slider moves; nothing is stored."""
@@ -366,17 +365,17 @@ class Sessions:
         return {"session": show_session(trial, editor.file.parse(trial.step.model)), **redrawn}
 
     def _show(self, file: SessionFile, prepared: PreparedRun, session: Session) -> dict[str, object]:
-        parsed = file.parse(session.step.model)
-        model = switch_off(parsed.model, session.step.off)
+        editor = self._edit(file, prepared, session)
+        model = switch_off(editor.begin(editor.model), session.step.off)
         trial = self._trials.find(prepared, model)
         diagnosis = read_diagnosis(self.results, prepared.manifest)
         return {
-            "session": show_session(session, parsed),
+            "session": show_session(session, file.parse(session.step.model)),
             "run": summarize_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
             "diagnosis": diagnosis,
-            "named": self._list_named(prepared, session, model),
+            "named": rank_offers(editor, diagnosis),
             "missing": [effect.id for effect in _list_missing(diagnosis, session)],
             "plan": find_plan(self.results, prepared.manifest),
             "trial": trial.show() if trial is not None else None,

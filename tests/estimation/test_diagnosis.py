@@ -14,17 +14,28 @@ import polars as pl
 import pytest
 
 from pipeline.core import NORMAL_95
-from pipeline.estimation import Diagnosis, Estimates, Recording, diagnose_runs
+from pipeline.estimation import (
+    Diagnosis,
+    Estimates,
+    Input,
+    Problem,
+    Recording,
+    diagnose_runs,
+    load_recording,
+)
 from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.floor import take_own_past
+from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
+from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.state import Free
 from pipeline.estimation.unexplained import is_felt
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
+from pipeline.models.formula import FormulaEffect
 from pipeline.run import MotionError
 from pipeline.simulate import (
     VEHICLES,
@@ -315,20 +326,33 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     assert told.lower().count("the vehicle does not move") == 1
 
 
-def test_a_formula_for_the_unexplained_can_be_pasted_into_a_model_file(tmp_path: Path) -> None:
+def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a_model_file(
+    tmp_path: Path,
+) -> None:
     def slip_in_reverse(state: State) -> tuple[float, float, float]:
         return (-0.3 * state.v0 if state.v0 < 0.0 else 0.0), 0.0, 0.0
 
-    (run,) = _diagnose(replace(_SCENE, extra=slip_in_reverse), tmp_path).runs
+    recording, vehicle = _record(replace(_SCENE, extra=slip_in_reverse), tmp_path)
+    (run,) = diagnose_runs([recording], vehicle).runs
     left = run.unexplained
     assert left is not None
     assert left.channel == "x"
     assert left.formula is not None
+    # The model that is written is the model of the ladder, without the formula.
+    assert run.proposal is not None
+    assert list(run.proposal.model.ids) == run.ladder[-1]["effects"]
+    assert not any(isinstance(effect, FormulaEffect) for effect in run.proposal.model)
     model = tmp_path / "model.toml"
     model.write_text(f'format = 1\n[vehicle]\npreset = "husky_a200"\n\n{left.formula}', encoding="utf-8")
-    assert read_model(model).model.ids == ("unexplained",)
-    before, after = run.ladder[0]["velocity_rms"][0], run.ladder[-1]["velocity_rms"][0]  # type: ignore[index]
+    formula = read_model(model).model
+    assert formula.ids == ("unexplained",)
+    # What it is said to bring is what the model has with it.
+    problem = Problem([load_recording(recording, vehicle)], vehicle, Input(run.input))
+    whole = judge_whole(problem, run.proposal.model + formula.effect("unexplained"))
+    assert left.reached == errors_as_json(whole.errors)
+    before, after = (one["velocity_rms"][0] for one in (run.ladder[-1], left.reached))  # type: ignore[index]
     assert after < 0.7 * before  # type: ignore[operator]
+    assert "would remain over 2 s" in describe(Diagnosis((run,)))
 
 
 @pytest.mark.long

@@ -20,7 +20,7 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.acceptance import find_implausible
 from pipeline.estimation.folds import measure_errors
-from pipeline.estimation.verdict import FORMULA, format_verdict
+from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -164,7 +164,7 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
         values = {key: value.value for key, value in effect.parameters.items()}
         assert find_implausible(find_effect(effect.id)().change(**values)) is None
     considered = {name for item in run.undecided for name in item.candidates}
-    assert {name for name in run.ladder[-1]["effects"] if name != FORMULA} <= {*named, *considered}
+    assert set(run.ladder[-1]["effects"]) <= {*named, *considered}
     # Contact friction contains the track, and the model has either where the log does not decide.
     assert run.proposal is not None
     (has_track,) = (e for e in run.proposal.model.effects if e.id in {"contact_friction", "effective_track"})

@@ -133,7 +133,7 @@ def test_undecided_are_rivals_of_as_many_numbers_once_each(
 
     final = model(("transport_delay",), 1.0)
     final.state = SimpleNamespace(effects=(effect,))
-    largest = SimpleNamespace(is_one_motion=False)
+    largest = SimpleNamespace(is_one_motion=False, is_one_speed=False)
     weights = SimpleNamespace(scale=1.0)
     models = [model((name,), 1.0) for name in others]
     selection = SimpleNamespace(

@@ -18,7 +18,6 @@ from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_model, ladder_as_json
-from pipeline.estimation.terms import is_term
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -118,14 +117,12 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
     assert read_model_text(told) == file
     found = {effect["id"] for effect in told["effects"] if not effect["corrected"]}
     found |= {item["in_model"] for item in told["undecided"] if item["in_model"] is not None}
-    assert {name for name in file.model.ids if not is_term(name)} == found
+    assert set(file.model.ids) == found
     if told["timing"]["wheel_delay_s"] is not None:
         written = file.find_wheel_delay(told["run"])
         assert written is not None
         assert told["timing"]["wheel_delay_s"] == round(written, 4)
-    assert {"unexplained" if is_term(name) else name for name in file.model.ids} == set(
-        told["ladder"][-1]["effects"]
-    )
+    assert set(file.model.ids) == set(told["ladder"][-1]["effects"])
     for written, rung in zip(file.list_fitted("ladder"), told["ladder"], strict=True):
         assert {key: written[key] for key in ERRORS} == {key: rung[key] for key in ERRORS}
     for effect, name, number in list_numbers(told):

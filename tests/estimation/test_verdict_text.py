@@ -77,8 +77,7 @@ def list_stored_numbers(diagnosis: Diagnosis, vehicle: Vehicle) -> set[str]:
     known |= {
         format_excess(ladder[-1][key] / floor[key]).removesuffix(" times") for key in _FLOOR if floor[key]
     }
-    # A formula is said as what it is.
-    known.add(str(len([name for name in ladder[-1]["effects"] if name != "unexplained"])))
+    known.add(str(len(ladder[-1]["effects"])))
     effects = [
         restore_known(entry["id"], {key: read_value(one) for key, one in entry["parameters"].items()})
         for entry in diagnosis["effects"]
@@ -164,14 +163,12 @@ def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
 
 
 def test_no_effect_is_smaller_where_none_is_larger() -> None:
-    """A formula that removed most left `1 smaller effect` as all that was said of effects."""
     drawn = draw_diagnosis({"deadband": {"d": 0.01}}, [(1.0, 0.5), (0.95, 0.5)])
-    drawn["ladder"].append({"effects": ["deadband", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.1})
-    assert [*rank_main(drawn["ladder"])] == ["deadband", "unexplained"]
+    assert [*rank_main(drawn["ladder"])] == ["deadband"]
     band = ("deadband", False)
     assert split_main([band], drawn["ladder"], lambda one: one) == ([band], [])
     assert not is_small("deadband", drawn["ladder"])
-    assert "ignores wheel speeds below 0.01 m/s; with this and a fitted formula" in check_verdict(drawn)
+    assert "ignores wheel speeds below 0.01 m/s; with this in the model" in check_verdict(drawn)
 
 
 def test_a_number_that_rises_is_no_share_and_of_small_effects_one_is_told() -> None:
@@ -245,18 +242,6 @@ def test_without_an_effect_the_noise_floor_decides_what_is_said() -> None:
     )
     clock = draw_diagnosis({"clock_offset": {"d": -0.15}}, close)
     assert check_verdict(clock).endswith("The poses are stamped 150 ms early, which is corrected.")
-
-
-def test_a_fitted_formula_is_part_of_the_model_and_no_effect() -> None:
-    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.3, 0.2)])
-    both = {"effects": ["drive_lag", "unexplained"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02}
-    drawn["ladder"].append(both)
-    told = "with this and a fitted formula in the model 10 cm and 1.1 degrees remain, 2 times the noise"
-    assert told in check_verdict(drawn)
-    drawn["effects"] = []
-    for rung in drawn["ladder"]:
-        rung["effects"] = [name for name in rung["effects"] if name == "unexplained"]
-    assert ". With a fitted formula in the model 10 cm and 1.1 degrees remain" in check_verdict(drawn)
 
 
 @pytest.mark.parametrize("name", ["not_moving", "pose_from_wheels", *FAULTS])

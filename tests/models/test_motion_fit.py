@@ -24,7 +24,7 @@ from pipeline.estimation.acceptance import find_idle
 from pipeline.estimation.comparison import HorizonErrors
 from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
-from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.ladder import judge_model, judge_whole
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run import MotionError
 from pipeline.run.heading import HeadingSource
@@ -234,15 +234,14 @@ def test_of_effects_that_replace_each_other_one_serves_predictions(others: tuple
     assert ("deadband" in idle) == bool(others)
 
 
-def test_the_model_is_fitted_to_the_end_whatever_rungs_are_known() -> None:
+def test_every_rung_is_what_its_effects_are_as_a_model() -> None:
     run = simulate({**SKID, "drive_lag": 0.3}, duration_s=90.0)
     problem = Problem([run], HUSKY, Input.COMMAND)
-    wider = judge_model(problem, model_of("drive_lag", "effective_track", "icr_offset", "lateral_skid"))
-    model = model_of("drive_lag", "effective_track", "icr_offset")
-    alone, after = judge_model(problem, model), judge_model(problem, model, wider=wider)
-    assert frozenset(model.ids) in {frozenset(rung.effects) for rung in wider.ladder.steps}
-    assert after.fitted.model == alone.fitted.model
-    assert after.whole.errors == alone.whole.errors
+    judged = judge_model(problem, model_of("drive_lag", "effective_track", "icr_offset"))
+    for rung in judged.ladder.steps:
+        alone = judge_whole(problem, judged.fitted.model.keep(rung.effects))
+        assert alone.errors == rung.errors
+        assert alone.fitted.model == rung.fitted.model
 
 
 @pytest.mark.parametrize("source", list(Input))

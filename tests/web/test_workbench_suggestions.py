@@ -12,7 +12,6 @@ from verbs import run_verb
 from workbench_server import RUN, TRACK
 
 from pipeline.estimation.additions import explain_refusal
-from pipeline.estimation.terms import is_term
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.report.motion_view import read_model_text
@@ -63,7 +62,7 @@ def named_in(results: Path, run: str) -> set[str]:
     file = read_model_text(told)
     if file is None:
         return set()
-    named = {effect.id for effect in file.model if not is_term(effect.id)}
+    named = set(file.model.ids)
     refused = {effect.id for effect in file.model if explain_refusal(effect, file.intervals)}
     # Nothing is held back of which the diagnosis is certain.
     tentative = {effect["id"] for effect in told["effects"] if effect["tentative"]}
@@ -78,6 +77,9 @@ def press_until_nothing_is_named(results: Path, run: str) -> list[str]:
     for sessions in open_sessions(results):
         while rows := cast("dict[str, Any]", sessions.answer(Ask(run=run, action="open")))["named"]:
             assert [row["left"] for row in rows] == sorted(row["left"] for row in rows)
+            rows = [row for row in rows if not row["formula"]]
+            if not rows:
+                break
             pressed.append(rows[0]["id"])
             sessions.answer(Ask(run=run, action="add", effect=pressed[-1], anyway=True))
     return pressed
@@ -85,6 +87,37 @@ def press_until_nothing_is_named(results: Path, run: str) -> list[str]:
 
 def test_the_button_offers_what_the_diagnosis_named(diagnosed: Path) -> None:
     assert set(press_until_nothing_is_named(diagnosed, "field/late")) == {"effective_track", "drive_lag"}
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_terminal_offer_and_workbench_give_a_model_one_number(diagnosed: Path, order: int) -> None:
+    """What the screen says of some effects is what the page offers, and what it has once they are added."""
+    run, slot = "field/late", "ab"[order]
+    manifest = Store(diagnosed).manifest(run)
+    assert manifest is not None
+    told = json.loads(manifest.path("diagnosis.json").read_text())
+    said = {frozenset(rung["effects"]): (rung["t_mrmse_m"], rung["r_mrmse_rad"]) for rung in told["ladder"]}
+    taken: list[str] = []
+    for sessions in open_sessions(diagnosed):
+        shown = cast("dict[str, Any]", sessions.answer(Ask(run=run, slot=slot, action="open")))
+        for card in shown["session"]["effects"]:
+            shown = cast(
+                "dict[str, Any]", sessions.answer(Ask(run=run, slot=slot, action="drop", effect=card["id"]))
+            )
+        for name in told["ladder"][-1]["effects"][::order]:
+            (offer,) = [row["to"] for row in shown["named"] if row["id"] == name]
+            shown = cast(
+                "dict[str, Any]", sessions.answer(Ask(run=run, slot=slot, action="add", effect=name))
+            )
+            taken.append(name)
+            now = shown["session"]["errors"]
+            assert (now["t"], now["r"]) == pytest.approx((offer["t"], offer["r"]), rel=5e-6)
+            if frozenset(taken) in said:
+                assert (now["t"], now["r"]) == pytest.approx(said[frozenset(taken)], rel=2e-6)
+        assert not shown["named"]
+        for name in taken:
+            sessions.answer(Ask(run=run, slot=slot, action="drop", effect=name))
+    assert frozenset(taken) in said
 
 
 def test_nothing_else_is_tried_before_what_the_diagnosis_named_is_in(diagnosed: Path) -> None:

@@ -37,6 +37,7 @@ class BodySpeedLimit(CommandEffect):
     clause = "clips the commanded speed at {limit:.3g} m/s"
     needs = (Excitation.LARGE, Excitation.SPEED_SPREAD)
     confused_with = ("wheel_speed_limit", "speed_slip")
+    same_at_one_speed = ("drive_gain", "wheel_servo", "wheel_radius")
     python = """
         asked = R * (left + right) / 2.0
         excess = (asked - max(-{limit}, min({limit}, asked))) / R

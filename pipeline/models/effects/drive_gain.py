@@ -11,7 +11,7 @@ Source: steady state of a proportional speed controller; Astrom and Murray, Feed
 
 from dataclasses import replace
 
-from pipeline.models.effect import WHEELED, DriveEffect, Excitation, Least, Parameter, Plausible
+from pipeline.models.effect import DriveEffect, Excitation, Least, Parameter, Plausible
 from pipeline.models.parameter import Conditions, TwinRole
 from pipeline.run.signals import RunContext, Wheels
 
@@ -35,12 +35,12 @@ class DriveGain(DriveEffect):
     id = "drive_gain"
     twin = TwinRole.SPEED_GAIN
     rank = 0
-    kinds = WHEELED
     parameters = (SHARE,)
     motion = "Drive gain: the wheels reach {percent} of the commanded speed"
     clause = "turns its wheels at {percent} of the commanded speed"
     needs = (Excitation.SPEED_SPREAD,)
     confused_with = ("wheel_radius", "wheel_speed_limit", "wheel_servo", "gain_drift")
+    same_at_one_speed = ("body_speed_limit", "wheel_speed_limit", "wheel_servo")
     python = "left, right, sideways = {g} * left, {g} * right, {g} * sideways"
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:

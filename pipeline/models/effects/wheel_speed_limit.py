@@ -42,6 +42,7 @@ class WheelSpeedLimit(DriveEffect):
     clause = "turns its wheels no faster than {rim:.2g} m/s at the rim"
     needs = (Excitation.LARGE,)
     confused_with = ("body_speed_limit", "body_turn_limit", "wheel_speed_scaling")
+    same_at_one_speed = ("drive_gain", "wheel_servo", "wheel_radius")
     same_in_one_motion = ("wheel_speed_scaling",)
     python = """
         wheels = split(left, right, sideways)

@@ -32,6 +32,7 @@ class WheelSpeedScaling(DriveEffect):
     clause = "slows all wheels by one factor where one exceeds {rim:.2g} m/s at the rim"
     needs = (Excitation.LARGE, Excitation.TURNING)
     confused_with = ("wheel_speed_limit", "body_speed_limit", "body_turn_limit")
+    same_at_one_speed = ("drive_gain", "wheel_servo", "wheel_radius")
     same_in_one_motion = ("wheel_speed_limit",)
     python = """
         fastest = max(map(abs, split(left, right, sideways)))

@@ -163,7 +163,7 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
         rows.append(
             {
                 "rung": number,
-                "step": f"+ {', '.join(added) or 'formula'}{rises and f' ({rises})'}" if number else "ideal",
+                "step": f"+ {', '.join(added)}{rises and f' ({rises})'}" if number else "ideal",
                 "t": size,
                 "told": " \u00b7 ".join([format_length(size), *_list_degrees(step)]),
                 "series": "model" if effects else "ideal",
