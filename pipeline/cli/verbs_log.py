@@ -189,7 +189,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
         "bytes": index.size_bytes,
         "profile": index.profile,
         "library": index.library,
-        "duration_s": index.duration_s,
+        "duration_s": seen.duration_s,
         "messages": seen.messages,
         "messages_stated": index.message_count,
         "chunks": index.chunk_count,
@@ -224,7 +224,7 @@ def _format_log(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(seen.duration_s)}, {packing}",
         f"          {_format_count(seen)}",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"

@@ -271,6 +271,7 @@ class Work:
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
         context: dict[str, JSON] = {
             "start_ns": made.start_ns,
+            "paused_s": round(made.paused_s, 6),
             "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
             "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
             "quarantined": {
