@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import SlipError, guess_names
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
@@ -41,7 +41,7 @@ from pipeline.sources import (
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import blame_damage
-from pipeline.stages.clocks import PAUSE_NS, describe_pauses, find_pauses
+from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store
 
 UNKNOWN = "unknown"

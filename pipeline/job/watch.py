@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core import SlipError
+from pipeline.core import SlipError, make_plain, shorten
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
 from pipeline.job import JobError, Options
@@ -241,7 +241,11 @@ class Watch:
                     seen = self._is_behind and (is_over or now >= self._light.due)
                     if seen:
                         self._look()
-                    judged = self._diagnose(Path(scratch))
+                    try:
+                        judged = self._diagnose(Path(scratch))
+                    except Exception as error:  # noqa: BLE001 - neither does one of a diagnosis
+                        judged, self.knowledge["problem"] = True, _describe_defect(error)
+                        self._heavy.note(now, 1.0)
                     if seen or judged or self._log.note != noted:
                         noted = self._log.note
                         yield self.to_json()
@@ -275,6 +279,8 @@ class Watch:
         except SlipError as error:
             # A log that has just started may have no pose or command yet.
             self.live.problem = error.what
+        except Exception as error:  # noqa: BLE001 - a defect of a look ends neither the watch nor the recording
+            self.live.problem = _describe_defect(error)
         self.live.duration_s = self._log.end_s
         return_freed_memory()
         self._light.note(begin, measure_cpu() - spent)
@@ -316,7 +322,8 @@ class Watch:
             with suppress(SlipError):
                 length = setup.configuration.slip.length_scale_m
                 slip, _ = add_model(slip, tables, self._model, aligned.vehicle, length=length)
-        offset = (made.start_ns - self._log.start_ns) * 1e-9
+        # The last message of the tables is the end of the log, whatever clock its stamps are of.
+        offset = end_s - max(float(frame["t"][-1]) for frame in made.tables.values() if not frame.is_empty())
         self._take(speeds, slip, offset)
         self._note_events(aligned.findings, offset)
 
@@ -419,6 +426,13 @@ class Watch:
     def forget(self) -> None:
         """Delete the stored knowledge of the growing log, which now has its final diagnosis."""
         self._notes.remove(str(self.path.resolve()))
+
+
+def _describe_defect(error: Exception) -> str:
+    """One line on an error that ends neither the watch nor the recording."""
+    if isinstance(error, SlipError):
+        return error.what
+    return f"this look failed ({type(error).__name__}: {make_plain(shorten(str(error)))}); the watch goes on"
 
 
 def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:

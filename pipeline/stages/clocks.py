@@ -14,10 +14,10 @@ from typing import cast
 import numpy as np
 
 from pipeline.core import format_duration
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages import Finding, timing
+from pipeline.stages import Finding, Severity, timing
 
 Stamps = Ints
 
@@ -62,9 +62,6 @@ _LEAST_HELD_UP_S = 0.03
 """Least delay of a bunch [s], below a command period: two simultaneous messages are not a bunch."""
 _HOLE_PERIODS = 8.0
 """Usual periods that a hole of a slow topic exceeds: bunches of eight cause gaps of as many."""
-PAUSE_NS = 3_600_000_000_000
-"""Silence of all topics [ns] above which the clock of the recorder was set, or its recording paused: no
-drive contains an hour of which nothing was recorded."""
 _CLOSED_NS = 10_000_000_000
 """Length of such a silence [ns] if no stamp tells how long it was: a `arrays.STRETCH_S`, longer than all
 waits and holds of a drive, so that nothing crosses it."""
@@ -261,10 +258,12 @@ def _follow(
         mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
     also = f"; so were the stamps of {', '.join(real)}, which are not simulated time" if real else ""
     text = (
-        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
-        f"real-time factor): log times were mapped onto them by those of {leading}{also}"
+        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock, and speeds are per "
+        "second of the stamps: right for a simulation at this real-time factor, wrong for a robot, whose "
+        f"clock then needs mending. Log times were mapped onto the stamps by those of {leading}{also}"
     )
-    return mapped, [Finding("simulated_time", "info", text, where=leading, value=clock_map.rate)]
+    severity: Severity = "info" if abs(clock_map.rate - 1.0) < _OTHER_RATE else "warning"
+    return mapped, [Finding("simulated_time", severity, text, where=leading, value=clock_map.rate)]
 
 
 def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:

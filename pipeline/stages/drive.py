@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run.signals import LIVE_SHARE
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
@@ -295,7 +295,7 @@ def differentiate_angle(times: Floats, angle: Floats) -> Floats:
     series = np.unwrap(angle) if wraps else angle
     if times.size < 3:  # noqa: PLR2004 - a central difference needs neighbours
         return np.zeros_like(angle)
-    spaced = np.maximum.accumulate(times) + np.arange(times.size) * 1e-12
+    spaced = spread_equal(times)
     return np.asarray(np.gradient(series, spaced), dtype=np.float64)
 
 

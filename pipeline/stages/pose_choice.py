@@ -255,7 +255,7 @@ def _compare_with_wheels(
     ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     distance, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path[:2])
-    rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
+    rate = np.gradient(path[1], arrays.spread_equal(path[0]))
     share = measure_rest(distance, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
     ahead, aside = split_chords(position, yaw)
     aside = aside - np.diff(np.interp(time, path[0], path[2]))
