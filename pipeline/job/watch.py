@@ -21,7 +21,7 @@ from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
 from pipeline.job import JobError, Options
 from pipeline.job.keys import LogSetup, set_up_log
-from pipeline.job.work import add_model, as_recorded
+from pipeline.job.work import add_model, as_recorded, identify
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.run import read_drive
@@ -30,6 +30,7 @@ from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
 from pipeline.store import JSON, Store
+from pipeline.store.parquet_tables import check_table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -296,7 +297,12 @@ class Watch:
         made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=where)
         del data
         aligned = align_tables(
-            {name: as_recorded(name, frame) for name, frame in made.tables.items() if not frame.is_empty()},
+            {
+                # Rows that break the contract are left out, as of a finished log.
+                name: check_table(name, identify(name, as_recorded(name, frame), "live", setup)).valid
+                for name, frame in made.tables.items()
+                if not frame.is_empty()
+            },
             setup.vehicle,
             hold_s=setup.configuration.command.hold_s,
             body_commanded=setup.is_body_commanded,
