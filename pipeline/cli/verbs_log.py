@@ -6,8 +6,9 @@ import contextlib
 import io
 import json as json_format
 import shlex
+import signal
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
@@ -189,7 +190,7 @@ def _log_as_json(seen: Inspection) -> dict[str, object]:
         "bytes": index.size_bytes,
         "profile": index.profile,
         "library": index.library,
-        "duration_s": index.duration_s,
+        "duration_s": seen.duration_s,
         "messages": seen.messages,
         "messages_stated": index.message_count,
         "chunks": index.chunk_count,
@@ -224,7 +225,7 @@ def _format_log(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(index.duration_s)}, {packing}",
+        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(seen.duration_s)}, {packing}",
         f"          {_format_count(seen)}",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"
@@ -393,17 +394,45 @@ def watch(  # noqa: D417 - the shared choices document themselves
         arguments = shlex.split(spell_choices(_without_results(choices)))
         watched = Watch(path, options, arguments, quiet_for, live)
         is_screen = sys.stdout.isatty() and not json
-        stopped = False
+        stopped, told = False, ""
         try:
-            for seen in watched.follow():
-                _show(seen, page, json=json, is_screen=is_screen)
-                write_statement(choices.results, path, list_statements(seen))
+            with _stopping_on_termination():
+                for seen in watched.follow():
+                    try:
+                        _show(seen, page, json=json, is_screen=is_screen)
+                        write_statement(choices.results, path, list_statements(seen))
+                    except BrokenPipeError:
+                        raise
+                    except (SlipError, OSError) as error:
+                        # A disk may be full or a folder gone: the recording is worth more than what is shown.
+                        if str(error) != told:
+                            told = str(error)
+                            print_note(f"slip: {told} The watch goes on.")
         except KeyboardInterrupt:
             stopped = True
             print_note("slip: stopped watching; this is the diagnosis of the log so far")
     if watched.live.problem and not watched.live.slip_mps:
         print_note(f"slip: no slip was seen: {watched.live.problem}")
     return _conclude(watched, choices, page, json=json, stopped=stopped)
+
+
+@contextlib.contextmanager
+def _stopping_on_termination() -> Iterator[None]:
+    """Let SIGTERM end a watch as Ctrl-C does, as service managers stop programs by it."""
+
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    try:
+        before = signal.signal(signal.SIGTERM, stop)
+    except ValueError:
+        # Only the main thread has signals.
+        yield
+        return
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _without_results(choices: Choices) -> Choices:

@@ -102,6 +102,8 @@ def naming_os_errors(
 
 
 _MINUTE, _HOUR = 60.0, 3600.0  # seconds
+_DAYS = 3
+"""Days from which a duration is told in days: an experiment of 48 h is one of hours."""
 _LEAST_PART = 0.001
 """Part of a whole below which its digits say nothing: intervals of budgets are wider."""
 _NEARLY_ALL = 0.95
@@ -194,13 +196,15 @@ def format_angle(radians: float) -> str:
 
 
 def format_duration(seconds: float) -> str:
-    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`."""
+    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
     if seconds < _MINUTE:
         return f"{round(seconds, 1):g} s"
     whole = round(seconds)
     if whole < _HOUR:
         return f"{whole // 60} min {whole % 60:02d} s"
-    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    if whole < _DAYS * 24 * _HOUR:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole // 86400} days {whole % 86400 // 3600} h"
 
 
 def format_recorded(recorded_s: float, compared_s: object = None) -> str:

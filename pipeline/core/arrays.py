@@ -62,6 +62,9 @@ ROUNDING_S = 1e-6
 """Times [s] that differ by less are equal: a double resolves a stamp since 1970 to 2.4e-7 s."""
 SILENT_S = 0.25
 """Time from the nearest message [s] above which wheel and gyro signals are unknown: `PERIODS` at 20 Hz."""
+PAUSE_NS = 3_600_000_000_000
+"""Silence of all topics [ns] above which the clock of the recorder was set, or its recording paused: no
+drive contains an hour of which nothing was recorded."""
 _FEWEST_POINTS = 4
 """Minimum number of poses of a quadratic fit: its coefficients plus one, to average noise. With eight, slow
 poses are smoothed more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
@@ -104,6 +107,13 @@ def count_steps(times: Floats, span: float) -> int:
         span: [s].
     """
     return max(round(span / max(float(np.median(np.diff(times))), _SHORTEST_PERIOD)), 1)
+
+
+def spread_equal(times: Floats) -> Floats:
+    """Times [s] in order, equal ones apart by rounding so that slopes over them are finite; shape (n,)."""
+    ordered = np.maximum.accumulate(times)
+    least = max(1e-12, 4.0 * float(np.spacing(np.abs(ordered).max(initial=0.0))))
+    return np.asarray(ordered + np.arange(times.size) * least, dtype=np.float64)
 
 
 def usual_hold(stamps: Floats) -> float:

@@ -163,10 +163,15 @@ _RARE_S = 10.0
 _COLUMNS = ("t", "stamp", "segment", "held", "active", "latency", "outlier")
 
 
+_LONGEST_GAP_S = 10.0
+"""Longest time between two samples of one segment [s]: nothing is known of the motion in between, and a grid
+laid over it would grow with the time, not with the samples."""
+
+
 def find_gaps(times: Floats, smallest: float) -> Flags:
     """Whether a gap in time precedes each sample.
 
-    A gap is longer than three median periods and than ``smallest`` [s].
+    A gap is longer than three median periods and than ``smallest`` [s], or than `_LONGEST_GAP_S`.
 
     Args:
         times: sample times [s], shape (n,), increasing.
@@ -178,7 +183,7 @@ def find_gaps(times: Floats, smallest: float) -> Flags:
     if times.size < 2:  # noqa: PLR2004 - one sample has no period
         return np.zeros(times.size, dtype=bool)
     period = np.diff(times)
-    limit = max(3.0 * float(np.median(period)), smallest)
+    limit = max(min(3.0 * float(np.median(period)), _LONGEST_GAP_S), smallest)
     return np.concatenate(([False], period > limit * (1.0 + 1e-9)))
 
 

@@ -28,7 +28,6 @@ from pipeline.core import (
 )
 from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
 from pipeline.core.compute import map_parallel
-from pipeline.core.rigid import find_runs
 from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
@@ -351,14 +350,18 @@ def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
 
 def _find_half(stretch: Ints, square: Floats) -> tuple[float, tuple[tuple[float, float, float], ...]]:
     """The fewest stretches with half of a sum: their share of the time, and spans of adjacent ones."""
-    first = int(stretch.min())
-    sums, counts = np.bincount(stretch - first, square) / square.sum(), np.bincount(stretch - first)
+    numbers, place = np.unique(stretch, return_inverse=True)
+    sums, counts = np.bincount(place, square) / square.sum(), np.bincount(place)
     order = np.argsort(-sums)
     half = order[: int(np.searchsorted(np.cumsum(sums[order]), 0.5)) + 1]
-    inside = np.isin(np.arange(sums.size), half)
+    chosen = np.sort(half)
     spans = [
-        (HORIZON_S * (first + begin), HORIZON_S * (first + end), float(sums[begin:end].sum()))
-        for begin, end in find_runs(inside)
+        (
+            HORIZON_S * float(numbers[some[0]]),
+            HORIZON_S * float(numbers[some[-1]] + 1),
+            float(sums[some].sum()),
+        )
+        for some in np.split(chosen, np.flatnonzero(np.diff(numbers[chosen]) > 1) + 1)
     ]
     spans.sort(key=lambda span: -span[2])
     return float(counts[half].sum() / counts.sum()), tuple(spans)

@@ -423,7 +423,8 @@ def number_stretches(run: Ints, since: Floats, length: float = STRETCH_S) -> Int
             depend on the absolute time of the recording.
         length: [s].
     """
-    label: Ints = run * 1_000_000 + arrays.number_stretches(since, length)
+    stretch = arrays.number_stretches(since, length)
+    label: Ints = run * (int(np.ptp(stretch)) + 1 if stretch.size else 1) + stretch
     return np.unique(label, return_inverse=True)[1].astype(np.int64)
 
 

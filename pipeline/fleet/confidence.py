@@ -23,6 +23,8 @@ _FEWEST_PAIRS = 20
 _LONGEST_SHARE = 0.25
 """Largest lag as a share of the series: autocovariances at longer lags rest on few pairs (Box and Jenkins
 advise a quarter)."""
+_LONG_GAP = 12_000
+"""Missing samples that no lag spans: ten minutes at 20 Hz, where a correlation lasts seconds."""
 _WINDOW = 3.0
 """Length of the summation window in tau: six of Sokal's tau, which is half of this one and for which he takes
 4 to 10. An exponential correlation has decayed to 0.25 % there; a longer window adds noise."""
@@ -43,7 +45,9 @@ def integrated_time(values: ArrayLike, ticks: ArrayLike) -> float:
         StatisticsError: a value is not finite, or there are fewer than two.
     """
     samples = check_values(values, what="samples", fewest=2)
-    index = np.asarray(ticks, dtype=np.int64) - int(np.asarray(ticks)[0])
+    # How long a long silence lasts does not matter: no lag of a correlation spans it.
+    steps = np.minimum(np.diff(np.asarray(ticks, dtype=np.int64)), _LONG_GAP)
+    index = np.append(0, np.cumsum(steps))
     span = int(index[-1]) + 1
     size = 1 << (2 * span - 1).bit_length()
     filled, there = np.zeros(span), np.zeros(span)

@@ -278,11 +278,12 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
 
 def _summarize_log(setup: LogSetup, sha256: str, work: Work) -> dict[str, JSON]:
     losses = work.contexts["extract"].get("losses", [])
+    paused_s = cast("float", work.contexts["extract"].get("paused_s", 0.0))
     return {
         "path": spell_location(setup.path.resolve()),
         "sha256": sha256,
         "bytes": setup.index.size_bytes,
-        "duration_s": round(setup.index.duration_s, 6),
+        "duration_s": round(setup.index.duration_s - paused_s, 6),
         "complete": not losses,
         "losses": losses,
         "unchecked": work.contexts["extract"].get("unchecked"),

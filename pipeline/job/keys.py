@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import SlipError, guess_names
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
@@ -41,6 +41,7 @@ from pipeline.sources import (
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import blame_damage
+from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store
 
 UNKNOWN = "unknown"
@@ -204,7 +205,10 @@ class TopicHealth:
 
 @dataclass(frozen=True)
 class Inspection:
-    """Health of a log: index, topics, losses, data without checksum, topics to use, and why it is refused."""
+    """Health of a log: index, topics, losses, data without checksum, topics to use, and why it is refused.
+
+    Its duration does not count the silences of a clock that was set, see `clocks.find_pauses`.
+    """
 
     index: LogIndex
     topics: tuple[TopicHealth, ...]
@@ -213,6 +217,7 @@ class Inspection:
     choice: Choice | None
     problem: SlipError | None
     unchecked: str = ""
+    duration_s: float = 0.0
 
     @property
     def messages(self) -> int:
@@ -252,11 +257,18 @@ def inspect_log(path: Path, options: Options) -> Inspection:
         for channel in index.channels
     )
     choice, problem = _choose(index, configuration, options)
-    notes = data.notes + tuple(
-        f"{count} messages of {topic} are byte-for-byte copies of others: duplicates are ignored"
-        for topic, count in data.repeated.items()
+    every = np.concatenate([log_time for log_time, _ in times.values()] or [np.zeros(0, dtype=np.int64)])
+    pauses = find_pauses(every)
+    notes = (
+        *data.notes,
+        *([describe_pauses(pauses)] if pauses else []),
+        *(
+            f"{count} messages of {topic} are byte-for-byte copies of others: duplicates are ignored"
+            for topic, count in data.repeated.items()
+        ),
     )
-    return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked)
+    duration_s = index.duration_s - sum(after - last for last, after in pauses) / 1e9
+    return Inspection(index, topics, data.losses, notes, choice, problem, data.unchecked, duration_s)
 
 
 def _measure_topic(
@@ -282,7 +294,12 @@ def _measure_topic(
 
 
 def _measure_rate(periods: Floats, gaps: Flags) -> float | None:
-    """Messages per second without the gaps [Hz]; with them where they are most of the time; None of none."""
+    """Messages per second without the gaps [Hz]; with them where they are most of the time; None of none.
+
+    Silences of a clock that was set are no time in which messages were missing.
+    """
+    recorded = periods * 1e9 <= PAUSE_NS
+    periods, gaps = periods[recorded], gaps[recorded]
     between = periods if periods[gaps].sum() > 0.5 * periods.sum() else periods[~gaps]
     seconds = float(between.sum())
     return between.size / seconds if seconds > 0.0 else None
@@ -435,7 +452,7 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 13, "align": 21, "velocity": 6, "slip": 14, "aggregate": 3}
+VERSIONS: Mapping[str, int] = {"extract": 14, "align": 21, "velocity": 6, "slip": 14, "aggregate": 3}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,

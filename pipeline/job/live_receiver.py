@@ -53,7 +53,11 @@ _MOST_BYTES: Final = 16 << 20
 _TOO_BIG: Final = 1009
 """WebSocket close code of a frame that is too large."""
 _CLOCK_NS: Final = 86_400_000_000_000
-"""Largest drift of message times against the clock of this machine since the first message [ns]: one day."""
+"""Largest drift of message times against the clock of this machine [ns], one day: more is another clock."""
+_IN_A_ROW: Final = 20
+"""Messages of another clock in a row that show that the clock was set: single ones have a wrong time."""
+_MOST_SET: Final = 100
+"""Largest number of files that clocks begin: a robot's clock is set once or twice."""
 _LAST_NS: Final = 1 << 63
 # Silences the library's log of a connection: `LiveReceiver.note` reports it in one line.
 _SILENT: Final = logging.getLogger(f"{__name__}.connection")
@@ -106,8 +110,10 @@ class LiveReceiver:
         self._protocol: LiveProtocol | None = None
         self._is_connected = False
         self._reason, self._skipped, self._why = "", 0, ""
-        # Offset of the server's clock from this machine's, from the first message [ns].
+        # Offset of the server's clock from this machine's [ns], and that of the last messages beside it.
         self._offset_ns: int | None = None
+        self._other_ns, self._others = 0, 0
+        self._placed, self._set = 0, 0
         self._last_note, self._reported_s = "", 0.0
 
     def stop(self) -> None:
@@ -121,6 +127,7 @@ class LiveReceiver:
         protocol = self._protocol
         parts = [f"{self.address}, {protocol.name}, {len(protocol.channels)} topics"] if protocol else []
         parts += [protocol.warning[:200]] if protocol and protocol.warning else []
+        parts += [f"{self._placed} of another clock: placed by their arrival"] if self._placed else []
         parts += [f"{self._skipped} left out ({self._why})"] if self._skipped else []
         return "; ".join(parts)
 
@@ -231,13 +238,28 @@ class LiveReceiver:
         if message is None:
             self._recording.flush()
             return
-        log_time = message.log_time or now
-        if self._offset_ns is None and log_time < _LAST_NS:
-            self._offset_ns = log_time - now
-        if log_time >= _LAST_NS or abs(log_time - now - (self._offset_ns or 0)) > _CLOCK_NS:
-            self._leave_out("a time that is more than a day from those before")
-            return
-        self._recording.write(message.channel, log_time, message.data)
+        self._recording.write(message.channel, self._find_time(message.log_time or now, now), message.data)
+
+    def _find_time(self, log_time: int, now: int) -> int:
+        """Log time of a message [ns]: its own, or its arrival if it is not of the clock in use.
+
+        A clock that was set begins a new file. Single messages with another time, as of a second computer,
+        and times that no log can hold, are placed by their arrival.
+        """
+        offset = log_time - now
+        if log_time < _LAST_NS:
+            self._offset_ns = offset if self._offset_ns is None else self._offset_ns
+            if abs(offset - self._offset_ns) <= _CLOCK_NS:
+                self._others = 0
+                return log_time
+            self._others = self._others + 1 if abs(offset - self._other_ns) <= _CLOCK_NS else 1
+            self._other_ns = offset
+            if self._others >= _IN_A_ROW and self._set < _MOST_SET:
+                self._recording.end_part()
+                self._offset_ns, self._others, self._set = offset, 0, self._set + 1
+                return log_time
+        self._placed += 1
+        return max(now + (self._offset_ns or 0), 0)
 
     def _leave_out(self, why: str) -> None:
         self._skipped += 1

@@ -411,7 +411,9 @@ def _measure_errors(fitted: Fitted) -> tuple[list[tuple[float, float]], float]:
     stretch = _number(comparison.horizons.times[:, 0] - begin)
     asked = (problem.whole.find_ideal()[:, 0] ** 2).sum(axis=1)
     driven = _number(problem.whole.times[:, 0] - begin)
-    count = int(max(stretch.max(), driven.max())) + 1
+    present, both = np.unique(np.concatenate((stretch, driven)), return_inverse=True)
+    stretch, driven = np.split(both, [stretch.size])
+    count = present.size
     ideal = _sum(driven, asked, count)
     pace = math.sqrt(max(float(ideal[0].sum() / ideal[1].sum()), _LEAST_SQUARE))
     squares = (errors.position**2, errors.yaw**2)

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core import SlipError
+from pipeline.core import SlipError, make_plain, shorten
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
 from pipeline.job import JobError, Options
 from pipeline.job.keys import LogSetup, set_up_log
-from pipeline.job.work import add_model, as_recorded
+from pipeline.job.work import add_model, as_recorded, identify
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.models import read_model
@@ -31,6 +31,7 @@ from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
 from pipeline.store import JSON, Store
+from pipeline.store.parquet_tables import check_table
 
 if TYPE_CHECKING:
     import polars as pl
@@ -242,7 +243,11 @@ class Watch:
                     seen = self._is_behind and (is_over or now >= self._light.due)
                     if seen:
                         self._look()
-                    judged = self._diagnose(Path(scratch))
+                    try:
+                        judged = self._diagnose(Path(scratch))
+                    except Exception as error:  # noqa: BLE001 - neither does one of a diagnosis
+                        judged, self.knowledge["problem"] = True, _describe_defect(error)
+                        self._heavy.note(now, 1.0)
                     if seen or judged or self._log.note != noted:
                         noted = self._log.note
                         yield self.to_json()
@@ -276,6 +281,8 @@ class Watch:
         except SlipError as error:
             # A log that has just started may have no pose or command yet.
             self.live.problem = error.what
+        except Exception as error:  # noqa: BLE001 - a defect of a look ends neither the watch nor the recording
+            self.live.problem = _describe_defect(error)
         self.live.duration_s = self._log.end_s
         return_freed_memory()
         self._light.note(begin, measure_cpu() - spent)
@@ -291,7 +298,12 @@ class Watch:
         made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=where)
         del data
         aligned = align_tables(
-            {name: as_recorded(name, frame) for name, frame in made.tables.items() if not frame.is_empty()},
+            {
+                # Rows that break the contract are left out, as of a finished log.
+                name: check_table(name, identify(name, as_recorded(name, frame), "live", setup)).valid
+                for name, frame in made.tables.items()
+                if not frame.is_empty()
+            },
             setup.vehicle,
             hold_s=setup.configuration.command.hold_s,
             body_commanded=setup.is_body_commanded,
@@ -320,7 +332,8 @@ class Watch:
                 slip, _ = add_model(
                     slip, tables, file, aligned.vehicle, length=length, where=str(self._model)
                 )
-        offset = (made.start_ns - self._log.start_ns) * 1e-9
+        # The last message of the tables is the end of the log, whatever clock its stamps are of.
+        offset = end_s - max(float(frame["t"][-1]) for frame in made.tables.values() if not frame.is_empty())
         self._take(speeds, slip, offset)
         self._note_events(aligned.findings, offset)
 
@@ -423,6 +436,13 @@ class Watch:
     def forget(self) -> None:
         """Delete the stored knowledge of the growing log, which now has its final diagnosis."""
         self._notes.remove(str(self.path.resolve()))
+
+
+def _describe_defect(error: Exception) -> str:
+    """One line on an error that ends neither the watch nor the recording."""
+    if isinstance(error, SlipError):
+        return error.what
+    return f"this look failed ({type(error).__name__}: {make_plain(shorten(str(error)))}); the watch goes on"
 
 
 def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:

@@ -230,15 +230,7 @@ class Work:
         return self.generation.write_table(table, self._identify(table, frame), facts)
 
     def _identify(self, table: str, frame: pl.DataFrame) -> pl.DataFrame:
-        who = {
-            "run": self.run,
-            "dataset": self.setup.dataset,
-            "vehicle": self.setup.vehicle.id,
-            "terrain": self.setup.terrain,
-        }
-        columns = contract_of(table).schema.column_names()
-        labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
-        return labelled.select(columns)
+        return identify(table, frame, self.run, self.setup)
 
     def _read(self, table: str) -> pl.DataFrame:
         """A table of an earlier stage; an empty frame if the log has no data for it."""
@@ -288,6 +280,7 @@ class Work:
         held = made.tables["poses"]["held"] if not made.tables["poses"].is_empty() else pl.Series([0])
         context: dict[str, JSON] = {
             "start_ns": made.start_ns,
+            "paused_s": round(made.paused_s, 6),
             "clocks": {topic: dict(clock) for topic, clock in made.clocks.items()},
             "held_poses": round(float(held.mean() or 0.0), 6),  # type: ignore[arg-type]
             "quarantined": {
@@ -400,6 +393,13 @@ class Work:
         )
         self.write("aggregates", made)
         return StageOutcome(())
+
+
+def identify(table: str, frame: pl.DataFrame, run: str, setup: LogSetup) -> pl.DataFrame:
+    """A table with the columns of its contract that say which run it is of."""
+    who = {"run": run, "dataset": setup.dataset, "vehicle": setup.vehicle.id, "terrain": setup.terrain}
+    labelled = frame.with_columns(pl.lit(text).alias(name) for name, text in who.items())
+    return labelled.select(contract_of(table).schema.column_names())
 
 
 def as_recorded(table: str, frame: pl.DataFrame) -> pl.DataFrame:

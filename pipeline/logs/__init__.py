@@ -26,7 +26,7 @@ from pipeline.core.rigid import (
     rotate,
 )
 from pipeline.logs.catalog import OVER_BUDGET
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings, join_stamp
+from pipeline.logs.columns import Ragged, RaggedStrings, Strings, join_times
 from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, read_topics
@@ -256,19 +256,26 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
     numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
     if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
         return []
-    values = [column.values for column in numbers if isinstance(column, Ragged)]
-    time = join_stamp(values[0], values[1]) if len(values) == len(_NUMBERS) else None
-    if time is None:
+    ragged = [column for column in numbers if isinstance(column, Ragged)]
+    if len(ragged) < len(_NUMBERS):
         return []
+    counts = np.array([np.diff(column.offsets) for column in (parents, children, *ragged)])
+    # Messages of JSON may lack a field of one of their transforms.
+    whole = (counts == counts[0]).all(axis=0)
+    parent_codes, child_codes = (
+        one.codes[np.repeat(whole, np.diff(one.offsets))] for one in (parents, children)
+    )
+    values = [column.values[np.repeat(whole, np.diff(column.offsets))] for column in ragged]
+    time, known = join_times(values[0], values[1])
     position = np.stack(values[2:5], axis=1).astype(np.float64)
     quaternion = np.stack(values[5:], axis=1).astype(np.float64)
-    log_time = np.repeat(columns.log_time, np.diff(children.offsets))
+    log_time = np.repeat(columns.log_time[whole], counts[0][whole])
     with np.errstate(over="ignore", invalid="ignore"):
         norm = np.linalg.norm(quaternion, axis=1)
-    valid = np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
+    valid = known & np.isfinite(position).all(axis=1) & np.isfinite(norm) & (norm > _LEAST_NORM)
     links: list[tuple[Link, int]] = []
     several = len(children.values)
-    pairs = parents.codes.astype(np.int64) * several + children.codes
+    pairs = parent_codes.astype(np.int64) * several + child_codes
     for pair in np.unique(pairs).tolist():
         parent, child = divmod(pair, several)
         here = pairs == pair

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Final, TypeAlias
@@ -218,6 +220,21 @@ _MOST_CELLS = 20_000_000
 _TIMES = {"nanos": "nanosec", "seconds": "sec", "nsec": "nanosec", "secs": "sec", "nsecs": "nanosec"}
 
 
+def _name_kind(value: Leaf | None) -> str:
+    """Kind of a value; empty for null."""
+    if value is None:
+        return ""
+    return "flag" if isinstance(value, bool) else "text" if isinstance(value, str) else "number"
+
+
+@dataclass(slots=True)
+class _Found:
+    """What one message has under one path: several values if it is a list, or in one."""
+
+    several: bool = False
+    values: list[Leaf | None] = field(default_factory=list)
+
+
 class ObjectDecoder:
     """Decodes payloads one by one into nested values.
 
@@ -231,8 +248,7 @@ class ObjectDecoder:
         self._decode = decode
         self._fields = fields
         self._where = where
-        self._rows: dict[int, dict[str, list[Leaf]]] = {}
-        self._several: set[str] = set()
+        self._rows: dict[int, dict[str, _Found]] = {}
         self.rejected: list[Rejected] = []
         self.notes: tuple[str, ...] = ()
         self.shortened: dict[str, int] = {}
@@ -243,15 +259,13 @@ class ObjectDecoder:
         spans = zip(ids.tolist(), block.start.tolist(), block.size.tolist(), strict=True)
         for position, (row, start, size) in enumerate(spans):
             try:
-                leaves: dict[str, list[Leaf]] = {}
-                for path, value, several in _walk(
+                leaves: dict[str, _Found] = {}
+                for path, values, several in _walk(
                     self._decode(block.data[start : start + size].tobytes()), "", inside=False
                 ):
-                    leaves.setdefault(path, [])
-                    if several:
-                        self._several.add(path)
-                    if value is not None:
-                        leaves[path].append(self._bound(path, value))
+                    found = leaves.setdefault(path, _Found())
+                    found.several |= several
+                    found.values += [None if value is None else self._bound(path, value) for value in values]
                 self._rows[row] = leaves
             except (ValueError, RecursionError):
                 wrong.append(position)
@@ -293,21 +307,32 @@ class ObjectDecoder:
             )
         return {path: self._column(path, messages) for path in leaves if path in chosen}
 
-    def _column(self, path: str, messages: list[dict[str, list[Leaf]]]) -> Column:
-        lists = [message.get(path, []) for message in messages]
-        flat = [value for values in lists for value in values]
-        offsets = np.r_[0, np.cumsum([len(values) for values in lists], dtype=np.int64)]
-        if any(isinstance(value, str) for value in flat):
+    def _column(self, path: str, messages: list[dict[str, _Found]]) -> Column:
+        """Values of one path. What is of another kind than in most messages is missing, as null is."""
+        found = [message.get(path) for message in messages]
+        several = 2 * sum(one.several for one in found if one) > sum(one is not None for one in found)
+        lists = [one.values if one and one.several == several else [] for one in found]
+        kinds = Counter(map(_name_kind, itertools.chain.from_iterable(lists)))
+        del kinds[""]
+        # Of equally many a number: all that is used of a message are numbers, but for names.
+        kind = max(kinds, key=lambda name: (kinds[name], name == "number"), default="number")
+        if kind == "text":
+            texts = [[str(value) for value in values if value is not None] for values in lists]
+            offsets = np.r_[0, np.cumsum([len(values) for values in texts], dtype=np.int64)]
             numbers: dict[str, int] = {}
-            codes = np.array([numbers.setdefault(str(v), len(numbers)) for v in flat], dtype=np.int32)
+            flat_texts = itertools.chain.from_iterable(texts)
+            codes = np.array([numbers.setdefault(v, len(numbers)) for v in flat_texts], dtype=np.int32)
             column = RaggedStrings(codes, tuple(numbers), offsets)
-            return column if path in self._several else column.at(0)
+            return column if several else column.at(0)
+        if not several:
+            lists = [values or [None] for values in lists]
+        flat = [v if _name_kind(v) == kind else math.nan for values in lists for v in values]
         values = np.array(flat) if flat else np.empty(0)
         if values.dtype == object:
             values = np.array([float(value) for value in flat])
-        if path in self._several:
-            return Ragged(values, offsets)
-        return values if values.size == len(messages) else Ragged(values, offsets).at(0)
+        if not several:
+            return values
+        return Ragged(values, np.r_[0, np.cumsum([len(values) for values in lists], dtype=np.int64)])
 
 
 def decode_json(payload: bytes) -> Value:
@@ -388,7 +413,7 @@ def _plain(message: object, above: frozenset[str] = frozenset()) -> Value:
     return values
 
 
-def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, Leaf | None, bool]]:
+def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, list[Leaf | None], bool]]:
     if isinstance(value, dict):
         for key, below in value.items():
             name = _TIMES.get(key, key) if path.endswith(("stamp", "timestamp")) else key
@@ -396,12 +421,12 @@ def _walk(value: Value, path: str, *, inside: bool) -> Iterator[tuple[str, Leaf 
     elif isinstance(value, list):
         yield from _walk_list(value, path)
     elif value is not None or path:
-        yield path, value, inside
+        yield path, [value], inside
 
 
-def _walk_list(values: list[Value], path: str) -> Iterator[tuple[str, Leaf | None, bool]]:
+def _walk_list(values: list[Value], path: str) -> Iterator[tuple[str, list[Leaf | None], bool]]:
     if not values:
-        yield path, None, True
+        yield path, [], True
     for value in values:
         name = f"{path}[]" if isinstance(value, dict) else path
         yield from _walk(value, name, inside=True)

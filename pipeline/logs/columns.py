@@ -15,7 +15,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Floats, Ints, group_rows
+from pipeline.core.arrays import Flags, Floats, Ints, group_rows
 from pipeline.logs.chunks import MESSAGE_OVERHEAD, Messages
 from pipeline.logs.records import Buffer, LogError
 
@@ -128,11 +128,27 @@ _LATEST_S: Final = 1 << 33
 _INDEXED: Final = re.compile(r"^(?P<path>.*[^\]])\[(?P<number>\d+)\]$")
 
 
-def join_stamp(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> Ints | None:
-    """Stamps [ns] from seconds and nanoseconds; None if any of them is not a valid time."""
-    if not ((np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)).all():
+def join_times(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -> tuple[Ints, Flags]:
+    """Stamps [ns] from seconds and nanoseconds, 0 for what is no time, and whether each is one."""
+    known: Flags = (np.abs(seconds) <= _LATEST_S) & (np.abs(nanoseconds) <= _LATEST_S)
+    whole, rest = (np.where(known, one, 0).astype(np.int64) for one in (seconds, nanoseconds))
+    return whole * 1_000_000_000 + rest, known
+
+
+def place_stamps(stamp: Ints, known: Flags, log_time: Ints) -> Ints | None:
+    """Stamps [ns], with those that are no time placed by their log times; None if these are most.
+
+    Args:
+        stamp: as recorded, shape (n,).
+        known: whether each is a time.
+        log_time: of the messages [ns].
+    """
+    if known.all():
+        return stamp
+    if 2 * int(known.sum()) <= known.size:
         return None
-    return seconds.astype(np.int64) * 1_000_000_000 + nanoseconds.astype(np.int64)
+    usual = round(float(np.median(stamp[known] - log_time[known])))
+    return np.where(known, stamp, log_time + usual)
 
 
 def select_leaves(leaves: Sequence[str], fields: Sequence[str] | None, *, where: str) -> set[str]:

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, cast
 
+from pipeline.core.arrays import PAUSE_NS
 from pipeline.core.compute import usable_threads
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.logs import records as rec
@@ -28,6 +30,8 @@ from pipeline.logs.scan import Scanner
 
 if TYPE_CHECKING:
     import os
+
+    from pipeline.logs.spans import Span
 
 SUFFIXES: Final = (".mcap", ".db3", ".bag")
 """Suffixes of the files of recordings."""
@@ -334,6 +338,10 @@ def merge_parts(path: Path, parts: Sequence[Part], losses: Sequence[Loss], fetch
     )
 
 
+_HEAD_BYTES: Final = 4096
+"""First bytes of a file by which it is known again: they hold the time of its first chunk."""
+
+
 @dataclass
 class _GrowingFile:
     """One file of a growing recording.
@@ -343,6 +351,8 @@ class _GrowingFile:
         catalog: contents of its complete records.
         offset: first byte of the first incomplete record.
         size: bytes at the last update.
+        seen: device, inode and time of change at the last update.
+        head: its first bytes.
         finished: whether the recorder has finished it.
     """
 
@@ -350,23 +360,33 @@ class _GrowingFile:
     catalog: Catalog = field(default_factory=Catalog)
     offset: int = len(rec.MAGIC)
     size: int = 0
+    seen: tuple[int, int, int] = (0, 0, 0)
+    head: bytes = b""
     finished: bool = False
 
     def follow(self) -> bool:
         """Scan the data that was added; returns whether there is any."""
         try:
-            size = self.path.stat().st_size
+            state = self.path.stat()
         except FileNotFoundError as error:
             what = "the file was removed while it was watched"
             hint = "Leave the files of a recording where they are until it ends"
             raise LogError("log_changed", what, where=str(self.path), hint=hint) from error
+        size, seen, before = state.st_size, (state.st_dev, state.st_ino, state.st_mtime_ns), self.seen
         if size < self.size:
             what = "the file became shorter while it was watched: it was replaced, or is not being recorded"
             raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")
-        if size == self.size or size < len(rec.MAGIC):
+        if seen == before or size < len(rec.MAGIC):
             return False
-        self.finished, self.size = is_finished(self.path), size
         with open_source(self.path) as source:
+            head = source.read_at(0, min(size, _HEAD_BYTES))
+            if self.head and (seen[:2] != before[:2] or not head.startswith(self.head)):
+                what = "the file was replaced by another while it was watched"
+                raise LogError("log_changed", what, where=str(self.path), hint="Start the watch again")
+            self.seen, self.head = seen, head
+            if size == self.size:
+                return False
+            self.finished, self.size = is_finished(self.path), size
             if source.read_at(0, len(rec.MAGIC)) != rec.MAGIC:
                 what = "only MCAP files can be watched while they are written, and this is not one"
                 hint = "Record with `ros2 bag record -s mcap`, or analyze the log when it is complete"
@@ -419,6 +439,7 @@ class GrowingLog:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._files: dict[Path, _GrowingFile] = {}
+        self._end_s = 0.0
 
     @property
     def note(self) -> str:
@@ -444,6 +465,8 @@ class GrowingLog:
         for path in find_parts(self.path)[0]:
             self._files.setdefault(path, _GrowingFile(path))
         grown = [file.follow() for file in self._files.values()]
+        if any(grown):
+            self._end_s = sum(_measure_lengths(self._list_spans())) * 1e-9
         return any(grown)
 
     @property
@@ -459,20 +482,14 @@ class GrowingLog:
         return sum(file.size for file in self._files.values())
 
     @property
-    def start_ns(self) -> int:
-        """First log time [ns]; 0 before the first message."""
-        starts = (file.catalog.start_ns for file in self._files.values())
-        return min((one for one in starts if one is not None), default=0)
-
-    @property
     def end_s(self) -> float:
-        """Last log time, relative to the first [s]."""
-        return (self._end_ns - self.start_ns) * 1e-9
+        """Recorded time so far [s], whatever the clock of the log times was set to meanwhile."""
+        return self._end_s
 
-    @property
-    def _end_ns(self) -> int:
-        ends = (file.catalog.end_ns for file in self._files.values())
-        return max((one for one in ends if one is not None), default=0)
+    def _list_spans(self) -> list[Span]:
+        """Chunks with known times, in the order in which they were written."""
+        spans = (span for file in self._files.values() for span in file.catalog.spans)
+        return [span for span in spans if span.end_ns is not None]
 
     def make_index(self, seconds: float | None = None) -> LogIndex:
         """Index of the recording so far.
@@ -480,16 +497,34 @@ class GrowingLog:
         Args:
             seconds: approximate length of the part at the end to index [s]; None for all.
         """
-        since = None if seconds is None else self._end_ns - round(seconds * 1e9)
+        kept: set[int] | None = None
+        if seconds is not None:
+            spans = self._list_spans()
+            ends = list(itertools.accumulate(_measure_lengths(spans)))
+            since = ends[-1] - seconds * 1e9 if ends else 0.0
+            kept = {id(span) for span, end in zip(spans, ends, strict=True) if end >= since}
         parts = [
-            Part(file.path, file.size, _cut(file.catalog, since), None)
+            Part(file.path, file.size, _cut(file.catalog, kept), None)
             for file in self._files.values()
             if file.catalog.spans or len(self._files) == 1
         ]
         return merge_parts(self.path, parts, (), 0)
 
 
-def _cut(catalog: Catalog, since_ns: int | None) -> Catalog:
-    """Catalog without the chunks that end before a time; it shares its dictionaries with the original."""
-    spans = [one for one in catalog.spans if since_ns is None or one.end_ns is None or one.end_ns >= since_ns]
+def _cut(catalog: Catalog, kept: set[int] | None) -> Catalog:
+    """Catalog without the other chunks with known times; it shares its dictionaries with the original."""
+    spans = [one for one in catalog.spans if kept is None or one.end_ns is None or id(one) in kept]
     return replace(catalog, spans=spans)
+
+
+def _measure_lengths(spans: Iterable[Span]) -> Iterator[int]:
+    """Recorded time that each chunk adds to those before it [ns]; a clock that was set adds none."""
+    last: int | None = None
+    for span in spans:
+        start, end = cast("int", span.start_ns), cast("int", span.end_ns)
+        if last is None or abs(end - last) > PAUSE_NS:
+            yield end - start if end - start <= PAUSE_NS else 0
+            last = end
+        else:
+            yield max(end - last, 0)
+            last = max(end, last)

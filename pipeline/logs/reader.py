@@ -28,7 +28,8 @@ from pipeline.logs.columns import (
     digest_messages,
     find_repeated,
     gather_payloads,
-    join_stamp,
+    join_times,
+    place_stamps,
     share_times,
 )
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
@@ -379,7 +380,7 @@ def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list
     repeated_rows = repeated.get(job.info.id, np.empty(0, dtype=np.int64))
     log_time, publish_time, rows = job.buffer.finish(repeated_rows)
     leaves = job.recipe.decoder.columns(rows)
-    header_time = _header_time(leaves)
+    header_time = _header_time(leaves, log_time)
     fields = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
     losses = []
     for rejected in job.recipe.decoder.rejected:
@@ -404,12 +405,12 @@ def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list
     return columns, losses
 
 
-def _header_time(leaves: Mapping[str, Column]) -> Ints | None:
+def _header_time(leaves: Mapping[str, Column], log_time: Ints) -> Ints | None:
     for prefix in STAMPS:
         seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
         if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
             continue
-        stamp = join_stamp(seconds, nanoseconds)
+        stamp = place_stamps(*join_times(seconds, nanoseconds), log_time)
         if stamp is not None:
             return stamp
     return None

@@ -309,8 +309,10 @@ def _read_plan(path: Path, vehicle: Vehicle) -> Floats:
 def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
     """Forward speed and yaw rate of a log's commands, each held, at the plan's rate."""
     speed, _, turn = vehicle.kinematics.asked(name_inputs(series, vehicle), vehicle)
-    times = np.arange(series.times[0], series.times[-1], 1.0 / RATE_HZ)
-    held = np.maximum(np.searchsorted(series.times, times, side="right") - 1, 0)
+    # A silence is as long as the longest plan at most.
+    played = np.append(0.0, np.cumsum(np.minimum(np.diff(series.times), LONGEST_S)))
+    times = np.arange(0.0, played[-1], 1.0 / RATE_HZ)
+    held = np.maximum(np.searchsorted(played, times, side="right") - 1, 0)
     return np.column_stack((speed[held], turn[held]))
 
 

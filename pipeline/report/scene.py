@@ -373,12 +373,14 @@ class Scene:
         slip, domain = self.sound_slip.get(self.report.main_input), self.time_domain
         if slip is None or domain is None or domain[1] - domain[0] < 1.5 * _WORST_S:
             return None
-        edges = np.arange(domain[0], domain[1] + 1.0, 1.0)
         squared = np.minimum(slip["modulus"].to_numpy(), self.modulus_cap) ** 2
-        second = np.histogram(slip["t"].to_numpy(), edges, weights=squared)[0]
-        width = int(_WORST_S)
-        total = np.convolve(second, np.ones(width), mode="valid")
-        start = min(float(edges[int(np.argmax(total))]), domain[1] - _WORST_S)
+        seconds, place = np.unique(np.floor(slip["t"].to_numpy() - domain[0]), return_inverse=True)
+        summed = np.append(0.0, np.cumsum(np.bincount(place, squared)))
+        # The worst span ends or begins with a second that has slip, however long there was none.
+        starts = np.unique(np.concatenate((seconds, np.maximum(seconds + 1.0 - _WORST_S, 0.0))))
+        ends = np.searchsorted(seconds, starts + _WORST_S)
+        total = summed[ends] - summed[np.searchsorted(seconds, starts)]
+        start = min(domain[0] + float(starts[int(np.argmax(total))]), domain[1] - _WORST_S)
         return start, start + _WORST_S
 
     @cached_property

@@ -30,6 +30,8 @@ class MotionError(SlipError):
 # Only this module converts stored tables to a run. The stage `align` has corrected the errors of a recording;
 # nothing is corrected here.
 
+_FAR_S = 2.5
+"""Distance from every message [s] beyond which nothing is scored: longer than a prediction (2 s)."""
 _DEAD = 1e-9
 """Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
 _ROLLS = 0.3
@@ -503,5 +505,12 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
     known = np.concatenate((ends[:1], times, ends[1:]))
     holes = np.flatnonzero(np.diff(known) > 0.2 + ROUNDING_S)
     for hole in holes.tolist():
-        excluded.append(np.arange(known[hole] + 0.05, known[hole + 1] - ROUNDING_S, 0.05))  # noqa: PERF401
+        # Nothing is scored far from all streams either, however long they are silent.
+        first, last = known[hole] + 0.05, known[hole + 1] - ROUNDING_S
+        near = np.concatenate(([first], streams[(streams > first) & (streams < last)], [last]))
+        silent = np.flatnonzero(np.diff(near) > 2.0 * _FAR_S)
+        begins, ends = np.append(first, near[silent + 1] - _FAR_S), np.append(near[silent] + _FAR_S, last)
+        for begin, end in zip(begins.tolist(), ends.tolist(), strict=True):
+            place = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
+            excluded.append(first + place * 0.05)
     return starts, np.unique(np.concatenate(excluded))

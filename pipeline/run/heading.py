@@ -13,6 +13,7 @@ from pipeline.run import GyroFit, MotionRun, Track
 from pipeline.run.signals import STILL, Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged
+_LONGEST_HOLE = 3.0  # [s]: no prediction (2 s) bridges it, however rare messages are; it bounds the cells
 SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; no window fits into a shorter span or bridges a longer gap
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags start at the wheel speeds
 
@@ -83,7 +84,7 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     """
     stamps = run.streams
     period = np.diff(stamps)
-    hole = max(_SHORTEST_HOLE, 3.0 * float(np.median(period)))
+    hole = min(max(_SHORTEST_HOLE, 3.0 * float(np.median(period))), _LONGEST_HOLE)
     edges = np.flatnonzero(period > hole + ROUNDING_S)
     starts = np.concatenate((stamps[:1], stamps[edges + 1]))
     ends = np.concatenate((stamps[edges], stamps[-1:]))

@@ -2,20 +2,22 @@
 
 Every topic has the recorder's log time; most have a header stamp, set at the measurement. Stamps are
 preferred, since recording delays do not affect them. A clock that jumps while the recorder's does not is
-corrected through the log time; the position of the jump is stored, so that no segment crosses it.
+corrected through the log time; the position of the jump is stored, so that no segment crosses it. Where the
+recorder's own clock jumps over hours, all topics are silent at once, and the time between is closed.
 """
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core import format_duration
+from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints, robust_spread
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
-from pipeline.stages import Finding, timing
+from pipeline.stages import Finding, Severity, timing
 
 Stamps = Ints
 
@@ -60,6 +62,9 @@ _LEAST_HELD_UP_S = 0.03
 """Least delay of a bunch [s], below a command period: two simultaneous messages are not a bunch."""
 _HOLE_PERIODS = 8.0
 """Usual periods that a hole of a slow topic exceeds: bunches of eight cause gaps of as many."""
+_CLOSED_NS = 10_000_000_000
+"""Length of such a silence [ns] if no stamp tells how long it was: a `arrays.STRETCH_S`, longer than all
+waits and holds of a drive, so that nothing crosses it."""
 _HOLE_NS = 1_000_000_000
 """Gap [ns] above which a line is interrupted: bridges delay messages by less."""
 _REACH = 25
@@ -116,16 +121,88 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     Returns:
         The clocks by the same keys, and findings.
     """
-    recorded, findings = _follow_simulated_time(recorded)
+    pauses = find_pauses(np.concatenate([times.log_time for times in recorded.values()]))
+    recorded, simulated = _follow_simulated_time(_close_pauses(recorded, pauses))
     recorded, drifts = _take_off_drift(recorded)
     recorded, bunches = _spread_bunches(recorded)
-    findings += drifts + bunches
+    findings = simulated + drifts + bunches
+    if pauses:
+        longest, count = max(after - last for last, after in pauses) / 1e9, len(pauses)
+        text = describe_pauses(pauses, "no topic in use")
+        jump = Finding("clock_jump", "warning", text, where="recorder", value=longest, count=count)
+        findings.insert(0, jump)
     clocks = {key: _read_clock(times) for key, times in recorded.items()}
     findings += [finding for clock in clocks.values() for finding in clock.findings]
     findings += _check_early_stamps(clocks)
     shifted, joined = _join_time_bases(clocks)
     single, repeated = drop_repeated_stamps(shifted)
     return single, findings + joined + repeated
+
+
+def find_pauses(log_time: Stamps) -> list[tuple[int, int]]:
+    """Silences longer than a drive's: last log time before and first one after each [ns].
+
+    Args:
+        log_time: of all topics together [ns], in any order.
+    """
+    log = np.unique(log_time)
+    last = np.flatnonzero(np.diff(log) > PAUSE_NS)
+    return list(zip(log[last].tolist(), log[last + 1].tolist(), strict=True))
+
+
+def describe_pauses(pauses: Sequence[tuple[int, int]], silent: str = "nothing") -> str:
+    """A sentence on silences of a recording, without full stop.
+
+    Args:
+        pauses: as of `find_pauses`, at least one.
+        silent: what was not recorded.
+    """
+    longest = format_duration(max(after - last for last, after in pauses) / 1e9)
+    most = longest if len(pauses) == 1 else f"up to {longest}"
+    return (
+        f"{silent} was recorded for {most}: the recorder's clock was set, or the recording paused; "
+        "that time does not count"
+    )
+
+
+def _close_pauses(
+    recorded: Mapping[str, Recorded], pauses: Sequence[tuple[int, int]]
+) -> Mapping[str, Recorded]:
+    """Close the silences of a recording, so that nothing depends on how far a clock was set.
+
+    What was recorded before moves towards what follows: a clock that was set is right afterwards. Stamps that
+    went on through a silence tell how long it was, and stay.
+    """
+    closed = dict(recorded)
+    for last, after in pauses:
+        offsets = {key: _compare_offsets(times, last) for key, times in recorded.items()}
+        # Stamps that went on: their offset to the log leaped.
+        passed = [after - last + round(off[1] - off[0]) for off in offsets.values() if off is not None]
+        known = [one for one in passed if 0 < one < PAUSE_NS]
+        shift = after - last - (round(float(np.median(known))) if known else _CLOSED_NS)
+        for key, times in recorded.items():
+            now, header, off = closed[key], times.header_time, offsets[key]
+            moved = np.where(times.log_time <= last, shift, 0)
+            stamps = now.header_time
+            if header is not None and stamps is not None and header.any():
+                if off is None:
+                    stamps = stamps + moved
+                elif not 0 < after - last + off[1] - off[0] < PAUSE_NS:
+                    # The last stamps of the former clock are recorded by the new one.
+                    stamps = stamps + np.where(header - off[0] <= (last + after) / 2.0, shift, 0)
+            log_time, publish_time = now.log_time + moved, now.publish_time + moved
+            closed[key] = replace(now, log_time=log_time, publish_time=publish_time, header_time=stamps)
+    return closed
+
+
+def _compare_offsets(times: Recorded, last: int) -> tuple[float, float] | None:
+    """Offset from log to stamps before and after a silence that begins at ``last`` [ns]; None if unknown."""
+    index = int(np.searchsorted(times.log_time, last, side="right"))
+    if times.header_time is None or not 0 < index < times.log_time.size:
+        return None
+    offset = times.header_time - times.log_time
+    before, after = offset[max(index - _AROUND, 0) : index], offset[index : index + _AROUND]
+    return float(np.median(before)), float(np.median(after))
 
 
 def _follow_simulated_time(
@@ -181,10 +258,12 @@ def _follow(
         mapped[key] = replace(times, log_time=log, publish_time=publish, header_time=header)
     also = f"; so were the stamps of {', '.join(real)}, which are not simulated time" if real else ""
     text = (
-        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock (simulated time, at this "
-        f"real-time factor): log times were mapped onto them by those of {leading}{also}"
+        f"the stamps run {clock_map.rate:.3g} times as fast as the recorder's clock, and speeds are per "
+        "second of the stamps: right for a simulation at this real-time factor, wrong for a robot, whose "
+        f"clock then needs mending. Log times were mapped onto the stamps by those of {leading}{also}"
     )
-    return mapped, [Finding("simulated_time", "info", text, where=leading, value=clock_map.rate)]
+    severity: Severity = "info" if abs(clock_map.rate - 1.0) < _OTHER_RATE else "warning"
+    return mapped, [Finding("simulated_time", severity, text, where=leading, value=clock_map.rate)]
 
 
 def _take_off_drift(recorded: Mapping[str, Recorded]) -> tuple[dict[str, Recorded], list[Finding]]:
@@ -303,9 +382,6 @@ def _draw_below(times: Floats) -> Floats:
 
 def _read_clock(times: Recorded) -> TopicClock:
     """The chosen time of one topic, with jumps corrected."""
-    log_known = (
-        times.log_time > DAY_NS if np.median(times.log_time) > DAY_NS else np.ones(times.log_time.size, bool)
-    )
     if times.clock == "publish":
         return TopicClock(times.topic, "publish", times.publish_time, times.publish_time > 0)
     header = times.header_time
@@ -314,21 +390,11 @@ def _read_clock(times: Recorded) -> TopicClock:
         if header is not None and not header.any():
             text = f"the header stamps of {times.topic} are all zero: log times were used"
             findings.append(Finding("no_header_stamp", "warning", text, where=times.topic))
-        findings += _flag_unset(times.topic, ~log_known)
-        return TopicClock(times.topic, "log", times.log_time, log_known, findings=tuple(findings))
-    stamp, usable, breaks, findings = _mend_jumps(times.topic, header, times.log_time, log_known)
-    trusted = usable & log_known
-    delays = times.log_time[trusted] - stamp[trusted]
-    latency = float(np.median(delays)) / 1e9 if delays.size else 0.0
+        usable = np.ones(times.log_time.size, dtype=bool)
+        return TopicClock(times.topic, "log", times.log_time, usable, findings=tuple(findings))
+    stamp, breaks, findings = _mend_jumps(times.topic, header, times.log_time)
+    usable, latency = np.ones(stamp.size, dtype=bool), float(np.median(times.log_time - stamp)) / 1e9
     return TopicClock(times.topic, "header", stamp, usable, breaks, latency, tuple(findings))
-
-
-def _flag_unset(topic: str, unset: Flags) -> list[Finding]:
-    count = int(unset.sum())
-    if not count:
-        return []
-    text = f"{count} messages of {topic} are stamped before the clock was set (1970): they were left out"
-    return [Finding("clock_unset", "warning", text, where=topic, count=count)]
 
 
 def _flag_placed(topic: str, count: int) -> Finding:
@@ -340,17 +406,15 @@ def _flag_placed(topic: str, count: int) -> Finding:
 
 
 def _mend_jumps(
-    topic: str, header: Stamps, log_time: Stamps, log_known: Flags
-) -> tuple[Stamps, Flags, tuple[int, ...], list[Finding]]:
+    topic: str, header: Stamps, log_time: Stamps
+) -> tuple[Stamps, tuple[int, ...], list[Finding]]:
     """Shift each stretch of constant clock offset onto the longest one."""
-    offset = np.where(log_known, header - log_time, 0)
-    usable = np.where(log_known, np.ones(header.size, dtype=bool), header > DAY_NS)
-    known = np.flatnonzero(log_known)
-    if known.size < 2:  # noqa: PLR2004 - one message shows no jump
-        return header, usable, (), _flag_unset(topic, ~usable)
+    if header.size < 2:  # noqa: PLR2004 - one message shows no jump
+        return header, (), []
+    offset = header - log_time
     # Messages of both clocks may alternate: those of a clock that is not set yet do not end a stretch.
-    is_early = (header[known] < DAY_NS) & (np.median(header[known]) > DAY_NS)
-    early, known = known[is_early], known[~is_early]
+    is_early = (header < DAY_NS) & (np.median(header) > DAY_NS)
+    early, known = np.flatnonzero(is_early), np.flatnonzero(~is_early)
     passed, recorded = np.diff(header[known]), np.diff(log_time[known])
     usual = float(np.median(passed)) if passed.size else 0.0
     # Messages that a busy recorder writes late have their usual stamps: only the log times jump.
@@ -393,7 +457,7 @@ def _mend_jumps(
     breaks = [int(log_time[span[0]]) for span in spans[1:]]
     if early.size and early[-1] + 1 < header.size:
         breaks = sorted({*breaks, int(log_time[early[-1] + 1])})
-    return stamp, usable, tuple(breaks), findings + _flag_unset(topic, ~usable)
+    return stamp, tuple(breaks), findings
 
 
 def _check_early_stamps(clocks: Mapping[str, TopicClock]) -> list[Finding]:

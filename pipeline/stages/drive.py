@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core.arrays import Floats, Ints, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
 from pipeline.run.signals import LIVE_SHARE
 from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
@@ -307,8 +307,7 @@ def differentiate_angle(times: Floats, angle: Floats) -> Floats:
     series, times = angle[known], times[known]
     if float(np.max(np.abs(np.diff(series)))) > np.pi and np.ptp(series) <= 2.0 * np.pi + 1e-6:
         series = np.unwrap(series)
-    spaced = np.maximum.accumulate(times) + np.arange(times.size) * 1e-12
-    rate[known] = np.gradient(series, spaced)
+    rate[known] = np.gradient(series, spread_equal(times))
     return rate
 
 

@@ -26,7 +26,7 @@ from pipeline.sources import (
 from pipeline.sources.configuration import IntervalSection
 from pipeline.sources.message_types import find_type
 from pipeline.stages import Finding, StageError, blame_damage, pose_topics, reading
-from pipeline.stages.clocks import Recorded, TopicClock, align_clocks
+from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
 from pipeline.stages.drive import (
     Drive,
     differentiate_angle,
@@ -58,6 +58,7 @@ class Extracted:
         tables: commands, wheels, poses, imu, empty without a source; and power, if recorded.
         findings: findings of the stage.
         start_ns: stamp at which t is zero.
+        paused_s: total of the silences that do not count, see `clocks.find_pauses`.
         clocks: by topic: the time used and the latency of the recording [s].
         frames: reference frame and child frame of the poses; empty if not recorded.
     """
@@ -65,6 +66,7 @@ class Extracted:
     tables: Mapping[str, pl.DataFrame]
     findings: tuple[Finding, ...]
     start_ns: int
+    paused_s: float
     clocks: Mapping[str, Mapping[str, str | float]]
     frames: tuple[str, str] = ("", "")
 
@@ -110,6 +112,7 @@ class _Extraction:
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
         self.chain = pose_topics.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        self.paused_s = 0.0
         self.clocks = self._align()
         self.start_ns = self._find_start()
 
@@ -123,7 +126,7 @@ class _Extraction:
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()
         }
-        return Extracted(tables, tuple(self.findings), self.start_ns, clocks, self.frames)
+        return Extracted(tables, tuple(self.findings), self.start_ns, self.paused_s, clocks, self.frames)
 
     def _join_channels(self, topic: str) -> TopicColumns | None:
         """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
@@ -154,6 +157,8 @@ class _Extraction:
             recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
         clocks, findings = align_clocks(recorded)
         self.findings += findings
+        pauses = find_pauses(np.concatenate([times.log_time for times in recorded.values()]))
+        self.paused_s = sum(after - last for last, after in pauses) / 1e9
         return clocks
 
     def _asked_clocks(self) -> dict[str, str | None]:

@@ -255,7 +255,7 @@ def _compare_with_wheels(
     ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     distance, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path[:2])
-    rate = np.gradient(path[1], path[0] + np.arange(path[0].size) * 1e-12)
+    rate = np.gradient(path[1], arrays.spread_equal(path[0]))
     share = measure_rest(distance, np.diff(rolled), np.diff(np.interp(time[ends], path[0], rate)))
     ahead, aside = split_chords(position, yaw)
     aside = aside - np.diff(np.interp(time, path[0], path[2]))
@@ -387,7 +387,11 @@ def fit_controller(
     if commands.height < FEWEST_MESSAGES:
         return None
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
-    starts = np.arange(max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S, WINDOW_S)
+    begin, end = max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S
+    # Spans in which the wheels were read, however long they were silent in between.
+    place = np.floor((clock - begin) / WINDOW_S)[:, None] - np.arange(np.ceil(ANSWERS_S / WINDOW_S) + 1.0)
+    starts = begin + np.unique(place[place >= 0.0]) * WINDOW_S
+    starts = starts[starts < end]
     spans = (starts, starts + ANSWERS_S)
     held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
     left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
+from pipeline.logs.columns import join_times, place_stamps
 from pipeline.logs.index import LONGEST_NAME
 from pipeline.run.signals import STILL_MPS
 from pipeline.sources import (
@@ -130,7 +131,6 @@ FEWEST_MESSAGES = 20
 """Least number of messages, poses or fixes for a conclusion: two seconds of a localization at 10 Hz."""
 _SIDEWAYS_SHARE = 0.01
 """Fraction of sideways commands above which they are not accidental joystick motion."""
-_NANOSECONDS = 1_000_000_000  # in a second
 _NED_IN_ENU = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRAME = "header.frame_id"
 _POLE_DEG = 90.0  # latitude of a pole
@@ -330,9 +330,11 @@ def with_stamps(columns: TopicColumns) -> TopicColumns:
         return columns
     if stamp.tick_ns:
         ticks = numbers(columns, stamp.field)
-        return replace(columns, header_time=np.asarray(ticks * stamp.tick_ns, dtype=np.int64))
-    seconds, rest = (numbers(columns, f"{stamp.field}.{part}") for part in ("sec", "nanosec"))
-    return replace(columns, header_time=seconds.astype(np.int64) * _NANOSECONDS + rest.astype(np.int64))
+        known = np.isfinite(ticks)
+        times = np.asarray(np.where(known, ticks, 0.0) * stamp.tick_ns, dtype=np.int64)
+    else:
+        times, known = join_times(*(numbers(columns, f"{stamp.field}.{part}") for part in ("sec", "nanosec")))
+    return replace(columns, header_time=place_stamps(times, known, columns.log_time))
 
 
 @dataclass(frozen=True)

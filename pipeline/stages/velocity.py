@@ -57,18 +57,24 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     stamps, rate = stamps[distinct], rate[distinct]
     first = max(float(times.min()) - 1.0, float(stamps[0]))
     last = min(float(times.max()) + 1.0, float(stamps[-1]))
-    grid = arrays.make_grid(first, last, VelocitySection().rate_hz)
-    if grid.size < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
+    rate_hz = VelocitySection().rate_hz
+    count = int(np.floor((last - first) * rate_hz + 1e-6)) + 1
+    if count < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
         return np.full(times.size, np.nan)
-    angle = arrays.integrate_rate(stamps, rate)[:, None]
-    smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
-    corrected: Floats = fit.signed_scale * np.interp(times, grid, smooth) + fit.bias
     # Grid times may differ from stamps by rounding.
     following = np.searchsorted(stamps, times - arrays.ROUNDING_S)
     before = stamps[np.maximum(following - 1, 0)]
     after = stamps[np.minimum(following, stamps.size - 1)]
     away = np.maximum(np.abs(times - before), np.abs(after - times))
-    corrected[away > arrays.SILENT_S + arrays.ROUNDING_S] = np.nan
+    known = away <= arrays.SILENT_S + arrays.ROUNDING_S
+    # Of the uniform grid only the points beside the given times, however long the gyro was silent.
+    place = np.clip(np.floor((times[known] - first) * rate_hz).astype(np.int64), 0, count - 2)
+    grid = first + np.unique(np.concatenate((place, place + 1))) / rate_hz
+    angle = arrays.integrate_rate(stamps, rate)[:, None]
+    smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
+    corrected = np.full(times.size, np.nan)
+    if known.any():
+        corrected[known] = fit.signed_scale * np.interp(times[known], grid, smooth) + fit.bias
     return corrected
 
 
