@@ -169,8 +169,9 @@ def render_errors(data: Data) -> list[str]:
         parts.append(f"{metric} error falls to {low} to {high} % (median {median} %)")
     count = len(section["rows"])
     return fold(
-        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the {parts[0]} "
-        f"of that of the ideal model, the {parts[1]}, but rarely to the noise floor, which the verdict states."
+        f"Over 2 s, held out in {count} recordings of Husky and Warthog and fed with commands, the "
+        f"{parts[0]} of that of the ideal model, the {parts[1]}, but rarely to the noise floor, which the "
+        "verdict states."
     )
 
 

@@ -59,7 +59,7 @@ def test_a_page_that_was_edited_by_hand_is_found(tmp_path: Path, monkeypatch: py
         content: Mapping[str, object] = json.loads(path.read_text(encoding="utf-8"))
         (measured / path.name).write_text(json.dumps({**content, "commit": "0000000"}), encoding="utf-8")
     monkeypatch.setattr(tables, "MEASURED", measured)
-    assert "Measured at 0000000" in tables.fill_page(page[0])
+    assert "at 0000000 (" in tables.fill_page(page[0])
 
 
 @pytest.mark.parametrize(
