@@ -118,7 +118,7 @@ class Comparison:
             hint = "Correct [[interval]], or take all with --interval all."
             raise MotionError("no_poses", what, where=run.name, hint=hint)
         lead = find_lead(run, run.alignment.heading_delay_s)
-        self._silences = np.zeros(0) if run.wheels is None else find_silences(run.wheels)
+        self._silences = np.zeros(0) if run.wheels is None else find_silences(run.wheels, run.track.times)
         compared = run
         if source is Input.MEASURED:
             compared = replace(run, excluded=np.union1d(run.excluded, self._silences))
@@ -397,8 +397,8 @@ class Comparison:
         origin = np.unique(self.horizons.origin)
         at = nodes.times[origin]
         # Where the encoders were silent, the drive goes on as predicted.
-        at = at[~has_excluded(self._silences, at - SILENT_S, at + SILENT_S)]
-        begin = grid.locate_edges(at).astype(np.int64)
+        known = at[~has_excluded(self._silences, at - SILENT_S, at + SILENT_S)]
+        begin = grid.locate_edges(known).astype(np.int64)
         begin = np.minimum(begin, grid.times.size - 1)
         before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
         first = np.unique(np.concatenate((grid.first, begin)))
@@ -406,12 +406,12 @@ class Comparison:
         wheels = base.wheels
         if self.run.wheels is not None:
             wheels = Resets(number, first, first, np.full((first.size, 4), np.nan))
-        at, velocity = self._measure_velocity(before, origin)
+        measured, velocity = self._measure_velocity(before, origin)
         good = np.isfinite(velocity).all(axis=1)
-        at = np.concatenate((base.body.at, at[good]))
+        cell = np.concatenate((base.body.at, measured[good]))
         velocity = np.concatenate((base.body.start, velocity[good]))
-        order = np.unique(at, return_index=True)[1]
-        rows = (at[order], velocity[order])
+        order = np.unique(cell, return_index=True)[1]
+        rows = (cell[order], velocity[order])
         body = _reset_body(grid, np.unique(np.concatenate((grid.first, rows[0]))), rows)
         return replace(base, wheels=wheels, body=body)
 

@@ -259,7 +259,8 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
     ragged = [column for column in numbers if isinstance(column, Ragged)]
     if len(ragged) < len(_NUMBERS):
         return []
-    counts = np.array([np.diff(column.offsets) for column in (parents, children, *ragged)])
+    offsets = [parents.offsets, children.offsets, *(column.offsets for column in ragged)]
+    counts = np.array([np.diff(one) for one in offsets])
     # Messages of JSON may lack a field of one of their transforms.
     whole = (counts == counts[0]).all(axis=0)
     parent_codes, child_codes = (

@@ -98,15 +98,21 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
     return Grid(step, times, span, first, starts, starts + counts * step)
 
 
-def find_silences(series: DriveSeries) -> Floats:
-    """Times [s] within the gaps of a drive's readings, in which its motion is unknown, 0.05 s apart."""
+def find_silences(series: DriveSeries, at: Floats) -> Floats:
+    """Times of poses [s] within the gaps of a drive's readings, where its motion is unknown, and their ends.
+
+    Args:
+        series: readings.
+        at: times of poses [s], increasing, shape (n,).
+    """
     steps = np.diff(series.times)
     # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
     longest = max(SILENT_S, PERIODS * float(np.quantile(steps, 0.75))) if steps.size else np.inf
-    gaps = np.flatnonzero(steps > longest + ROUNDING_S).tolist()
-    return np.concatenate(
-        [np.zeros(0), *(np.arange(series.times[gap] + 0.05, series.times[gap + 1], 0.05) for gap in gaps)]
-    )
+    gaps = np.flatnonzero(steps > longest + ROUNDING_S)
+    begins, ends = series.times[gaps] + 0.05, series.times[gaps + 1] - 0.05
+    first = np.searchsorted(begins, at, side="right") - 1
+    inside = at[(first >= 0) & (at <= ends[np.maximum(first, 0)])] if gaps.size else at[:0]
+    return np.unique(np.concatenate((begins, inside, ends)))
 
 
 class MeasuredDrive:
