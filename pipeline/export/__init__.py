@@ -25,6 +25,7 @@ from pipeline.core.untrusted import read_bounded_text
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.formula import FormulaEffect
+from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import Quantity
 from pipeline.run import MotionError
@@ -169,13 +170,13 @@ _LEAST_FACTOR = 0.01
 """Least ratio of an effective to a nominal length: below it a vehicle hardly moves, and has no parameters."""
 
 
-def require_factors(file: ModelFile) -> None:
+def require_factors(model: Model) -> None:
     """Refuse effective lengths of almost zero, by which controllers and simulators divide.
 
     Raises:
         MotionError: ``absurd_number``.
     """
-    for effect in file.model:
+    for effect in model:
         for parameter in effect.parameters:
             if _FACTORS.intersection(parameter.quantities):
                 value = effect.values[parameter.name]
@@ -304,7 +305,7 @@ class Facts:
     """
 
     def __init__(self, file: ModelFile) -> None:
-        require_factors(file)
+        require_factors(file.model)
         self.file = file
         self.vehicle = file.model.vehicle
 

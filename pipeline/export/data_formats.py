@@ -8,6 +8,7 @@ import inspect
 import json
 import math
 import textwrap
+from datetime import date, time
 from importlib import resources
 from typing import cast
 
@@ -73,7 +74,7 @@ def _plain(value: object) -> object:
         return [_plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
-    return value
+    return value.isoformat() if isinstance(value, date | time) else value
 
 
 JSON_OBJECT = Target(

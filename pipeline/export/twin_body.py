@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from pipeline.core.rigid import GRAVITY_MPS2
+from pipeline.export import require_factors
 from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
 from pipeline.models.parameter import TwinRole
@@ -150,8 +151,10 @@ def build_twin_body(model: Model, speed_mps: float = 1.0) -> TwinBody:
             grows with speed in the model, the latter with its square.
 
     Raises:
-        MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``: dimensions are not its own.
+        MotionError: ``wrong_vehicle``: rollers have no twin yet; ``no_geometry``: dimensions are not its own;
+            ``absurd_number``.
     """
+    require_factors(model)
     vehicle = model.vehicle
     if vehicle.stand_ins:
         what = f"a twin needs {' and '.join(vehicle.stand_ins)}, which are not known"

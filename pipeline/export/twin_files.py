@@ -17,7 +17,6 @@ from pipeline.export import (
     Target,
     name_entity,
     quote_name,
-    require_factors,
     require_plausible,
 )
 from pipeline.export.twin_body import (
@@ -75,7 +74,6 @@ def build_twin(file: ModelFile) -> TwinBody:
     Raises:
         MotionError: ``wrong_vehicle``; ``no_geometry``; ``absurd_number``.
     """
-    require_factors(file)
     return build_twin_body(file.model, find_driven_speed(file))
 
 

@@ -424,12 +424,12 @@ def check_geometry(vehicle: Vehicle, where: str) -> None:
         if value is None or least <= value <= largest:
             continue
         unit = name.rpartition("_")[2]
-        limit, more = (largest, "more") if value > largest else (least, "less")
+        limit, side = (largest, "more") if value > largest else (least, "less")
         fits = ((word, value * factor) for word, factor in _SMALLER.get(unit, ()))
         meant = next(((word, number) for word, number in fits if least <= number <= largest), None)
         raise ConfigurationError(
             "implausible_geometry",
-            f"{name} = {value:g} is {more} than any vehicle has ({limit:.3g})",
+            f"{name} = {value:g} is {side} than any vehicle has ({limit:.3g})",
             where=where,
             hint=f"If it is in {meant[0]}, write {meant[1]:g}."
             if meant

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import tomllib
 from dataclasses import replace
@@ -188,3 +189,14 @@ def test_nothing_is_written_of_an_absurd_model(tmp_path: Path) -> None:
         assert len(said.stderr.splitlines()) == 1
         assert "mass_kg" in said.stderr
         assert not out.exists()
+
+
+def test_dates_and_odd_numbers_of_a_fit_are_json() -> None:
+    values = "a = 2026-01-02\nb = 2026-01-02T03:04:05Z\nc = 03:04:05\nd = [nan, inf, { e = 2026-01-02 }]\n"
+    file = parse_model(f'[vehicle]\npreset = "husky_a200"\n[fit]\n{values}', Path("m.toml"))
+    assert json.loads(export_model(file, "json"))["fit"] == {
+        "a": "2026-01-02",
+        "b": "2026-01-02T03:04:05+00:00",
+        "c": "03:04:05",
+        "d": [None, None, {"e": "2026-01-02"}],
+    }
