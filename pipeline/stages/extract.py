@@ -1,6 +1,6 @@
 """The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -106,8 +106,12 @@ class _Extraction:
         # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
         beside = sources.body_beside
         aside = None if beside is None else beside.signals[0].topic
-        names = dict.fromkeys(columns.topic for columns in topics if columns.topic != aside)
-        stamped = [reading.with_stamps(c) for c in map(self._join_channels, names) if c is not None]
+        recorded: dict[str, list[TopicColumns]] = {}
+        for columns in topics:
+            if columns.topic != aside:
+                recorded.setdefault(columns.topic, []).append(columns)
+        joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
+        stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
         # All texts of a topic may be unreadable.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
@@ -128,9 +132,9 @@ class _Extraction:
         }
         return Extracted(tables, tuple(self.findings), self.start_ns, self.paused_s, clocks, self.frames)
 
-    def _join_channels(self, topic: str) -> TopicColumns | None:
+    def _join_channels(self, topic: str, recorded: Sequence[TopicColumns]) -> TopicColumns | None:
         """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
-        channels = [columns for columns in self.data.of(topic) if columns.log_time.size]
+        channels = [columns for columns in recorded if columns.log_time.size]
         if len(channels) <= 1:
             return channels[0] if channels else None
         joined = join_channels(channels)

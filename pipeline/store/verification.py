@@ -253,7 +253,8 @@ class _Examiner:
                 if data is not None:
                     decode_checked(data)
             except (ValueError, OSError) as error:
-                what = f"the note is damaged and is not used ({error}); this costs nothing but time"
+                why = getattr(error, "strerror", None) or error
+                what = f"the note is damaged and is not used ({why}); this costs nothing but time"
                 yield self._problem("", name, "note_damaged", what)
 
     def _problem(self, run: str, name: str, code: str, what: str) -> Problem:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FEW, MANY = 150, 600
 """Topics of a kind beside those of a drive."""
 
+OPTIONS = Options(overrides={"vehicle": {"preset": "husky_a200"}})
 SECOND = 10**9
 STAMPED = np.arange(5, dtype=np.int64) * SECOND
 
@@ -84,7 +85,7 @@ def add_topics(drive: Path, kind: str, count: int) -> Path:
 def measure(path: Path) -> float:
     """CPU time to inspect a log [s]."""
     begin = time.process_time()
-    found = inspect_log(path, Options())
+    found = inspect_log(path, OPTIONS)
     assert len(found.topics) >= FEW
     return time.process_time() - begin
 
@@ -122,10 +123,10 @@ def test_of_many_poses_those_with_most_messages_are_compared_and_the_others_coun
 ) -> None:
     path = add_topics(drive, "odometries", FEW)
     calls = count_calls(monkeypatch, pose_choice, "extract_tables")
-    choice = inspect_log(path, Options()).choice
+    choice = inspect_log(path, OPTIONS).choice
     assert choice is not None
     assert len(calls) == len(choice.ratings) == MOST_POSES
-    assert str(choice.sources.pose) == str(inspect_log(drive, Options()).choice.sources.pose)  # type: ignore[union-attr]
+    assert str(choice.sources.pose) == str(inspect_log(drive, OPTIONS).choice.sources.pose)  # type: ignore[union-attr]
     (finding,) = [one for one in choice.findings if one.id == "poses_left_out"]
     assert finding.count == FEW + 1 - MOST_POSES
     assert finding.text == f"{FEW + 1} topics or frames hold poses: the 40 with most messages were compared"
