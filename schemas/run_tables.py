@@ -150,7 +150,8 @@ class Alignments(Table):
         "1", "by which the controller multiplies the track width when it turns a body command into wheels"
     )
     body_multiplier = schemas.optional(
-        "1", "yaw rate of the commanded wheels at the nominal track over that of the body command; null without"
+        "1",
+        "yaw rate of the commanded wheels at the nominal track over that of the body command; null without",
     )
     gyro_scale = schemas.optional(
         "1", "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro"
