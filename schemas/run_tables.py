@@ -152,7 +152,7 @@ class Alignments(Table):
     )
     body_multiplier = schemas.optional(
         "1",
-        "yaw rate of the commanded wheels at the nominal track over that of the body command; null without",
+        "yaw rate of the commanded wheels at the nominal track over the body command's; null without one",
     )
     gyro_scale = schemas.optional(
         "1", "yaw rate over the gyro's, negative where it turns the other way; null without a good gyro"

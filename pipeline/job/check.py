@@ -388,15 +388,15 @@ def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = Fal
     names += [MULTIPLIER] if _is_set_anew(sides) else []
 
     def compare_named(some: Sequence[str]) -> list[Change]:
-        kept = [sides.names.index(name) for name in some]
+        places = [sides.names.index(name) for name in some]
 
         def pick(one: RunReading) -> RunNumbers:
-            values, covariance = one.numbers.values[kept], one.numbers.covariance[np.ix_(kept, kept)]
+            values, covariance = one.numbers.values[places], one.numbers.covariance[np.ix_(places, places)]
             return replace(one.numbers, values=values, covariance=covariance)
 
         return compare_sides(
             [pick(one) for one in (*sides.before, *sides.after)],
-            usual[kept],
+            usual[places],
             alike=simulated,
             others={name: [pick(one) for one in group] for name, group in sides.others.items()},
         )

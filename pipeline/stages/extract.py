@@ -377,7 +377,7 @@ class _Extraction:
     def _commands(self) -> pl.DataFrame:
         table = self._drive_table(self.sources.command, self.configuration.command, held=True)
         beside = self.sources.body_beside
-        columns = None if beside is None else self._join_channels(beside.signals[0].topic)
+        columns = None if beside is None else self._join_channels(beside.signals[0].topic, self.data.of(beside.signals[0].topic))
         if beside is None or columns is None or table.is_empty():
             return table
         order = np.argsort(columns.log_time, kind="stable")

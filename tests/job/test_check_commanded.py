@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import polars as pl
@@ -15,7 +15,15 @@ from pipeline.estimation.verdict import format_verdict as format_diagnosis
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.check import BROKEN, Check, check_as_json, compare, keep_baseline
+from pipeline.job.check import (
+    BROKEN,
+    Check,
+    check_as_json,
+    check_runs,
+    compare,
+    find_usual_spread,
+    keep_baseline,
+)
 from pipeline.job.check_sides import Sides, read_baseline, read_under
 from pipeline.job.check_text import format_verdict, list_lines
 from pipeline.job.run_results import load_vehicle
@@ -27,6 +35,7 @@ from pipeline.report.motion_view import load_motion_run
 from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import find_preset
 from pipeline.stages.align import measure_body_multiplier
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -183,3 +192,25 @@ def test_a_run_without_a_body_command_has_no_share(sides: Sides) -> None:
     assert measure_commanded_turn(run, sides.model.model.vehicle) is not None
     bare = replace(run, alignment=replace(run.alignment, body_multiplier=None))
     assert measure_commanded_turn(bare, sides.model.model.vehicle) is None
+
+
+def test_other_runs_of_the_results_tell_how_much_runs_differ(tmp_path: Path) -> None:
+    runs = [drive(tmp_path, "beside", 1.0, seed)[1] for seed in (11, 12, 13, 14)]
+    store = Store(tmp_path / "results")
+    manifests = {one.run: one for one in store.survey().manifests}
+    vehicle = load_vehicle(manifests[runs[0].name])
+    model = Model(vehicle, tuple(find_effect(name)().change(**values) for name, values in EFFECTS.items()))
+
+    check = check_runs(ModelFile(model), [manifests[runs[0].name]], store)
+
+    (there,) = check.sides.others.values()
+    assert sorted(one.numbers.run for one in there) == sorted(run.name for run in runs[1:])
+    change = check.changes["drive_lag.tau"]
+    # Three runs of one terrain; the model beside the run is a side of its own.
+    assert change.freedom == 2
+    assert change.spread < 0.5 * find_usual_spread(check.sides.labels[0].parameter)
+    assert any(
+        "3 tell how much runs differ" in text for label, text in list_lines(check) if label == "others"
+    )
+    assert "and 3 others of the vehicle" in format_verdict(check)
+    assert len(cast("list[str]", check_as_json(check, list_lines(check))["others"])) == 3
