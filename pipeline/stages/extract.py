@@ -377,8 +377,11 @@ class _Extraction:
     def _commands(self) -> pl.DataFrame:
         table = self._drive_table(self.sources.command, self.configuration.command, held=True)
         beside = self.sources.body_beside
-        columns = None if beside is None else self._join_channels(beside.signals[0].topic, self.data.of(beside.signals[0].topic))
-        if beside is None or columns is None or table.is_empty():
+        if beside is None or table.is_empty():
+            return table
+        topic = beside.signals[0].topic
+        columns = self._join_channels(topic, self.data.of(topic))
+        if columns is None:
             return table
         order = np.argsort(columns.log_time, kind="stable")
         at = np.searchsorted(columns.log_time[order], table["log_time"].to_numpy(), side="right") - 1
