@@ -253,7 +253,7 @@ def list_lines(check: Check) -> list[Line]:
     lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
     others = [one.numbers.run for group in check.sides.others.values() for one in group]
     if others:
-        lines.append(("others", f"{len(others)} tell how much runs differ: {', '.join(others)}"))
+        lines.append(("others", f"{len(others)}: {', '.join(others)}"))
     if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
         before, after = (" and ".join(one) for one in check.sides.terrains)
         lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
@@ -291,7 +291,8 @@ def _format_resolution(check: Check, name: str) -> str:
     text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
     if check.simulated:
         return text
-    known = f"these runs and {check.count_others()} others" if check.count_others() else "these runs"
+    count = check.count_others()
+    known = f"with {count} others" if count else "these runs"
     source = "(default)" if change.is_default else f"({known})"
     return f"{text}; spread between runs {show(change.spread)} {source}"
 
