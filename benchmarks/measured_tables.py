@@ -68,9 +68,11 @@ def find_outdated(data: Data, present: Mapping[str, int]) -> list[str]:
 
 
 def name_origin(data: Data) -> list[str]:
-    """The sentence below a table: command, commit, date and versions."""
+    """The sentences below a table: command, commit, date and versions, and whether they are outdated."""
     versions = ", ".join(f"{name} version {version}" for name, version in data["versions"].items())
-    return fold(f"Measured by `{data['command']}` at {data['commit']} ({data['date']}; {versions}).")
+    outdated = find_outdated(data, list_versions())
+    older = f" **Outdated** ({'; '.join(outdated)}): today's figures may differ." if outdated else ""
+    return fold(f"Measured by `{data['command']}` at {data['commit']} ({data['date']}; {versions}).{older}")
 
 
 def fold(text: str) -> list[str]:
