@@ -379,17 +379,20 @@ def find_idle(
     problems: Mapping[Input, Problem],
     duties: Mapping[str, Collection[Input]],
     drive: Collection[str],
+    written: Collection[str] = (),
 ) -> list[str]:
     """Effects that raise the 2 s errors, and those of the drivetrain that reduce no error.
 
     They are taken out one by one, the one that raises the errors most first: without it others may be needed,
-    or help no longer. From the first input no effect may raise them: that model is written.
+    or help no longer.
 
     Args:
         model: with all effects.
         problems: the runs by input; what cannot be fitted from an input is not judged from it.
         duties: inputs from which an effect must serve predictions, by id; others stay.
         drive: ids of the effects of the drivetrain.
+        written: ids of effects that may not raise the errors from the first input either, that of the model
+            that is written.
     """
     idle, leading = list[str](), next(iter(problems))
     while rest := [name for name in duties if name not in idle]:
@@ -397,7 +400,9 @@ def find_idle(
         for source, problem in problems.items():
             with suppress(MotionError):
                 whole = judge_whole(problem, part)
-                judged = [one for one in rest if source is leading or source in duties[one]]
+                judged = [
+                    one for one in rest if source in duties[one] or (source is leading and one in written)
+                ]
                 for name in (one for one in judged if one in whole.effects):
                     with suppress(MotionError):
                         without = whole.drop(name)

@@ -67,6 +67,7 @@ from pipeline.estimation.unexplained import find_places
 from pipeline.models import Effect, Model, ModelFile, find_effect
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late, find_late
+from pipeline.models.parameter import Quantity
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
@@ -188,7 +189,11 @@ def summarize(
 
 
 def _list_raising(judgement: Judgement | None) -> list[str]:
-    return [] if judgement is None else list_raising(judgement)
+    """Effects of the written model whose steps raise its errors, see `list_raising`."""
+    if judgement is None:
+        return []
+    written = _list_written(judgement.fitted.model)
+    return [name for name in list_raising(judgement) if name in written]
 
 
 def _find_lead(paths: Sequence[Explored], judgement: Judgement | None) -> str:
@@ -296,7 +301,18 @@ def _list_idle(
     # An encoder error affects both the ground and the drivetrain; from commands the two cancel.
     duties = {name: inputs[-1:] if is_ground else inputs[:1] for name, is_ground in on_ground.items()}
     drive = {name for name, is_ground in on_ground.items() if not is_ground}
-    return find_idle(model, {one: _find_problem(context, one) for one in inputs}, duties, drive)
+    problems = {one: _find_problem(context, one) for one in inputs}
+    return find_idle(model, problems, duties, drive, _list_written(model))
+
+
+def _list_written(model: Model) -> list[str]:
+    """Effects that may not raise the errors of the written model.
+
+    An encoder that counts wrong looks like another radius: its part in the drive, which cancels it from
+    commands, may be too faint to be found, and the encoder is named all the same.
+    """
+    radii = {Quantity.RADIUS, Quantity.RADIUS_DIFFERENCE}
+    return [one.id for one in model if radii.isdisjoint(q for p in one.parameters for q in p.quantities)]
 
 
 def _judge_ways(

@@ -101,9 +101,9 @@ def test_what_raises_the_errors_of_the_model_that_is_written_is_not_named(
     model = Model(HUSKY, (find_effect(radius)(), find_effect(psi)()))
     problems: Any = {source: source for source in Input}
     ground = dict.fromkeys(model.ids, (Input.MEASURED,))
-    assert find_idle(model, problems, ground, ()) == [psi]
+    assert find_idle(model, problems, ground, (), (psi,)) == [psi]
     # Where the model predicts from the wheels, it stays.
-    assert find_idle(model, {Input.MEASURED: problems[Input.MEASURED]}, ground, ()) == []
+    assert find_idle(model, {Input.MEASURED: problems[Input.MEASURED]}, ground, (), (psi,)) == []
 
 
 def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_not() -> None:
