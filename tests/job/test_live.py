@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from websockets.sync.server import ServerConnection
 
 ODOMETRY = "/mapping/icp_odom"
+DAY_NS = 86_400 * 10**9
 
 
 @pytest.fixture(scope="module")
@@ -225,6 +226,43 @@ def test_garbage_is_said_and_what_is_good_beside_it_is_kept(source: Path, tmp_pa
     index = open_log(tmp_path / "run")
     assert index.message_count == len(messages) + 3
     assert index.complete
+
+
+@pytest.mark.parametrize(
+    "times",
+    [
+        ("3 days ahead", lambda t: t + 3 * DAY_NS),
+        ("3 days back", lambda t: t - 3 * DAY_NS),
+        ("30 years ahead", lambda t: t + 11_000 * DAY_NS),
+        ("to zero", lambda t: t % DAY_NS),
+    ],
+    ids=lambda one: one[0],
+)
+def test_a_clock_that_is_set_begins_a_file_and_costs_no_message(
+    times: tuple[str, Callable[[int], int]], source: Path, tmp_path: Path
+) -> None:
+    messages = read_messages(source)[:400]
+    for _, _, message in messages[200:]:
+        message.log_time = times[1](message.log_time)
+    # As of a simulation that has not started, and of a message that a second computer has stamped.
+    messages[0][2].log_time = 0
+    messages[100][2].log_time += 9 * DAY_NS
+    server = make_server("older", messages)
+    try:
+        with receive(server.port, tmp_path / "run") as log, playing(server, messages, 1e12):
+            wait_for(lambda: count_messages(log) == len(messages))
+            assert "left out" not in log.note
+            assert log.end_s < 60.0
+    finally:
+        server.close()
+    files = sorted((tmp_path / "run").glob("*.mcap"))
+    counts = [open_log(file).message_count for file in files]
+    # The message at zero, and the first ones of each clock, which tell it from a time that is wrong for once.
+    assert len(counts) == 3
+    assert counts[0] < 25
+    assert 200 <= counts[0] + counts[1] < 225
+    assert sum(counts) == len(messages)
+    assert open_log(tmp_path / "run").message_count == len(messages)
 
 
 @pytest.mark.parametrize(

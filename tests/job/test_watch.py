@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import pytest
 from mcap.reader import make_reader
@@ -26,7 +27,11 @@ from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store
 
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
 CHUNK = 1 << 14
+OTHER = {"drive_lag": 0.5}
 
 
 def make_log(path: Path, duration_s: float, **settings: object) -> Path:
@@ -133,6 +138,124 @@ def test_a_file_that_was_replaced_is_refused(tmp_path: Path) -> None:
     grown.write_bytes(grown.read_bytes()[:2000])
     with pytest.raises(LogError, match="became shorter"):
         log.update()
+
+
+@pytest.mark.parametrize("how", ["renamed over it", "written into it"])
+@pytest.mark.parametrize("longer", [False, True], ids=["of its size", "longer"])
+def test_a_file_in_place_of_another_is_noticed(how: str, longer: bool, tmp_path: Path) -> None:  # noqa: FBT001
+    grown, other = (
+        make_log(tmp_path / "grown.mcap", 3.0),
+        make_log(tmp_path / "other.mcap", 5.0, effects=OTHER),
+    )
+    content = other.read_bytes()
+    log = GrowingLog(grown)
+    log.update()
+    content = content if longer else content[: grown.stat().st_size].ljust(grown.stat().st_size, b"\0")
+    if how == "renamed over it":
+        other.write_bytes(content)
+        other.replace(grown)
+    else:
+        grown.write_bytes(content)
+        os.utime(grown, ns=(1, 1))
+    with pytest.raises(LogError, match="was replaced by another while it was watched"):
+        log.update()
+
+
+def write_parts(path: Path, starts_s: list[float]) -> Path:
+    """A log of ten seconds a part, whose clock is set between them."""
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200)
+        writer.start(profile="", library="test")
+        channel = writer.register_channel("/a", "json", writer.register_schema("T", "jsonschema", b"{}"))
+        for start in starts_s:
+            for tick in range(100):
+                at = round((start + 0.1 * tick) * 1e9)
+                writer.add_message(channel, at, b'{"a": 1}', at)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize(
+    "starts_s", [[0.0], [0.0, 1.7e9], [1.7e9, 5.0], [1.7e9, 1.7e9 - 3 * 86_400.0, 1.8e9]]
+)
+def test_time_goes_on_however_the_clock_of_the_recorder_is_set(starts_s: list[float], tmp_path: Path) -> None:
+    log = GrowingLog(write_parts(tmp_path / "run.mcap", starts_s))
+    log.update()
+    assert log.end_s == pytest.approx(10.0 * len(starts_s), abs=1.0)
+    tail = read_topics(log.make_index(3.0), [Wanted("/a")], sha256="-").of("/a")[0]
+    assert len(tail) == pytest.approx(30, abs=12)
+    assert tail.log_time.min() * 1e-9 > starts_s[-1] + 5.0
+
+
+def test_a_defect_of_a_look_is_one_line_and_the_watch_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = make_log(tmp_path / "run.mcap", 3.0)
+    monkeypatch.setattr(Watch, "_read_end", lambda _: [].index("what\nis not there"))
+    (look,) = Watch(log, Options(out=tmp_path / "out"), (), 1.0).follow()
+    assert str(look["problem"]).startswith("this look failed (ValueError: ")
+    assert "\n" not in str(look["problem"])
+    assert look["duration_s"] == pytest.approx(3.0, abs=0.1)
+
+
+@pytest.mark.parametrize("full", ["page", "results"])
+def test_a_full_disk_under_what_is_shown_is_one_line_and_the_watch_goes_on(
+    full: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, looks = make_log(tmp_path / "run.mcap", 3.0), []
+
+    def follow(_: Watch) -> Iterator[dict[str, object]]:
+        seen = Watch(log, Options(out=tmp_path / "out"), (), 1.0).to_json()
+        for number in range(3):
+            looks.append(number)
+            yield seen
+
+    def fill(*_: object, **given: object) -> None:
+        if given.get("is_live", not given.get("ended")):
+            raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Watch, "follow", follow)
+    place = "pipeline.cli.verbs_log._write_page" if full == "page" else "pipeline.job.watch.write_statement"
+    monkeypatch.setattr(place, fill)
+    told = run_verb("watch", log, "--page", tmp_path / "page.html", "--results", tmp_path / "out")
+    assert looks == [0, 1, 2]
+    assert told.stderr.count("No space left on device") == 1
+    assert "The watch goes on." in told.stderr
+
+
+@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_ends_a_watch_with_the_diagnosis_so_far(by: signal.Signals, tmp_path: Path) -> None:
+    log = make_log(tmp_path / "run.mcap", 6.0)
+    content = log.read_bytes()
+    log.write_bytes(content[: len(content) * 3 // 4])
+    command = [
+        sys.executable,
+        "-m",
+        "pipeline",
+        "watch",
+        str(log),
+        "--json",
+        "--for",
+        "300",
+        "--results",
+        "out",
+    ]
+    with subprocess.Popen(
+        command,
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, "PYTHONPATH": str(Path.cwd())},
+    ) as process:
+        assert process.stdout is not None
+        assert json.loads(process.stdout.readline())["kind"] == "look"
+        process.send_signal(by)
+        said, told = process.communicate(timeout=120)
+    assert "stopped watching; this is the diagnosis of the log so far" in told
+    final = json.loads(said.splitlines()[-1])
+    assert (final["kind"], final["stopped"]) == ("final", True)
+    assert process.returncode in {0, 1, 3}
 
 
 def test_a_file_that_was_taken_away_while_it_was_watched_is_told(tmp_path: Path) -> None:

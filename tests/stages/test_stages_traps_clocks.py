@@ -275,6 +275,9 @@ def test_trap_5_slip_is_that_of_a_log_with_one_clock(
     plain, taken = drive(unstamped), drive(replace(unstamped, clock=clock))
     assert noticed in taken.ids()
     assert noticed not in plain.ids()
+    if clock.real_time_factor not in (None, 1.0):
+        # The default screen shows warnings: on a robot, all speeds are wrong by this factor.
+        assert "simulated_time" in taken.warned()
     for name in ("command", "measured"):
         usual = float(np.median(plain.slip(name)["modulus"]))
         assert float(np.median(taken.slip(name)["modulus"])) == pytest.approx(usual, rel=0.02)
