@@ -343,13 +343,13 @@ def describe(paths: Sequence[Explored], judgement: Judgement | None, lead: str =
         without = selection.drop(final, [term.id for term in terms])
         share = 1.0 - selection.weights.loss(final.held) / selection.weights.loss(without.held)
         signal = without.fit.residual - final.fit.residual
-        found = _name_signal(body, signal, share)
+        described = _name_signal(body, signal, share)
         if judgement is not None and (suggested := _suggest(judgement, join_formula(terms))):
-            return replace(found, formula=suggested[0], reached=suggested[1])
+            return replace(described, formula=suggested[0], reached=suggested[1])
         # Without a formula it is one cause of several, and the share that of one channel.
-        channel = CHANNELS.index(found.channel)
+        channel = CHANNELS.index(described.channel)
         before, after = (float((one.held[:, channel] ** 2).mean()) for one in (without, final))
-        causes += _weigh(body, signal, replace(found, share=1.0 - after / before))
+        causes += _weigh(body, signal, replace(described, share=1.0 - after / before))
     for path in paths:
         known, lasting = _find_explainable(path), _find_lasting(path, lead)
         causes += known

@@ -331,13 +331,13 @@ class Editor:
         file: file of the session.
         prepared: the run.
         session: the session before the change.
-        found: what the diagnosis of the run found, with its values: where fits of these effects begin.
+        diagnosed: what the diagnosis of the run found, with its values: fits of these effects begin there.
     """
 
     file: SessionFile
     prepared: PreparedRun
     session: Session
-    found: Sequence[Effect] = ()
+    diagnosed: Sequence[Effect] = ()
 
     @property
     def model(self) -> Model:
@@ -350,7 +350,9 @@ class Editor:
         So a model has the errors that the diagnosis gives it, whatever was fitted or set before, and in
         whichever order its effects were added.
         """
-        return model.swap(*(one for one in self.found if one.id in model and not model.effect(one.id).fixed))
+        return model.swap(
+            *(one for one in self.diagnosed if one.id in model and not model.effect(one.id).fixed)
+        )
 
     def add_effect(self, effect: Effect | str, *, anyway: bool = False) -> Session:
         """Add an effect to the model and fit the whole model.
@@ -358,7 +360,7 @@ class Editor:
         Raises:
             WorkbenchError: ``no_help``, see `add_effects`.
         """
-        named = {one.id: one for one in self.found}
+        named = {one.id: one for one in self.diagnosed}
         made = (named.get(effect) or find_effect(effect)()) if isinstance(effect, str) else effect
         return self.add_effects([made], f"+ {made.id}", anyway=anyway)
 

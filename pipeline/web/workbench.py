@@ -183,7 +183,7 @@ def rank_offers(editor: Editor, diagnosis: Mapping[str, object] | None) -> list[
     prepared, step = editor.prepared, editor.session.step
     file = None if diagnosis is None else read_model_text(diagnosis)
     intervals = {} if file is None else file.intervals
-    missing = (one for one in editor.found if one.id not in step.order)
+    missing = (one for one in editor.diagnosed if one.id not in step.order)
     sound = Model(prepared.vehicle, tuple(one for one in missing if explain_refusal(one, intervals) is None))
     with prepared.lock:
         offered = prepared.problem.active_effects(sound)
@@ -319,7 +319,7 @@ class Sessions:
 
     def _is_named(self, editor: Editor, ask: Ask) -> bool:
         """Whether the diagnosis tested an effect together with all others."""
-        return ask.effect in {effect.id for effect in editor.found}
+        return ask.effect in {effect.id for effect in editor.diagnosed}
 
     def _add_named(self, editor: Editor, ask: Ask) -> Session:
         diagnosis = read_diagnosis(self.results, editor.prepared.manifest)
@@ -337,7 +337,7 @@ class Sessions:
         return editor.add_effects(missing, f"+ all {len(missing)} of the diagnosis", anyway=True)
 
     def _add_suggestion(self, editor: Editor, ask: Ask) -> Session:
-        formulas = [effect for effect in editor.found if isinstance(effect, FormulaEffect)]
+        formulas = [effect for effect in editor.diagnosed if isinstance(effect, FormulaEffect)]
         if not formulas:
             raise WorkbenchError(
                 "no_formula", "no formula was found on this run", where=ask.run, hint="Diagnose it first."
