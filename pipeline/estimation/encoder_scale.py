@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from pipeline.core import format_share
-from pipeline.estimation.diagnosis import Named, RunDiagnosis, Value
+from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.models.catalogue import find_effect
 from pipeline.models.parameter import TwinRole
 from pipeline.run import MotionRun
@@ -40,7 +40,7 @@ class EncoderScale:
             for run in runs
         ]
 
-    def report(self) -> Mapping[str, object]:
+    def report(self) -> Mapping[str, Json]:
         """The finding, with the line of run.toml that mends it."""
         way = "low" if self.value < 1.0 else "high"
         text = (
