@@ -395,9 +395,9 @@ class Comparison:
         """The context with states reset at every horizon to the values known at that time."""
         grid, nodes = self.grid, self.nodes
         origin = np.unique(self.horizons.origin)
-        at = nodes.times[origin]
+        known = nodes.times[origin]
         # Where the encoders were silent, the drive goes on as predicted.
-        known = at[~has_excluded(self._silences, at - SILENT_S, at + SILENT_S)]
+        known = known[~has_excluded(self._silences, known - SILENT_S, known + SILENT_S)]
         begin = grid.locate_edges(known).astype(np.int64)
         begin = np.minimum(begin, grid.times.size - 1)
         before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)

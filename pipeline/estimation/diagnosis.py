@@ -38,8 +38,8 @@ Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
 _TIGHT = 10.0
-"""Expected range between runs over the interval in this run above which a row has both: a limit that clips
-the samples of one run is known to a fraction of a percent there, and not in the next run."""
+"""Expected range between runs over the interval in this run above which a row says so: a limit that clips the
+samples of one run is known to a fraction of a percent there, and not in the next run."""
 _LEAST_UNITS = 3.55
 """Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
 moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
@@ -51,6 +51,7 @@ class Value:
     """A value with its 95 % interval, NaN where there is none, and whether it is at its bound.
 
     `another_run`: expected interval in another run on this ground. `one_sided`: `Parameter.is_one_sided`.
+    `is_spread_measured`: whether the spread between runs was measured, not only assumed.
     """
 
     value: float
@@ -60,6 +61,7 @@ class Value:
     at_bound: bool = False
     another_run: tuple[float, float] = (math.nan, math.nan)
     one_sided: bool = False
+    is_spread_measured: bool = False
 
     @property
     def is_undetermined(self) -> bool:
@@ -96,12 +98,15 @@ class Value:
         return f"{text} ({UNDETERMINED})" if self.is_undetermined else text
 
     def format_with_range(self) -> str:
-        """The value as text, and its range between runs where this run says little about another one."""
+        """The value as text; where its interval says little about another run, that it is this run's.
+
+        The range between runs stands beside it where it was measured how much runs differ.
+        """
         low, high = self.another_run
         if not high - low > _TIGHT * (self.high - self.low):
             return str(self)
         _, *ends = split_interval(self.value, low, high)
-        return f"{self} this run, [{', '.join(ends)}] another"
+        return f"{self} this run" + (f", [{', '.join(ends)}] another" if self.is_spread_measured else "")
 
     def move(self, change: float) -> Value:
         """The value and its intervals shifted by a known amount."""

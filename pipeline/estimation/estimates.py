@@ -56,7 +56,10 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         own = at_bound or is_of_one_run(effect.parameters)
         another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
         one_sided = parameter.is_one_sided(low, high)
-        values[parameter.name] = Value(value, low, high, parameter.unit, at_bound, another, one_sided)
+        values[parameter.name] = Value(
+            value, low, high, parameter.unit, at_bound, another, one_sided,
+            is_spread_measured=parameter.between_runs is not None,
+        )  # fmt: skip
     return values
 
 

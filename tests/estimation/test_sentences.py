@@ -124,6 +124,7 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
         "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
         "bound": Value(1.03, 0.91, 1.15, "m/s"),
         "scrub": Value(1.3312, 1.3300, 1.3324, "m/s", another_run=(0.42, 2.24)),
+        "creep": Value(0.3601, 0.3597, 0.3605, "s/m", another_run=(0.277, 0.443), is_spread_measured=True),
     }
     named = Named(
         "wheel_servo", numbers, 1.0, (), (), corrected=False, path="command", selected=1.0,
@@ -136,11 +137,12 @@ def test_of_a_servo_each_number_has_a_line_of_its_own() -> None:
     lines = list_lines(RunDiagnosis("run", "command", effects=(named,), ladder=ladder))
     texts = [text for _, text in lines]
     at = texts.index("Wheel servo: lag 0.68 s")
-    assert [text.strip() for text in texts[at + 1 : at + 5]] == [
+    assert [text.strip() for text in texts[at + 1 : at + 6]] == [
         "wheel_servo         60 -> 54 cm",
         "tau = 0.68 s [0.59, 0.78]",
         "bound = 1.03 m/s [0.91, 1.15]",
-        "scrub = 1.3312 m/s [1.3300, 1.3324] this run, [0.4, 2.2] another",
+        "scrub = 1.3312 m/s [1.3300, 1.3324] this run",
+        "creep = 0.3601 s/m [0.3597, 0.3605] this run, [0.28, 0.44] another",
     ]
     # A number at its bound is none: only --all says which.
     assert not any("reset" in text for _, text in choose_lines(lines, everything=False))
