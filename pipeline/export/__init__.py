@@ -141,7 +141,7 @@ def export_model(file: ModelFile, name: str, current: Current | None = None) -> 
     target = find_target(name)
     used = dict(current or {})
     check_geometry(file.model.vehicle, file.model.vehicle.id)
-    _check_numbers(file, used)
+    _check_numbers(file, {key: value for key, value in used.items() if key in target.corrects})
     return target.write(file, used)
 
 

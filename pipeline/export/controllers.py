@@ -7,6 +7,7 @@ import csv
 import io
 import math
 import operator
+import re
 from collections.abc import Collection
 
 import msgspec
@@ -427,20 +428,28 @@ def read_vesc(text: str) -> Current:
         MotionError: ``parameters_unreadable``.
     """
     try:
-        tree = yaml.safe_load(text)
-    except yaml.YAMLError as error:
+        # Scalars as texts: the constructors of other types fail in ways of their own.
+        tree = yaml.load(text, Loader=yaml.BaseLoader)  # noqa: S506 - the loader that makes texts only
+    except (yaml.YAMLError, RecursionError) as error:
         what = f"is not YAML: {' '.join(str(error).split())}"
         hint = "Give the vesc.yaml that the car was driven with."
         raise MotionError("parameters_unreadable", what, where="--current", hint=hint) from None
     numbers: dict[str, float] = {}
-    groups = [tree]
+    groups, seen = [tree], set[int]()
     while groups:
         group = groups.pop()
-        for name, value in group.items() if isinstance(group, dict) else ():
-            if isinstance(value, int | float) and not isinstance(value, bool):
-                numbers[str(name)] = float(value)
+        if not isinstance(group, dict) or id(group) in seen:
+            continue
+        # Aliases may repeat a group without end.
+        seen.add(id(group))
+        for name, value in group.items():
+            if isinstance(value, str) and _NUMBER.fullmatch(value):
+                numbers[str(name)] = float(value.replace(".inf", "inf").replace(".nan", "nan"))
             groups.append(value)
     return numbers
+
+
+_NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?|[-+]?\.inf|\.nan", re.ASCII)
 
 
 def _find_current(facts: Facts, current: Current, name: str) -> Amount:
