@@ -260,13 +260,12 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
     if len(ragged) < len(_NUMBERS):
         return []
     offsets = [parents.offsets, children.offsets, *(column.offsets for column in ragged)]
-    counts = np.array([np.diff(one) for one in offsets])
+    counts = np.diff(np.array(offsets), axis=1)
     # Messages of JSON may lack a field of one of their transforms.
     whole = (counts == counts[0]).all(axis=0)
-    parent_codes, child_codes = (
-        one.codes[np.repeat(whole, np.diff(one.offsets))] for one in (parents, children)
-    )
-    values = [column.values[np.repeat(whole, np.diff(column.offsets))] for column in ragged]
+    kept = [np.repeat(whole, count) for count in counts]
+    parent_codes, child_codes = parents.codes[kept[0]], children.codes[kept[1]]
+    values = [column.values[rows] for column, rows in zip(ragged, kept[2:], strict=True)]
     time, known = join_times(values[0], values[1])
     position = np.stack(values[2:5], axis=1).astype(np.float64)
     quaternion = np.stack(values[5:], axis=1).astype(np.float64)

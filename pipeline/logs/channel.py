@@ -328,8 +328,6 @@ class ObjectDecoder:
             lists = [values or [None] for values in lists]
         flat = [v if _name_kind(v) == kind else math.nan for values in lists for v in values]
         values = np.array(flat) if flat else np.empty(0)
-        if values.dtype == object:
-            values = np.asarray(flat, dtype=np.float64)
         if not several:
             return values
         return Ragged(values, np.r_[0, np.cumsum([len(values) for values in lists], dtype=np.int64)])

@@ -2,11 +2,11 @@
 
     python tests/fuzz/fuzz_live.py --minutes 60 [--seed 1] [--finds folder]
 
-Each case is a server on this machine, of the Foxglove WebSocket protocol or rosbridge, that sends the messages
-of a short drive with faults between them: clocks that step, values of another kind, payloads that are cut,
-changed schemas, frames outside the protocol, frames that declare lengths they do not have, connections that
-break. What the server sent as a message must be in the recording, a look at it must end without a defect,
-and so must its analysis. Finds are kept, and the run goes on.
+Each case is a server on this machine, of the Foxglove WebSocket protocol or rosbridge, that sends the
+messages of a short drive with faults between them: clocks that step, values of another kind, payloads that
+are cut, changed schemas, frames outside the protocol, frames that declare lengths they do not have,
+connections that break. What the server sent as a message must be in the recording, a look at it must end
+without a defect, and so must its analysis. Finds are kept, and the run goes on.
 """
 
 from __future__ import annotations
