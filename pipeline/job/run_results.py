@@ -102,8 +102,8 @@ def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
 def diagnose_work(work: Work) -> dict[str, JSON] | None:
     """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
-    Table `slip` is given the model that was judged, unless one was named with ``--model``; without a
-    diagnosis it has none.
+    Table `slip` is given the model that was judged, now or by an earlier ``slip diagnose``, unless one was
+    named with ``--model``; without a diagnosis it has none.
 
     Returns:
         The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None if it
@@ -126,7 +126,8 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
             work.computed.append(STAGE)
         if work.options.model is None:
             length = work.setup.configuration.slip.length_scale_m
-            show_model(generation, content or {}, work.vehicle, length)
+            judged = content or _read_kept(work.options.out, generation.run, key) or {}
+            show_model(generation, judged, work.vehicle, length)
     if content is None:
         return None
     work.keys = {**work.keys, STAGE: key}
@@ -496,14 +497,18 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
     diagnosis = read_diagnosis(manifest)
     if diagnosis is not None or not _is_of(results, manifest):
         return diagnosis
+    kept = _read_kept(results, manifest.run, _key_of(manifest))
+    return None if kept is None else {**kept, **read_choices(manifest)}
+
+
+def _read_kept(results: Path, run: str, key: str) -> dict[str, object] | None:
+    """What `keep_diagnosis` stored of a run under a key."""
     try:
-        path = locate_beside(results, "diagnoses", manifest.run, ".json")
+        path = locate_beside(results, "diagnoses", run, ".json")
         stored = msgspec.json.decode(read_bounded(path), type=_StoredDiagnosis)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
-    if stored.key != _key_of(manifest) or LINES not in stored.diagnosis:
-        return None
-    return {**stored.diagnosis, **read_choices(manifest)}
+    return stored.diagnosis if stored.key == key and LINES in stored.diagnosis else None
 
 
 def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:

@@ -102,7 +102,9 @@ class Alignment:
         outlier_s: duration of contradictions of localization and wheels, except bad stretches.
         gyro: fit of the gyro to the poses; None without a good one.
         heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
-        recorded_moduli: median slip speed with L = 1 m by input before the corrections [m/s].
+        recorded_moduli: median slip modulus with L = 1 m by input before the corrections [m/s].
+        body_multiplier: yaw rate of the commanded wheels at the nominal track over that of the body command;
+            None without a body command that the wheels obey.
     """
 
     hold_s: float | None = None
@@ -115,6 +117,7 @@ class Alignment:
     gyro: GyroFit | None = None
     heading_delay_s: float = 0.0
     recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
+    body_multiplier: float | None = None
 
 
 @dataclass(frozen=True)
@@ -353,7 +356,13 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
     row = {"command_turn_scale": row["command_scale"], **row}
     moduli = {name: row[f"recorded_modulus_{name}"] for name in _INPUTS}
     first = Alignment(*(row[name] for name in _ALIGNED))
-    return replace(first, gyro=gyro, heading_delay_s=row["heading_delay"] or 0.0, recorded_moduli=moduli)
+    return replace(
+        first,
+        gyro=gyro,
+        heading_delay_s=row["heading_delay"] or 0.0,
+        recorded_moduli=moduli,
+        body_multiplier=row.get("body_multiplier"),
+    )
 
 
 def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
@@ -364,6 +373,7 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     row = {
         **{name: getattr(alignment, one.name) for name, one in zip(_ALIGNED, firsts, strict=True)},
         **{f"recorded_modulus_{name}": alignment.recorded_moduli.get(name) for name in _INPUTS},
+        "body_multiplier": alignment.body_multiplier,
     }
     fit = alignment.gyro
     if fit is not None and np.isfinite(fit.delay_error_s):
@@ -499,8 +509,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
         first, last = known[hole] + 0.05, known[hole + 1] - ROUNDING_S
         near = np.concatenate(([first], streams[(streams > first) & (streams < last)], [last]))
         silent = np.flatnonzero(np.diff(near) > 2.0 * _FAR_S)
-        begins, stops = [first, *(near[silent + 1] - _FAR_S)], [*(near[silent] + _FAR_S), last]
-        for begin, end in zip(begins, stops, strict=True):
+        begins = np.append(first, near[silent + 1] - _FAR_S).tolist()
+        for begin, end in zip(begins, np.append(near[silent] + _FAR_S, last).tolist(), strict=True):
             place = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
             excluded.append(first + place * 0.05)
     return starts, np.unique(np.concatenate(excluded))
