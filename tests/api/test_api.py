@@ -13,6 +13,7 @@ import pytest
 
 import pipeline as slip
 from pipeline.cli import main
+from pipeline.job.work import COLUMNS
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
@@ -239,4 +240,6 @@ def test_a_list_of_logs_is_a_list_of_runs(run: slip.Run) -> None:
     log = str(run.summary["log"]["path"])  # type: ignore[index]
     (again,) = slip.analyze([log], results=find_results(run), report=False, diagnosis=False)
     assert again.name == run.name
-    assert again.slip.collect().equals(run.slip.collect())
+    # A diagnosis by the command line may have filled the columns of the model since.
+    ours, theirs = (one.slip.collect().drop(COLUMNS) for one in (again, run))
+    assert ours.equals(theirs)
