@@ -509,15 +509,8 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
         first, last = known[hole] + 0.05, known[hole + 1] - ROUNDING_S
         near = np.concatenate(([first], streams[(streams > first) & (streams < last)], [last]))
         silent = np.flatnonzero(np.diff(near) > 2.0 * _FAR_S)
-<<<<<<< ours
-        begins = np.append(first, near[silent + 1] - _FAR_S).tolist()
-        for begin, end in zip(begins, np.append(near[silent] + _FAR_S, last).tolist(), strict=True):
-            place = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
-            excluded.append(first + place * 0.05)
-=======
         begins, stops = [first, *(near[silent + 1] - _FAR_S)], [*(near[silent] + _FAR_S), last]
         for begin, end in zip(begins, stops, strict=True):
             steps = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
             excluded.append(first + steps * 0.05)
->>>>>>> theirs
     return starts, np.unique(np.concatenate(excluded))
