@@ -394,7 +394,7 @@ def watch(  # noqa: D417 - the shared choices document themselves
         arguments = shlex.split(spell_choices(_without_results(choices)))
         watched = Watch(path, options, arguments, quiet_for, live)
         is_screen = sys.stdout.isatty() and not json
-        stopped, told = False, ""
+        stopped, reported = False, ""
         try:
             with _stopping_on_termination():
                 for seen in watched.follow():
@@ -405,9 +405,9 @@ def watch(  # noqa: D417 - the shared choices document themselves
                         raise
                     except (SlipError, OSError) as error:
                         # A disk may be full or a folder gone: the recording is worth more than what is shown.
-                        if str(error) != told:
-                            told = str(error)
-                            print_note(f"slip: {told} The watch goes on.")
+                        if str(error) != reported:
+                            reported = str(error)
+                            print_note(f"slip: {reported} The watch goes on.")
         except KeyboardInterrupt:
             stopped = True
             print_note("slip: stopped watching; this is the diagnosis of the log so far")

@@ -358,8 +358,8 @@ def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
 
 def _find_half(stretch: Ints, square: Floats) -> tuple[float, tuple[tuple[float, float, float], ...]]:
     """The fewest stretches with half of a sum: their share of the time, and spans of adjacent ones."""
-    numbers, place = np.unique(stretch, return_inverse=True)
-    sums, counts = np.bincount(place, square) / square.sum(), np.bincount(place)
+    numbers, position = np.unique(stretch, return_inverse=True)
+    sums, counts = np.bincount(position, square) / square.sum(), np.bincount(position)
     order = np.argsort(-sums)
     half = order[: int(np.searchsorted(np.cumsum(sums[order]), 0.5)) + 1]
     chosen = np.sort(half)

@@ -263,9 +263,9 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
     counts = np.diff(np.array(offsets), axis=1)
     # Messages of JSON may lack a field of one of their transforms.
     whole = (counts == counts[0]).all(axis=0)
-    kept = [np.repeat(whole, count) for count in counts]
-    parent_codes, child_codes = parents.codes[kept[0]], children.codes[kept[1]]
-    values = [column.values[rows] for column, rows in zip(ragged, kept[2:], strict=True)]
+    rows_of = [np.repeat(whole, count) for count in counts]
+    parent_codes, child_codes = parents.codes[rows_of[0]], children.codes[rows_of[1]]
+    values = [column.values[rows] for column, rows in zip(ragged, rows_of[2:], strict=True)]
     time, known = join_times(values[0], values[1])
     position = np.stack(values[2:5], axis=1).astype(np.float64)
     quaternion = np.stack(values[5:], axis=1).astype(np.float64)

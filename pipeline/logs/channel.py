@@ -228,7 +228,7 @@ def _name_kind(value: Leaf | None) -> str:
 
 
 @dataclass(slots=True)
-class _Found:
+class _Read:
     """What one message has under one path: several values if it is a list, or in one."""
 
     several: bool = False
@@ -248,7 +248,7 @@ class ObjectDecoder:
         self._decode = decode
         self._fields = fields
         self._where = where
-        self._rows: dict[int, dict[str, _Found]] = {}
+        self._rows: dict[int, dict[str, _Read]] = {}
         self.rejected: list[Rejected] = []
         self.notes: tuple[str, ...] = ()
         self.shortened: dict[str, int] = {}
@@ -259,13 +259,13 @@ class ObjectDecoder:
         spans = zip(ids.tolist(), block.start.tolist(), block.size.tolist(), strict=True)
         for position, (row, start, size) in enumerate(spans):
             try:
-                leaves: dict[str, _Found] = {}
+                leaves: dict[str, _Read] = {}
                 for path, values, several in _walk(
                     self._decode(block.data[start : start + size].tobytes()), "", inside=False
                 ):
-                    found = leaves.setdefault(path, _Found())
-                    found.several |= several
-                    found.values += [None if value is None else self._bound(path, value) for value in values]
+                    read = leaves.setdefault(path, _Read())
+                    read.several |= several
+                    read.values += [None if value is None else self._bound(path, value) for value in values]
                 self._rows[row] = leaves
             except (ValueError, RecursionError):
                 wrong.append(position)
@@ -307,11 +307,11 @@ class ObjectDecoder:
             )
         return {path: self._column(path, messages) for path in leaves if path in chosen}
 
-    def _column(self, path: str, messages: list[dict[str, _Found]]) -> Column:
+    def _column(self, path: str, messages: list[dict[str, _Read]]) -> Column:
         """Values of one path. What is of another kind than in most messages is missing, as null is."""
-        found = [message.get(path) for message in messages]
-        several = 2 * sum(one.several for one in found if one) > sum(one is not None for one in found)
-        lists = [one.values if one and one.several == several else [] for one in found]
+        read = [message.get(path) for message in messages]
+        several = 2 * sum(one.several for one in read if one) > sum(one is not None for one in read)
+        lists = [one.values if one and one.several == several else [] for one in read]
         kinds = Counter(map(_name_kind, itertools.chain.from_iterable(lists)))
         del kinds[""]
         # Of equally many a number: all that is used of a message are numbers, but for names.

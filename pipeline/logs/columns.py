@@ -135,7 +135,7 @@ def join_times(seconds: NDArray[np.generic], nanoseconds: NDArray[np.generic]) -
     return whole * 1_000_000_000 + rest, known
 
 
-def place_stamps(stamp: Ints, known: Flags, log_time: Ints) -> Ints | None:
+def complete_stamps(stamp: Ints, known: Flags, log_time: Ints) -> Ints | None:
     """Stamps [ns], with those that are no time placed by their log times; None if these are most.
 
     Args:

@@ -492,23 +492,23 @@ class GrowingLog:
         Args:
             seconds: approximate length of the part at the end to index [s]; None for all.
         """
-        kept: set[int] | None = None
+        chosen: set[int] | None = None
         if seconds is not None:
             spans = self._list_spans()
             ends = list(itertools.accumulate(_measure_lengths(spans)))
             since = ends[-1] - seconds * 1e9 if ends else 0.0
-            kept = {id(span) for span, end in zip(spans, ends, strict=True) if end >= since}
+            chosen = {id(span) for span, end in zip(spans, ends, strict=True) if end >= since}
         parts = [
-            Part(file.path, file.size, _cut(file.catalog, kept), None)
+            Part(file.path, file.size, _cut(file.catalog, chosen), None)
             for file in self._files.values()
             if file.catalog.spans or len(self._files) == 1
         ]
         return merge_parts(self.path, parts, (), 0)
 
 
-def _cut(catalog: Catalog, kept: set[int] | None) -> Catalog:
+def _cut(catalog: Catalog, chosen: set[int] | None) -> Catalog:
     """Catalog without the other chunks with known times; it shares its dictionaries with the original."""
-    spans = [one for one in catalog.spans if kept is None or one.end_ns is None or id(one) in kept]
+    spans = [one for one in catalog.spans if chosen is None or one.end_ns is None or id(one) in chosen]
     return replace(catalog, spans=spans)
 
 

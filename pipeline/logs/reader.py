@@ -24,12 +24,12 @@ from pipeline.logs.columns import (
     Ragged,
     RaggedStrings,
     Strings,
+    complete_stamps,
     derive_columns,
     digest_messages,
     find_repeated,
     gather_payloads,
     join_times,
-    place_stamps,
     share_times,
 )
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
@@ -403,7 +403,7 @@ def _header_time(leaves: Mapping[str, Column], log_time: Ints) -> Ints | None:
         seconds, nanoseconds = leaves.get(f"{prefix}sec"), leaves.get(f"{prefix}nanosec")
         if not isinstance(seconds, np.ndarray) or not isinstance(nanoseconds, np.ndarray):
             continue
-        stamp = place_stamps(*join_times(seconds, nanoseconds), log_time)
+        stamp = complete_stamps(*join_times(seconds, nanoseconds), log_time)
         if stamp is not None:
             return stamp
     return None

@@ -377,8 +377,8 @@ class Scene:
         if slip is None or domain is None or domain[1] - domain[0] < 1.5 * _WORST_S:
             return None
         squared = np.minimum(slip["modulus"].to_numpy(), self.modulus_cap) ** 2
-        seconds, place = np.unique(np.floor(slip["t"].to_numpy() - domain[0]), return_inverse=True)
-        summed = np.append(0.0, np.cumsum(np.bincount(place, squared)))
+        seconds, position = np.unique(np.floor(slip["t"].to_numpy() - domain[0]), return_inverse=True)
+        summed = np.append(0.0, np.cumsum(np.bincount(position, squared)))
         # The worst span ends or begins with a second that has slip, however long there was none.
         starts = np.unique(np.concatenate((seconds, np.maximum(seconds + 1.0 - _WORST_S, 0.0))))
         ends = np.searchsorted(seconds, starts + _WORST_S)

@@ -501,6 +501,6 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
         silent = np.flatnonzero(np.diff(near) > 2.0 * _FAR_S)
         begins, stops = [first, *(near[silent + 1] - _FAR_S)], [*(near[silent] + _FAR_S), last]
         for begin, end in zip(begins, stops, strict=True):
-            place = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
-            excluded.append(first + place * 0.05)
+            steps = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
+            excluded.append(first + steps * 0.05)
     return starts, np.unique(np.concatenate(excluded))

@@ -383,8 +383,8 @@ def fit_controller(
     asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
     begin, end = max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S
     # Spans in which the wheels were read, however long they were silent in between.
-    place = np.floor((clock - begin) / WINDOW_S)[:, None] - np.arange(np.ceil(ANSWERS_S / WINDOW_S) + 1.0)
-    starts = begin + np.unique(place[place >= 0.0]) * WINDOW_S
+    number = np.floor((clock - begin) / WINDOW_S)[:, None] - np.arange(np.ceil(ANSWERS_S / WINDOW_S) + 1.0)
+    starts = begin + np.unique(number[number >= 0.0]) * WINDOW_S
     starts = starts[starts < end]
     spans = np.stack((starts, starts + ANSWERS_S))
     held = np.minimum(np.diff(asked), arrays.usual_hold(asked))

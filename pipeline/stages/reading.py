@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core import rigid
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
-from pipeline.logs.columns import join_times, place_stamps
+from pipeline.logs.columns import complete_stamps, join_times
 from pipeline.logs.index import LONGEST_NAME
 from pipeline.run.signals import STILL_MPS
 from pipeline.sources import (
@@ -335,7 +335,7 @@ def with_stamps(columns: TopicColumns) -> TopicColumns:
         times = np.asarray(np.where(known, ticks, 0.0) * stamp.tick_ns, dtype=np.int64)
     else:
         times, known = join_times(*(numbers(columns, f"{stamp.field}.{part}") for part in ("sec", "nanosec")))
-    return replace(columns, header_time=place_stamps(times, known, columns.log_time))
+    return replace(columns, header_time=complete_stamps(times, known, columns.log_time))
 
 
 @dataclass(frozen=True)

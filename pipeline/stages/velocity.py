@@ -68,8 +68,8 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     away = np.maximum(np.abs(times - before), np.abs(after - times))
     known = away <= arrays.SILENT_S + arrays.ROUNDING_S
     # Of the uniform grid only the points beside the given times, however long the gyro was silent.
-    place = np.clip(np.floor((times[known] - first) * rate_hz).astype(np.int64), 0, count - 2)
-    grid = first + np.unique(np.concatenate((place, place + 1))) / rate_hz
+    cell = np.clip(np.floor((times[known] - first) * rate_hz).astype(np.int64), 0, count - 2)
+    grid = first + np.unique(np.concatenate((cell, cell + 1))) / rate_hz
     angle = arrays.integrate_rate(stamps, rate)[:, None]
     smooth = arrays.differentiate_locally(grid, stamps, angle, window)[:, 0]
     corrected = np.full(times.size, np.nan)
