@@ -257,8 +257,7 @@ def inspect_log(path: Path, options: Options) -> Inspection:
         for channel in index.channels
     )
     choice, problem = _choose(index, configuration, options)
-    every = np.concatenate([log_time for log_time, _ in times.values()] or [np.zeros(0, dtype=np.int64)])
-    pauses = find_pauses(every)
+    pauses = find_pauses(log_time for log_time, _ in times.values())
     notes = (
         *data.notes,
         *([describe_pauses(pauses)] if pauses else []),

@@ -7,7 +7,7 @@ recorder's own clock jumps over hours, all topics are silent at once, and the ti
 """
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import cast
 
@@ -121,7 +121,7 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     Returns:
         The clocks by the same keys, and findings.
     """
-    pauses = find_pauses(np.concatenate([times.log_time for times in recorded.values()]))
+    pauses = find_pauses(times.log_time for times in recorded.values())
     recorded, simulated = _follow_simulated_time(_close_pauses(recorded, pauses))
     recorded, drifts = _take_off_drift(recorded)
     recorded, bunches = _spread_bunches(recorded)
@@ -139,13 +139,13 @@ def align_clocks(recorded: Mapping[str, Recorded]) -> tuple[dict[str, TopicClock
     return single, findings + joined + repeated
 
 
-def find_pauses(log_time: Stamps) -> list[tuple[int, int]]:
+def find_pauses(log_times: Iterable[Stamps]) -> list[tuple[int, int]]:
     """Silences longer than a drive's: last log time before and first one after each [ns].
 
     Args:
-        log_time: of all topics together [ns], in any order.
+        log_times: of every topic [ns], in any order; none of no topic.
     """
-    log = np.unique(log_time)
+    log = np.unique(np.concatenate([np.empty(0, dtype=np.int64), *log_times]))
     last = np.flatnonzero(np.diff(log) > PAUSE_NS)
     return list(zip(log[last].tolist(), log[last + 1].tolist(), strict=True))
 

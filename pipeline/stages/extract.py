@@ -161,7 +161,7 @@ class _Extraction:
             recorded[topic] = Recorded(topic, times.log_time, times.log_time, times.time, asked.get(topic))
         clocks, findings = align_clocks(recorded)
         self.findings += findings
-        pauses = find_pauses(np.concatenate([times.log_time for times in recorded.values()]))
+        pauses = find_pauses(times.log_time for times in recorded.values())
         self.paused_s = sum(after - last for last, after in pauses) / 1e9
         return clocks
 

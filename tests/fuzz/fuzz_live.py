@@ -254,7 +254,8 @@ class Player:
 
 def run_case(messages: list[Played], seed: int, folder: Path) -> Case:
     """Play one server, record it, look at it, and analyze what was recorded."""
-    begin, case = time.monotonic(), record_case(messages, seed, folder)
+    begin, before_mb = time.monotonic(), measure_peak_mb()
+    case = record_case(messages, seed, folder)
     if case.find is not None:
         return case
     try:
@@ -266,9 +267,14 @@ def run_case(messages: list[Played], seed: int, folder: Path) -> Case:
         case.find = Find(f"{count} files were written")
     if time.monotonic() - begin > LONGEST_S:
         case.find = Find(f"it took {time.monotonic() - begin:.0f} s")
-    if resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024 > MOST_MB:
+    if measure_peak_mb() - before_mb > MOST_MB:
         case.find = Find("it took more memory than it may")
     return case
+
+
+def measure_peak_mb() -> float:
+    """Most memory of this process so far: what a case adds to it is the case's own."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def record_case(messages: list[Played], seed: int, folder: Path) -> Case:
