@@ -41,7 +41,7 @@ class Watch:
 
     def plan(self, todo: int, settled: int, size: int) -> None: ...
 
-    def tell(self, line: object, size: int) -> None: ...
+    def notify(self, line: object, size: int) -> None: ...
 
 
 class Table:
@@ -75,7 +75,7 @@ class Table:
 class Remembering:
     """The files of results, of which those that have not changed are hashed once."""
 
-    def __init__(self, files: room.Files) -> None:
+    def __init__(self, files: room.DiskFiles | Mirror) -> None:
         self._files = files
         self._names = files.names(do_nothing)
         self._contents: dict[str, bytes | None] = {}
@@ -201,7 +201,7 @@ class Exchange:
             self._files.change(name, content)
 
 
-def list_contents(files: room.Files) -> list[str]:
+def list_contents(files: room.DiskFiles | Mirror) -> list[str]:
     """Files that hold something: no locks, and nothing that another program keeps there."""
     return sorted(
         name for name in files.names(do_nothing) if not name.endswith(".lock") and "/claims/" not in name
@@ -215,7 +215,7 @@ def run(every: int, *, in_bucket: bool) -> int:
         address = ADDRESS if in_bucket else None
         out = make_results(folder, address)
         store = Store(out)
-        source: room.Files = room.DiskFiles(out) if address is None else Mirror(address, out)
+        source: room.DiskFiles | Mirror = room.DiskFiles(out) if address is None else Mirror(address, out)
         files = Remembering(source)
         current = {manifest.folder.relative_to(out).as_posix() for manifest in store.manifests()}
         found = room.examine_files(files)
