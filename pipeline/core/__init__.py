@@ -136,27 +136,32 @@ def format_digits(value: float, digits: int = 2) -> str:
     return text.rstrip("0").rstrip(".") if places else text
 
 
-_PRECISE = 3.55
-"""Half of an interval in units of the last digit below which one more digit is shown, as of the Particle Data
-Group: with twice as many a digit is chance."""
+_LEAST_UNITS = 3.55
+"""Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
+moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
+lost."""
 _UNEVEN = 0.1
 """Least half of an interval over the other half for the digits to follow it: one may be cut at a bound."""
+
+
+def count_places(half: float) -> int:
+    """Places behind the point that the half of an interval supports, negative for tens and hundreds."""
+    return -math.floor(math.log10(half / _LEAST_UNITS))
 
 
 def split_interval(value: float, low: float, high: float) -> tuple[str, str, str]:
     """A value and the ends of its interval with the digits that the interval supports.
 
     The last digit is that of the narrower half, so that both ends differ from the value as printed; a value
-    has two digits at least.
+    has one digit at least.
     """
     halves = value - low, high - value
     half = max(min(halves), _UNEVEN * max(halves))
     if not 0.0 < half < math.inf:
         return f"{value:.3g}", f"{low:.3g}", f"{high:.3g}"
-    leading = math.floor(math.log10(half))
-    places = -leading + (half < _PRECISE * 10.0**leading)
+    places = count_places(half)
     if value:
-        places = max(places, 1 - math.floor(math.log10(abs(value))))
+        places = max(places, -math.floor(math.log10(abs(value))))
     value_text, low_text, high_text = (
         f"{round(one, places):z.{max(places, 0)}f}" for one in (value, low, high)
     )

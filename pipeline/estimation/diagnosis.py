@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from pipeline.core import (
     JSON_DIGITS,
+    count_places,
     finite_or_none,
     format_interval,
     pick_finite,
@@ -40,10 +41,6 @@ CAUSE = ". Cause: "
 _TIGHT = 10.0
 """Expected range between runs over the interval in this run above which a row says so: a limit that clips the
 samples of one run is known to a fraction of a percent there, and not in the next run."""
-_LEAST_UNITS = 3.55
-"""Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
-moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
-lost."""
 
 
 @dataclass(frozen=True)
@@ -78,8 +75,8 @@ class Value:
         """Significant digits that its interval supports, at least one; as in JSON where it has none."""
         if not self.value or not 0.0 < self.half < math.inf:
             return JSON_DIGITS
-        last = math.floor(math.log10(self.half / _LEAST_UNITS))
-        return min(max(math.floor(math.log10(abs(self.value))) - last + 1, 1), JSON_DIGITS)
+        places = count_places(self.half)
+        return min(max(math.floor(math.log10(abs(self.value))) + places + 1, 1), JSON_DIGITS)
 
     @property
     def suffix(self) -> str:
