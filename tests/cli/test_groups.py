@@ -61,7 +61,8 @@ def list_options(app: App) -> set[str]:
 def test_a_command_that_moved_names_its_new_place(old: str, tmp_path: Path) -> None:
     done = run_verb(old, "--json", cwd=tmp_path)
 
-    assert (done.returncode, done.stdout) == (2, "")
+    assert done.returncode == 2
+    assert json.loads(done.stdout)["errors"][0]["message"] == f"slip {old} is now: slip {MOVED[old]}"
     assert done.stderr == f"slip: slip {old} is now: slip {MOVED[old]}\n"
     assert MOVED[old] in dict(list_apps(build_app()))
     assert list(tmp_path.iterdir()) == []

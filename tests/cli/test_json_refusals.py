@@ -58,7 +58,6 @@ REFUSED: dict[str, list[tuple[str, ...]]] = {
     "results explain": [("missing", "modulus", "--results", "missing")],
     "results query": [("SELECT", "--results", "missing")],
     "results stage": [("extract", BROKEN), ("slip", "missing")],
-    "results seal": [("missing",)],
 }
 """Arguments that each verb with --json refuses."""
 NEVER_REFUSES = {"doctor", "model trusted", "model untrust"}

@@ -119,8 +119,6 @@ def test_table_of_the_whole_results_is_replaced(store: Store) -> None:
     assert {path.name for path in store.root.iterdir()} == {
         "windows.parquet",
         ".lock",
-        "listed",
-        "listed.json",
     }
 
 
@@ -141,8 +139,6 @@ def test_text_of_the_whole_results_is_replaced(store: Store, monkeypatch: pytest
     assert {path.name for path in store.root.iterdir()} == {
         "comparison.html",
         ".lock",
-        "listed",
-        "listed.json",
     }
     with pytest.raises(StoreError):
         store.write_results_text("../comparison.html", "")
@@ -152,4 +148,4 @@ def test_leftovers_of_killed_writers_are_removed(store: Store, tmp_path: Path) -
     (tmp_path / "results").mkdir()
     (tmp_path / "results" / ".tmp-1-dead").write_bytes(b"half")
     store.write_results_text("map.html", "map")
-    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock", "listed", "listed.json"}
+    assert {path.name for path in store.root.iterdir()} == {"map.html", ".lock"}
