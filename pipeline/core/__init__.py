@@ -159,12 +159,9 @@ def split_interval(value: float, low: float, high: float) -> tuple[str, str, str
     half = max(min(halves), _UNEVEN * max(halves))
     if not 0.0 < half < math.inf:
         return f"{value:.3g}", f"{low:.3g}", f"{high:.3g}"
-    places = count_places(half)
-    if value:
-        places = max(places, -math.floor(math.log10(abs(value))))
-    value_text, low_text, high_text = (
-        f"{round(one, places):z.{max(places, 0)}f}" for one in (value, low, high)
-    )
+    # Whole numbers at the coarsest: in tens, an end near zero would be zero.
+    places = max(count_places(half), 0, -math.floor(math.log10(abs(value))) if value else 0)
+    value_text, low_text, high_text = (f"{one:z.{places}f}" for one in (value, low, high))
     return value_text, low_text, high_text
 
 

@@ -72,7 +72,7 @@ def test_a_sentence_has_the_digits_that_the_interval_supports() -> None:
         restore_known("clock_offset", {"d": one}).describe_clause(find_vehicle()) for one in (wide, narrow)
     ]
     assert said == ["the poses are stamped 420 ms late", "the poses are stamped 421 ms late"]
-    assert [str(one) for one in (wide, narrow)] == ["0.42 s [0.16, 0.68]", "0.4212 s [0.4195, 0.4231]"]
+    assert [str(one) for one in (wide, narrow)] == ["0.42 s [0.16, 0.68]", "0.4213 s [0.4195, 0.4231]"]
     # Without an interval nothing is known of the digits, and one remains however wide it is.
     assert str(Value(0.4213, math.nan, math.nan, "s")).startswith("0.421 s")
     assert str(Value(-0.4213, -5.0, 5.0, "1")) == "-0.4 [-5.0, 5.0]"

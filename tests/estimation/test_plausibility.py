@@ -95,7 +95,7 @@ def test_what_no_vehicle_does_is_said() -> None:
 
 def test_a_number_that_the_runs_leave_open_says_so_on_screen_and_in_json() -> None:
     known, left_open = Value(2.1, 1.9, 2.3, "s"), Value(2.1, math.nan, math.nan, "s")
-    assert str(known) == "2.1 s [1.9, 2.3]"
+    assert str(known) == "2.10 s [1.90, 2.30]"
     assert str(left_open) == "2.1 s (undetermined)"
     assert [one.to_json()["undetermined"] for one in (known, left_open)] == [False, True]
     assert Value(3.0, 2.0, 3.0, "s", at_bound=True).to_json()["undetermined"] is True

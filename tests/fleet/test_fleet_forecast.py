@@ -110,7 +110,7 @@ def test_a_limit_that_no_run_reaches_is_said_to_be_none() -> None:
     unknown["value"] = number["value"] = 18.0
     assert _format_expected(unknown, limit) == "18 rad/s^2 (no interval: fewer than three runs)"
     assert _format_expected(number, limit) == (
-        "18 rad/s^2 [4.23, 500] (the interval ends at a limit of the search)"
+        "18 rad/s^2 [4, 500] (the interval ends at a limit of the search)"
     )
 
 

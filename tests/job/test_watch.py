@@ -366,7 +366,7 @@ def test_it_asks_until_it_knows_enough() -> None:
         "knowledge": {"until_s": 80.0, **done}, "diagnosing": False, "cpu_share": 0.2,
     }  # fmt: skip
     text = "\n".join(format_watch(seen))
-    assert "effective_track: k 1.8 [1.78, 1.82] (known to 1.1 %)" in text
+    assert "effective_track: k 1.800 [1.780, 1.820] (known to 1.1 %)" in text
     assert "no more driving is needed" in text
     assert "drive on a slope" not in text
 
