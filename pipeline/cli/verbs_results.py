@@ -337,8 +337,8 @@ def _format_check(verification: Verification) -> list[str]:
         lines.append("These addresses are known from the results alone; --follow-remote reads them.")
     lines += [f"{each.action:<8} {each.subject}: {each.what}" for each in verification.repairs]
     if unchecked:
-        more = f" and {len(unchecked) - _NAMED} more" if len(unchecked) > _NAMED else ""
-        lines.append(f"no checksum covers {', '.join(unchecked[:_NAMED])}{more}")
+        others = f" and {len(unchecked) - _NAMED} more" if len(unchecked) > _NAMED else ""
+        lines.append(f"no checksum covers {', '.join(unchecked[:_NAMED])}{others}")
     if verification.is_clean:
         lines.append(f"{read} are unchanged")
     else:

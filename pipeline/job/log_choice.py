@@ -360,10 +360,10 @@ def _leave_out_silent(
     silent = list(dict.fromkeys(one.signals[0].topic for one in texts))
     silent = [topic for topic in silent if topic not in readable]
     named = ", ".join(silent[:_NAMED]) + (f" and {len(silent) - _NAMED} more" if silent[_NAMED:] else "")
-    left_out = "the topic was" if len(silent) == 1 else "the topics were"
-    text = f"no message of {named} is a readable command: {left_out} left out"
-    left = set(silent)
-    channels = [channel for channel in channels if channel.topic not in left]
+    subject = "the topic was" if len(silent) == 1 else "the topics were"
+    text = f"no message of {named} is a readable command: {subject} left out"
+    unread = set(silent)
+    channels = [channel for channel in channels if channel.topic not in unread]
     sources = choose_sources(channels, configuration, vehicle, where=str(index.path))
     return channels, sources, [Finding("no_readable_text", "warning", text, where=silent[0])]
 

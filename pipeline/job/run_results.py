@@ -126,7 +126,7 @@ def diagnose_work(work: Work) -> dict[str, JSON] | None:
             work.computed.append(STAGE)
         if work.options.model is None:
             length = work.setup.configuration.slip.length_scale_m
-            judged = content or _read_kept(work.options.out, generation.run, key) or {}
+            judged = content or _read_stored(work.options.out, generation.run, key) or {}
             show_model(generation, judged, work.vehicle, length)
     if content is None:
         return None
@@ -497,11 +497,11 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
     diagnosis = read_diagnosis(manifest)
     if diagnosis is not None or not _is_of(results, manifest):
         return diagnosis
-    kept = _read_kept(results, manifest.run, _key_of(manifest))
-    return None if kept is None else {**kept, **read_choices(manifest)}
+    earlier = _read_stored(results, manifest.run, _key_of(manifest))
+    return None if earlier is None else {**earlier, **read_choices(manifest)}
 
 
-def _read_kept(results: Path, run: str, key: str) -> dict[str, object] | None:
+def _read_stored(results: Path, run: str, key: str) -> dict[str, object] | None:
     """What `keep_diagnosis` stored of a run under a key."""
     try:
         path = locate_beside(results, "diagnoses", run, ".json")

@@ -194,7 +194,7 @@ def _list_fields(axes: list[str]) -> str:
     return " and ".join({"ahead": "linear.x", "turning": "angular.z"}[axis] for axis in axes)
 
 
-def _say_turned(name: str, axes: list[str], *, body: bool) -> str:
+def _format_remedy(name: str, axes: list[str], *, body: bool) -> str:
     """What mends a command or wheels whose sign is wrong along these axes."""
     if name == "command" and body:
         return f"turn the sign of {_list_fields(axes)} in what sends it"
@@ -210,7 +210,7 @@ def _report_either(name: str, axes: list[str], value: float, *, body: bool) -> F
     pose = "base_link is mirrored: correct the localization's frame"
     if len(axes) == 1:
         pose = _MIRRORED if axes == ["turning"] else _REVERSED
-    what = f"have the wrong sign: {_say_turned(name, axes, body=body)}"
+    what = f"have the wrong sign: {_format_remedy(name, axes, body=body)}"
     if name == "command" and body:
         what = f"have the wrong sign of {_list_fields(axes)} where they are sent"
     text = (
@@ -232,7 +232,7 @@ def _report_sign(name: str, axes: list[str], value: float, *, agree: str, body: 
             what, mend = "move backward", _REVERSED
         text = f"{agree} agree, and the poses {what} ({turned}): {mend}"
         return Finding("pose_mirrored", "error", text, where="pose", value=value)
-    they, mend = _WORDS[name], _say_turned(name, axes, body=body)
+    they, mend = _WORDS[name], _format_remedy(name, axes, body=body)
     if axes == ["turning"]:
         text = (
             f"left and right are exchanged: {they} turn left where the vehicle turns right ({turned}; {mend})"

@@ -129,7 +129,7 @@ class _Examiner:
     def examine(self) -> Examination:
         problems = list(self._unread)
         # A run has a link to its results only when it had a manifest.
-        for home in sorted(self._find_homes(MANIFEST) | self._find_homes(LATEST)):
+        for home in sorted(self._find_folders(MANIFEST) | self._find_folders(LATEST)):
             problems += [replace(problem, home=home) for problem in self._examine_run(home)]
         problems += self._examine_notes()
         of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
@@ -139,10 +139,10 @@ class _Examiner:
             files=self._tally,
         )
 
-    def _find_homes(self, name: str) -> set[str]:
+    def _find_folders(self, name: str) -> set[str]:
         """Folders of runs that hold a name."""
-        homes = {path.removesuffix(f"/{name}") for path in self._names if path.endswith(f"/{name}")}
-        depths = {home: home.count("/") for home in homes if home.startswith(f"{RUNS}/")}
+        folders = {path.removesuffix(f"/{name}") for path in self._names if path.endswith(f"/{name}")}
+        depths = {home: home.count("/") for home in folders if home.startswith(f"{RUNS}/")}
         return {home for home, depth in depths.items() if depth in _RUN_DEPTHS} - self._folders
 
     def _leave_out(self, locate: Path, why: str) -> None:
