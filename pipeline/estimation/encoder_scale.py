@@ -44,7 +44,8 @@ class EncoderScale:
         """The finding, with the line of run.toml that mends it."""
         direction = "low" if self.value < 1.0 else "high"
         text = (
-            f"the encoders read {format_share(abs(self.value - 1.0))} {direction}: the body moves as commanded, "
+            f"the encoders read {format_share(abs(self.value - 1.0))} {direction}: the body moves as "
+            "commanded, "
             f"while the wheels seem to turn {self.gain:.3g} times as fast as commanded and the body to move "
             f"{self.radius:.3g} times as far as they turn. The readings were corrected for the effects; "
             f"scale = {1.0 / self.value:.4g} under [wheels] in run.toml corrects the tables too. If instead "
