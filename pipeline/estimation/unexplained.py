@@ -76,6 +76,11 @@ class Explainable:
     predicted: Floats
 
 
+_RESERVE = 8640
+"""Shapes for which a formula pays beyond the terms that are tried: for these alone it displaces effects of the
+catalogue that are right (a lateral skid, drawn sets, seed 44)."""
+
+
 def search_formula(selection: Selection, final: CandidateModel) -> CandidateModel:
     """Try formulas where the catalogue has nothing, or where it only imitates one.
 
@@ -89,7 +94,7 @@ def search_formula(selection: Selection, final: CandidateModel) -> CandidateMode
     sideways = selection.part.find_ideal().shape[2] > len(("x", "w"))
     terms = list_terms(sideways=sideways)
     # A formula is the best one of all shapes that were looked at; effects stand for known physics.
-    shapes = dict.fromkeys((term.id for term in terms), len(terms))
+    shapes = dict.fromkeys((term.id for term in terms), len(terms) + _RESERVE)
     wide = replace(selection, candidates=terms, shapes=shapes, rivals={})
     current = final
     for _ in range(_MOST_TERMS):
