@@ -77,8 +77,8 @@ class Explainable:
 
 
 _RESERVE = 8640
-"""Shapes for which a formula pays beyond the terms that are tried: for these alone it displaces effects of the
-catalogue that are right (a lateral skid, drawn sets, seed 44)."""
+"""Shapes for which a formula pays beyond the terms that are tried: for these alone it displaces effects of
+the catalogue that are right (a lateral skid, drawn sets, seed 44)."""
 
 
 def search_formula(selection: Selection, final: CandidateModel) -> CandidateModel:

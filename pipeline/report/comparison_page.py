@@ -150,7 +150,7 @@ def _names(labels: Mapping[str, str]) -> Channel:
 
 def _axis(field: str, title: str, *, end: float | None = None) -> Channel:
     scale = {"zero": True, "nice": True} if end is None else {"domain": [0.0, end], "nice": True}
-    return make_axis(field, title, scale=scale, tickCount=7)
+    return make_axis(field, title, scale=scale, tickCount=5)
 
 
 def _frame(chart: Chart, rows: int) -> Chart:
