@@ -12,13 +12,10 @@ the run with a traceback. A case that fails is kept in the folder of finds.
 
 from __future__ import annotations
 
-import argparse
 import csv
-import faulthandler
 import json
 import math
 import random
-import resource
 import sys
 import tempfile
 import time
@@ -32,6 +29,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)]
 
 from exported_texts import HOSTILE, READERS  # noqa: E402 - the repository is put on the path first
 from fuzz_texts import FORMULAS, mutate, require_one_line  # noqa: E402
+from fuzzing import keep_failure, run_script  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 
@@ -253,8 +251,8 @@ def run(seconds: float, seed: int, finds: Path | None, most: float = math.inf) -
             text = mutate([text], rng) if rng.random() < 0.3 else text
             own = {key: mutate([one], rng) for key, one in OWN_FILES.items()}
             frame = draw_name(rng)
-            faulthandler.dump_traceback_later(HANG_S, exit=True)
-            try:
+            case = json.dumps({"model": text, "own": own, "frame": frame}).encode()
+            with keep_failure(finds, f"export_{seed}_{counts.total()}.json", case, hang_s=HANG_S):
                 file = open_case(text)
                 counts["read" if file else "refused"] += 1
                 if file is not None:
@@ -262,33 +260,16 @@ def run(seconds: float, seed: int, finds: Path | None, most: float = math.inf) -
                     if counts["read"] % VIEWERS_EVERY == 1:
                         model = file.model if rng.random() < 0.5 else None
                         check_viewers(model, manifest, frame, folder, counts)
-            except BaseException:
-                if finds is not None:
-                    finds.mkdir(parents=True, exist_ok=True)
-                    kept = json.dumps({"model": text, "own": own, "frame": frame})
-                    (finds / f"export_{seed}_{counts.total()}.json").write_text(kept, encoding="utf-8")
-                raise
-            finally:
-                faulthandler.cancel_dump_traceback_later()
     return counts
 
 
-def main() -> int:
-    """Run as a script."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--finds", type=Path, default=Path("fuzz_finds"))
-    given = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    counts = run(given.minutes * 60.0, given.seed, given.finds)
+def count_cases(seconds: float, seed: int, finds: Path) -> int:
+    """Try cases, and print what was written and what was refused; the number of cases."""
+    counts = run(seconds, seed, finds)
     for name, count in sorted(counts.items()):
         sys.stdout.write(f"{count:8d}  {name}\n")
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    cases = counts["read"] + counts["refused"]
-    sys.stdout.write(f"{cases} cases in {given.minutes:g} minutes, no find, peak {peak_mb:.0f} MB\n")
-    return 0
+    return counts["read"] + counts["refused"]
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_script(__doc__, MEMORY, count_cases))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import random
-import resource
 import struct
 import sys
 import tempfile
@@ -30,7 +29,8 @@ from typing import Any, cast
 ROOT = Path(__file__).parents[2]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "job")]
 
-from live_servers import (  # noqa: E402 - the repository is put on the path first
+from fuzzing import peak_mb  # noqa: E402 - the repository is put on the path first
+from live_servers import (  # noqa: E402 - as above
     OlderFoxgloveServer,
     Played,
     RosbridgeServer,
@@ -254,7 +254,7 @@ class Player:
 
 def run_case(messages: list[Played], seed: int, folder: Path) -> Case:
     """Play one server, record it, look at it, and analyze what was recorded."""
-    begin, before_mb = time.monotonic(), measure_peak_mb()
+    begin, before_mb = time.monotonic(), peak_mb()
     case = record_case(messages, seed, folder)
     if case.find is not None:
         return case
@@ -267,14 +267,10 @@ def run_case(messages: list[Played], seed: int, folder: Path) -> Case:
         case.find = Find(f"{count} files were written")
     if time.monotonic() - begin > LONGEST_S:
         case.find = Find(f"it took {time.monotonic() - begin:.0f} s")
-    if measure_peak_mb() - before_mb > MOST_MB:
+    # What a case adds to the most memory of this process so far is its own.
+    if peak_mb() - before_mb > MOST_MB:
         case.find = Find("it took more memory than it may")
     return case
-
-
-def measure_peak_mb() -> float:
-    """Most memory of this process so far: what a case adds to it is the case's own."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 def record_case(messages: list[Played], seed: int, folder: Path) -> Case:

@@ -9,10 +9,7 @@ with a traceback. A case that fails is kept in the folder of finds.
 
 from __future__ import annotations
 
-import argparse
-import faulthandler
 import random
-import resource
 import sys
 import tempfile
 import time
@@ -24,6 +21,7 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "logs")]
 
 import numpy as np  # noqa: E402 - the repository is put on the path first
 from bag_files import BagWriter, write_bag, write_db3  # noqa: E402
+from fuzzing import keep_failure, run_script  # noqa: E402
 from google.protobuf.descriptor_pb2 import FileDescriptorSet  # noqa: E402
 from google.protobuf.struct_pb2 import Value  # noqa: E402
 from mcap.writer import CompressionType, IndexType, Writer  # noqa: E402
@@ -201,39 +199,14 @@ def run(seconds: float, seed: int, finds: Path | None) -> int:
         path = Path(folder) / "case.mcap"
         end = time.monotonic() + seconds
         while time.monotonic() < end:
-            path.write_bytes(mutate(seeds, rng))
-            faulthandler.dump_traceback_later(HANG_S, exit=True)
-            try:
+            case = mutate(seeds, rng)
+            path.write_bytes(case)
+            with keep_failure(finds, f"find_{seed}_{cases}.mcap", case, hang_s=HANG_S):
                 check_log(path)
                 check_definition(rng)
-            except BaseException:
-                if finds is not None:
-                    finds.mkdir(parents=True, exist_ok=True)
-                    (finds / f"find_{seed}_{cases}.mcap").write_bytes(path.read_bytes())
-                raise
-            finally:
-                faulthandler.cancel_dump_traceback_later()
             cases += 1
     return cases
 
 
-def main() -> int:
-    """Run as a script."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--finds", type=Path, default=Path("fuzz_finds"))
-    given = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    cases = run(given.minutes * 60.0, given.seed, given.finds)
-    sys.stdout.write(f"{cases} cases in {given.minutes:g} minutes, no find, peak {peak_mb():.0f} MB\n")
-    return 0
-
-
-def peak_mb() -> float:
-    """Highest resident memory of this process [MB]."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_script(__doc__, MEMORY, run))

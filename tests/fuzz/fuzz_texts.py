@@ -9,12 +9,9 @@ run with a traceback. A case that fails is kept in the folder of finds.
 
 from __future__ import annotations
 
-import argparse
 import ast
-import faulthandler
 import json
 import random
-import resource
 import sys
 import tempfile
 import time
@@ -27,6 +24,7 @@ sys.path[:0] = [str(ROOT)]
 
 import numpy as np  # noqa: E402 - the repository is put on the path first
 import yaml  # noqa: E402
+from fuzzing import keep_failure, run_script  # noqa: E402
 
 from pipeline.core import SlipError  # noqa: E402
 from pipeline.export import export_model, find_target, list_targets  # noqa: E402
@@ -262,35 +260,14 @@ def run(seconds: float, seed: int, finds: Path | None) -> int:
         warnings.simplefilter("error")
         while time.monotonic() < end:
             texts = [mutate(models, rng), mutate((CONFIGURATION,), rng), mutate(FORMULAS, rng)]
-            faulthandler.dump_traceback_later(HANG_S, exit=True)
-            try:
+            case = json.dumps(texts).encode()
+            with keep_failure(finds, f"find_{seed}_{cases}.json", case, hang_s=HANG_S):
                 check_model(texts[0])
                 check_configuration(texts[1], Path(name))
                 check_formula(texts[2], rng)
-            except BaseException:
-                if finds is not None:
-                    finds.mkdir(parents=True, exist_ok=True)
-                    (finds / f"find_{seed}_{cases}.json").write_text(json.dumps(texts), encoding="utf-8")
-                raise
-            finally:
-                faulthandler.cancel_dump_traceback_later()
             cases += 3
     return cases
 
 
-def main() -> int:
-    """Run as a script."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--minutes", type=float, default=60.0)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--finds", type=Path, default=Path("fuzz_finds"))
-    given = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
-    cases = run(given.minutes * 60.0, given.seed, given.finds)
-    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    sys.stdout.write(f"{cases} cases in {given.minutes:g} minutes, no find, peak {peak_mb:.0f} MB\n")
-    return 0
-
-
 if __name__ == "__main__":
-    raise SystemExit(main())
+    raise SystemExit(run_script(__doc__, MEMORY, run))
