@@ -33,19 +33,9 @@ from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import FORMAT, ModelFile, read_model
 from pipeline.run import MotionError
 from pipeline.sources import FLEET_FILE, RUN_FILE, Vehicle, find_preset, is_model
+from pipeline.sources.configuration import RANGES
 from pipeline.store.files import replace_file
 
-_GEOMETRY = (
-    "wheel_radius_m",
-    "track_width_m",
-    "wheelbase_m",
-    "base_to_rear_axle_m",
-    "mass_kg",
-    "max_speed_mps",
-    "max_yaw_rate_radps",
-    "max_steering_rad",
-    "controller_track_multiplier",
-)
 _LEARNED_HEAD = (
     "# What was learned beyond the effects; it has no cause. One scale of an input adds so much to v_x, v_y",
     "# [m/s] and v_w [rad/s]; outside of low to high the term fades. `slip model drop FILE learned_term`.",
@@ -141,9 +131,9 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
     # A vehicle of the same name may lack what the preset knows, and a file has no word for that.
     if preset is not None and vehicle.kind == preset.kind and not _lacks(values, known):
         lines.append(f"preset = {format_value(preset.id)}")
-        return lines + [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] != known[key]]
+        return lines + [f"{key} = {_exactly(values[key])}" for key in RANGES if values[key] != known[key]]
     lines += [f"name = {format_value(vehicle.name)}", f"kind = {format_value(vehicle.kind)}"]
-    lines += [f"{key} = {_exactly(values[key])}" for key in _GEOMETRY if values[key] is not None]
+    lines += [f"{key} = {_exactly(values[key])}" for key in RANGES if values[key] is not None]
     if vehicle.stand_ins:
         names = ", ".join(map(format_value, vehicle.stand_ins))
         lines.append("# Not known: their values only convert body motion into wheel speeds and back.")
@@ -153,7 +143,7 @@ def _format_vehicle(vehicle: Vehicle) -> list[str]:
 
 def _lacks(values: Mapping[str, object], known: Mapping[str, object]) -> bool:
     """Whether a value of the geometry is unknown that is known."""
-    return any(values[key] is None and known[key] is not None for key in _GEOMETRY)
+    return any(values[key] is None and known[key] is not None for key in RANGES)
 
 
 def _format_parameter(effect: Effect, parameter: Parameter, file: ModelFile | None) -> str:

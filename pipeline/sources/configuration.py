@@ -379,7 +379,7 @@ def resolve_vehicle(
     return _require_geometry(msgspec.structs.replace(base, **values), where)
 
 
-_RANGES: Final = {
+RANGES: Final = {
     "wheel_radius_m": (1e-3, 2.5),
     "track_width_m": (5e-3, 15.0),
     "wheelbase_m": (5e-3, 25.0),
@@ -419,7 +419,7 @@ def check_geometry(vehicle: Vehicle, where: str) -> None:
     Raises:
         ConfigurationError: ``implausible_geometry``.
     """
-    for name, (least, largest) in _RANGES.items():
+    for name, (least, largest) in RANGES.items():
         value = getattr(vehicle, name)
         if value is None or least <= value <= largest:
             continue

@@ -23,6 +23,7 @@ from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
 from pipeline.run import MotionError
+from pipeline.sources.configuration import RANGES
 
 if TYPE_CHECKING:
     from pipeline.sources import Vehicle
@@ -116,17 +117,6 @@ def test_a_name_comes_back_from_a_model_file(name: str) -> None:
     assert READERS["python"](export_model(again, "python"))[1] == [name]
 
 
-GEOMETRY = (
-    "wheel_radius_m",
-    "track_width_m",
-    "wheelbase_m",
-    "base_to_rear_axle_m",
-    "mass_kg",
-    "max_speed_mps",
-    "max_yaw_rate_radps",
-    "max_steering_rad",
-    "controller_track_multiplier",
-)
 ABSURD = (math.nan, math.inf, -math.inf, 1e300, -1e300)
 
 
@@ -136,7 +126,7 @@ def list_absurd(kind: str) -> list[ModelFile]:
     vehicle = file.model.vehicle
     files = [
         replace(file, model=Model(structs.replace(vehicle, **{key: value}), file.model.effects))
-        for key in GEOMETRY
+        for key in RANGES
         for value in (*ABSURD, *((-1.0, 0.0, 1e-300) if key != "base_to_rear_axle_m" else ()))
     ]
     wide = (make_parameter("k", "1", (-math.inf, math.inf)),)
