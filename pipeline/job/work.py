@@ -13,7 +13,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import SlipError, naming_os_errors, pick
-from pipeline.core.arrays import Floats
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_bounded
 from pipeline.job import STAGES, JobError, Options
@@ -99,7 +98,7 @@ def add_model(
             findings.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
             parts.append(part)
             continue
-        columns = [*predicted.T, find_residual_modulus(predicted, part, length=length)]
+        columns = [*predicted.T, slip_stage.find_residual_modulus(predicted, part, length=length)]
         known = np.isfinite(np.stack(columns)).all(axis=0)
         parts.append(
             part.with_columns(
@@ -113,18 +112,6 @@ def add_model(
 def remove_model(slip: pl.DataFrame) -> pl.DataFrame:
     """Table `slip` with empty model columns."""
     return slip.with_columns(pl.lit(None, pl.Float64).alias(name) for name in COLUMNS)
-
-
-def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
-    """Modulus of a model's velocity residual [m/s], shape (n,).
-
-    Args:
-        predicted: body velocities of the model at the rows of ``slip`` [m/s, m/s, rad/s], shape (n, 3).
-        slip: rows of table `slip` of one input.
-        length: length scale L [m] of the modulus.
-    """
-    residual = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
-    return np.asarray(np.sqrt(np.sum(residual**2, axis=1)), dtype=np.float64)
 
 
 # Stages of one run: each reads the tables of the previous one and writes its own.

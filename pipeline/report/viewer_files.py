@@ -39,6 +39,7 @@ from pipeline.report.export_source import (
     write_findings,
     write_trail,
 )
+from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store.files import replace_file, temporary_beside
 from schemas import contract_of
 
@@ -128,9 +129,7 @@ def _write_model(
     columns = {f"v_{axis}": predicted.velocity[:, i] for i, axis in enumerate("xyw")}
     velocity = frame.select("stamp").with_columns(**columns).filter(pl.col("v_x").is_finite())
     _write_twist(writer, source, MODEL, velocity, "v")
-    scale = np.array([1.0, 1.0, source.length_scale_m])
-    residual = (predicted.velocity - frame.select("v_x", "v_y", "v_w").to_numpy()) * scale
-    modulus = np.linalg.norm(residual, axis=1)
+    modulus = find_residual_modulus(predicted.velocity, frame, length=source.length_scale_m)
     known = np.isfinite(modulus)
     times = source.log_times(frame["stamp"].to_numpy()[known])
     writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})

@@ -431,6 +431,18 @@ def aggregate_run(
     return set_residuals(tabulate("aggregates", rows), slip)
 
 
+def find_residual_modulus(predicted: Floats, slip: pl.DataFrame, *, length: float) -> Floats:
+    """Modulus of a model's velocity residual [m/s], shape (n,).
+
+    Args:
+        predicted: body velocities of the model at the rows of ``slip`` [m/s, m/s, rad/s], shape (n, 3).
+        slip: rows of table `slip` of one input.
+        length: length scale L [m] of the modulus.
+    """
+    residual = (predicted - slip.select("v_x", "v_y", "v_w").to_numpy()) * np.array([1.0, 1.0, length])
+    return np.asarray(np.sqrt(np.sum(residual**2, axis=1)), dtype=np.float64)
+
+
 def set_residuals(aggregates: pl.DataFrame, slip: pl.DataFrame) -> pl.DataFrame:
     """Table `aggregates` with the medians of the residual moduli in table `slip`."""
     clean = slip.filter(~pl.col("suspect"))

@@ -11,13 +11,13 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.untrusted import number_in
-from pipeline.job.work import find_residual_modulus
 from pipeline.report import figures, theme
 from pipeline.report.figures import Drawing, Figure, Section, list_figures, slip_figures
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import RunReport, Scene, break_lines
 from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
 from pipeline.run.windows import HORIZON_S
+from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Manifest
 from pipeline.web import WorkbenchError
 from pipeline.web.actions import Shown

@@ -14,9 +14,9 @@ from workbench_server import RUN, Workbench
 from pipeline.estimation import Input
 from pipeline.estimation.problem import predict_at
 from pipeline.job.run_results import load_vehicle
-from pipeline.job.work import find_residual_modulus
 from pipeline.models import list_effects, read_model
 from pipeline.report.motion_view import load_motion_run
+from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Store
 from pipeline.web.workbench import Trials
 
