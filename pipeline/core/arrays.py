@@ -79,10 +79,14 @@ _SHORTEST_PERIOD = 1e-3
 """Assumed period of samples with equal stamps [s]."""
 
 
+def count_grid(start: float, end: float, rate: float) -> int:
+    """Number of uniform times from ``start`` to ``end`` inclusive in steps of 1/``rate``; see `make_grid`."""
+    return max(int(np.floor((end - start) * rate + 1e-6)) + 1, 0)
+
+
 def make_grid(start: float, end: float, rate: float) -> Floats:
     """Uniform times from ``start`` to ``end`` inclusive in steps of 1/``rate``, tolerant of rounding."""
-    count = int(np.floor((end - start) * rate + 1e-6)) + 1
-    return start + np.arange(max(count, 0)) / rate
+    return start + np.arange(count_grid(start, end, rate)) / rate
 
 
 def hold_indices(at: Floats, times: Floats) -> Ints:

@@ -58,7 +58,7 @@ def smooth_gyro(times: Floats, imu: pl.DataFrame, fit: GyroFit, window: float) -
     first = max(float(times.min()) - 1.0, float(stamps[0]))
     last = min(float(times.max()) + 1.0, float(stamps[-1]))
     rate_hz = VelocitySection().rate_hz
-    count = int(np.floor((last - first) * rate_hz + 1e-6)) + 1
+    count = arrays.count_grid(first, last, rate_hz)
     if count < 2 or stamps.size < 2:  # noqa: PLR2004 - no overlap with the poses
         return np.full(times.size, np.nan)
     # Grid times may differ from stamps by rounding.
