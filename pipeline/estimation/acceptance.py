@@ -400,17 +400,17 @@ def find_idle(
         for source, problem in problems.items():
             with suppress(MotionError):
                 whole = judge_whole(problem, part)
-                judged = [
-                    one for one in rest if source in duties[one] or (source is leading and one in written)
-                ]
-                for name in (one for one in judged if one in whole.effects):
+                for name in (one for one in rest if one in whole.effects):
+                    must_serve = source in duties[name]
+                    if not must_serve and not (source is leading and name in written):
+                        continue
                     with suppress(MotionError):
                         without = whole.drop(name)
-                        if source not in duties[name]:
-                            is_idle = raises_errors(without.errors, whole.errors)
-                        else:
-                            is_idle = _is_idle(whole, without, is_of_drive=name in drive)
-                        if is_idle:
+                        if (
+                            _is_idle(whole, without, is_of_drive=name in drive)
+                            if must_serve
+                            else raises_errors(without.errors, whole.errors)
+                        ):
                             size = math.prod(whole.errors.ratios(without.errors)[3:])
                             raised[name] = max(raised.get(name, 0.0), size)
         if not raised:

@@ -21,14 +21,20 @@ _LEAST: Final = 0.02
 """Smallest misreading that is reported: unequal tyres and motors reach 0.035 between the sides."""
 _ONE: Final = 0.004
 """Deviation of the product from one within which it is one: the least size of a wheel radius worth a name."""
+_ROLES: Final = (TwinRole.SPEED_GAIN, TwinRole.RADIUS)
+"""What the two effects are to the motion: a gain of the drive, and a factor on the radius."""
 
 
 @dataclass(frozen=True)
 class EncoderScale:
-    """Readings of the encoders over the true wheel speeds, and the effects that it explains."""
+    """Readings of the encoders over the true wheel speeds.
+
+    Attributes:
+        value: the scale, which is also the gain that the drive seems to have.
+        radius: factor that the wheel radius seems to have.
+    """
 
     value: float
-    gain: float
     radius: float
 
     def correct(self, runs: Sequence[MotionRun]) -> list[MotionRun]:
@@ -45,20 +51,14 @@ class EncoderScale:
         direction = "low" if self.value < 1.0 else "high"
         text = (
             f"the encoders read {format_share(abs(self.value - 1.0))} {direction}: the body moves as "
-            "commanded, "
-            f"while the wheels seem to turn {self.gain:.3g} times as fast as commanded and the body to move "
+            f"commanded, while the wheels seem to turn {self.value:.3g} times as fast as commanded and the "
+            "body to move "
             f"{self.radius:.3g} times as far as they turn. The readings were corrected for the effects; "
             f"scale = {1.0 / self.value:.4g} under [wheels] in run.toml corrects the tables too. If instead "
             "the wheels have another radius and the drive has that gain by coincidence, scale = 1 names both"
         )
-        where, severity = "wheels", "warning"
-        return {
-            "id": "encoder_scale",
-            "text": text,
-            "where": where,
-            "severity": severity,
-            "value": self.value,
-        }
+        about: dict[str, Json] = {"where": "wheels", "severity": "warning", "value": self.value}
+        return {"id": "encoder_scale", "text": text, **about}
 
 
 def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
@@ -72,10 +72,7 @@ def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
     sure = math.hypot(gain.half / gain.value, radius.half / radius.value)
     if off > max(sure, _ONE) or abs(math.log(gain.value)) < max(_LEAST, 2.0 * off):
         return None
-    return EncoderScale(gain.value, gain.value, radius.value)
-
-
-_ROLES: Final = (TwinRole.SPEED_GAIN, TwinRole.RADIUS)
+    return EncoderScale(gain.value, radius.value)
 
 
 def _list_values(effects: Sequence[Named], role: TwinRole) -> Iterator[Value]:

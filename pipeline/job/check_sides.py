@@ -199,14 +199,16 @@ def _list_others(store: Store, sides: Sides, held: Collection[str]) -> list[Mani
     """Further runs of the vehicle on the terrains of a check; none where enough runs are on its sides."""
     room = _MOST_OF_SPREAD - len(sides.before) - len(sides.after)
     terrains = {*itertools.chain(*sides.terrains)} - {UNKNOWN}
+    if room <= 0 or not terrains:
+        return []
     others: dict[str, Manifest] = {}
-    for manifest in store.survey().manifests if room > 0 and terrains else ():
+    for manifest in store.survey().manifests:
         is_here = manifest.details.get("terrain") in terrains
         if is_here and manifest.part("vehicle").get("id") == sides.model.model.vehicle.id:
             digest = _digest(manifest)
             if digest and digest not in held and not find_run_refusal(manifest):
                 others.setdefault(digest, manifest)
-    return [*others.values()][-room:] if room > 0 else []
+    return [*others.values()][-room:]
 
 
 def _read_others(

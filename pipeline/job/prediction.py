@@ -468,20 +468,23 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     forecast = prediction.forecast
     effects: dict[str, dict[str, object]] = {}
     for number in forecast.numbers:
-        low, high = number.ends
-        ends = _summarize_ends(Expected(number.value, Interval(low, high, CONFIDENCE)), number.runs)
         numbers = effects.setdefault(number.effect, {})
         numbers[number.parameter] = {
-            **ends,
+            **_summarize_ends(number.value, number.ends, number.runs),
             **pick(number, "unit", "runs", "at_bound"),
             "default_spread": number.has_default_spread,
         }
+    expected = {
+        "t_mrmse_m": prediction.t_mrmse_m,
+        "ideal_t_mrmse_m": prediction.ideal_t_mrmse_m,
+        "median_modulus": prediction.median_modulus,
+    }
     return {
         **pick(forecast, "vehicle", "terrain", "input"),
         "effects": [{"id": effect.id, "parameters": effects[effect.id]} for effect in forecast.effects],
         **{
-            key: _summarize_ends(getattr(prediction, key), len(prediction.runs_used))
-            for key in ("t_mrmse_m", "ideal_t_mrmse_m", "median_modulus")
+            key: _summarize_ends(one.value, (one.interval.low, one.interval.high), len(prediction.runs_used))
+            for key, one in expected.items()
         },
         "runs_on_terrain": len(forecast.here),
         "runs_elsewhere": len(forecast.elsewhere),
@@ -490,10 +493,10 @@ def summarize_prediction(prediction: Prediction) -> dict[str, object]:
     }
 
 
-def _summarize_ends(number: Expected, runs: int) -> dict[str, float | None]:
+def _summarize_ends(value: float, ends: tuple[float, float], runs: int) -> dict[str, float | None]:
     """A value with its interval, which is not given from fewer than three runs."""
-    ends = (number.interval.low, number.interval.high) if runs >= FEWEST_OF_SPREAD else (None, None)
-    return {"value": number.value, "low": ends[0], "high": ends[1]}
+    low, high = ends if runs >= FEWEST_OF_SPREAD else (None, None)
+    return {"value": value, "low": low, "high": high}
 
 
 def make_model_file(prediction: Prediction) -> ModelFile:

@@ -164,13 +164,13 @@ def list_raised(vehicle: Vehicle, limits: Limits) -> Iterator[tuple[str, Limits,
     yield (
         f"--max-lateral {sideways:.3g}",
         replace(limits, lateral_mps2=sideways),
-        (f"{limits.lateral_mps2:.3g} m/s^2 sideways"),
+        f"{limits.lateral_mps2:.3g} m/s^2 sideways",
     )
     faster = _RAISED * limits.acceleration_mps2
     yield (
         f"--max-acceleration {faster:.3g}",
         replace(limits, acceleration_mps2=faster),
-        (f"{limits.acceleration_mps2:.3g} m/s^2"),
+        f"{limits.acceleration_mps2:.3g} m/s^2",
     )
     speed = min(_RAISED * limits.speed_mps, vehicle.max_speed_mps or math.inf)
     if speed > limits.speed_mps:

@@ -156,16 +156,12 @@ def _check_signs(sides: Mapping[str, Floats], gyro_sign: float, *, body: bool) -
     if len(wrong) == 2 and _EITHER in wrong:  # noqa: PLR2004 - what the gyro names, and the way ahead
         wrong = {name: list(_AXES) for name in wrong if name != _EITHER}
     other = next(name for name in sides if name != "pose")
-    return (
-        [
-            _report_either(other, axes, value, body=body)
-            if name == _EITHER
-            else _report_sign(name, axes, value, agree=_list_agreeing(sides, name), body=body)
-            for name, axes in wrong.items()
-        ]
-        if len(wrong) == 1
-        else []
-    )
+    if len(wrong) != 1:
+        return []
+    ((name, axes),) = wrong.items()
+    if name == _EITHER:
+        return [_report_either(other, axes, value, body=body)]
+    return [_report_sign(name, axes, value, agree=_list_agreeing(sides, name), body=body)]
 
 
 def _find_odd(signs: Mapping[frozenset[str], float], names: list[str], gyro_sign: float) -> str | None:
@@ -210,9 +206,11 @@ def _report_either(name: str, axes: list[str], value: float, *, body: bool) -> F
     pose = "base_link is mirrored: correct the localization's frame"
     if len(axes) == 1:
         pose = _MIRRORED if axes == ["turning"] else _REVERSED
-    what = f"have the wrong sign: {_format_remedy(name, axes, body=body)}"
-    if name == "command" and body:
-        what = f"have the wrong sign of {_list_fields(axes)} where they are sent"
+    what = (
+        f"have the wrong sign of {_list_fields(axes)} where they are sent"
+        if name == "command" and body
+        else f"have the wrong sign: {_format_remedy(name, axes, body=body)}"
+    )
     text = (
         f"{_WORDS[name]} and the poses {' and '.join(verbs[axis] for axis in axes)} opposite ways "
         f"(correlation {value:.2f}), and no third signal tells which of them is wrong: either {pose}; or "
