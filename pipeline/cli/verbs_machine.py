@@ -386,11 +386,11 @@ def _read_numbers(version: str) -> list[int]:
 def compile_every_loop() -> int:
     """Compile the loops of the estimation and of every effect; the number of loops compiled."""
     import pipeline.estimation  # noqa: F401, PLC0415 - heavy; loops are known where they are imported
-    from pipeline.core.machine_code import compile_loops  # noqa: PLC0415
+    from pipeline.core.machine_code import count_loops  # noqa: PLC0415
     from pipeline.models import list_effects  # noqa: PLC0415
 
     list_effects()
-    return sum(1 for _ in compile_loops())
+    return count_loops()
 
 
 def _look_at_loops() -> Check:

@@ -1,20 +1,14 @@
-"""Arrays: types, sampling on uniform grids, robust regression, small numerical methods.
-
-Importing SciPy's `stdtrit`, `nnls` and `solveh_banded` takes half a second of CPU, more than a diagnosis
-uses them for: they stand here, and tests compare the results.
-"""
+"""Arrays: types, sampling on uniform grids, robust regression, quantiles."""
 
 from __future__ import annotations
 
 import functools
 import math
-from statistics import NormalDist
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-
-from pipeline.core.machine_code import compiled
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -208,25 +202,14 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
 
 
 def fit_rising(values: Floats) -> Floats:
-    """Least squares fit that never falls, shape (n,), by pooling adjacent violators.
-
-    Source: Barlow, Bartholomew, Bremner and Brunk, Statistical Inference under Order Restrictions, 1972.
-    """
-    means, sizes = list[float](), list[int]()
-    for value in values.tolist():
-        mean, size = value, 1
-        while means and means[-1] >= mean:
-            last, count = means.pop(), sizes.pop()
-            mean, size = (mean * size + last * count) / (size + count), size + count
-        means.append(mean)
-        sizes.append(size)
-    return np.repeat(np.asarray(means, dtype=np.float64), sizes)
+    """Least squares fit that never falls, shape (n,)."""
+    fitted: Floats = scipy.optimize.isotonic_regression(values).x
+    return fitted
 
 
 def integrate_rate(times: Floats, rate: Floats) -> Floats:
     """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
-    steps = np.diff(times) * (rate[1:] + rate[:-1]) / 2.0
-    return np.concatenate(([0.0], np.cumsum(steps)))
+    return np.asarray(scipy.integrate.cumulative_trapezoid(rate, times, initial=0.0))
 
 
 def integrate_between(start: Floats, end: Floats, times: Floats, rate: Floats) -> Floats:
@@ -349,19 +332,6 @@ def count_freedom(normals: Floats, without: Floats) -> Floats:
     return freedom
 
 
-_MANY = 400.0
-"""Degrees of freedom above which the series for the quantile is exact to 1e-10."""
-_SOME = 5.0
-"""Degrees of freedom above which the series is closer than the normal quantile."""
-_TINY = 1e-300
-"""Replacement of a zero divisor in Lentz's method: the smallest double is 2e-308."""
-_ROOT_HALF = math.sqrt(0.5)
-_MOST_STEPS = 1000
-"""Maximum number of steps, a guard. Both loops end by `_EXACT`, the fraction in about sqrt(`_MANY`) steps."""
-_EXACT = 1e-12
-"""Relative change of the result by the last step."""
-
-
 @functools.lru_cache(maxsize=4096)
 def student_quantile(level: float, freedom: float) -> float:
     """Quantile of Student's t for a two-sided level; NaN without degrees of freedom.
@@ -369,38 +339,13 @@ def student_quantile(level: float, freedom: float) -> float:
     Args:
         level: share of draws within the quantile, between 0 and 1.
         freedom: degrees of freedom, any number above 0.
-
-    Sources: Abramowitz and Stegun, Handbook of Mathematical Functions, 26.7.5 for many degrees of freedom;
-    else Newton's method on the tail, which is convex, starting from that series, or for few degrees of
-    freedom from the normal quantile, which is smaller.
     """
-    if not freedom > 0.0:
-        return math.nan
-    z = NormalDist().inv_cdf((1.0 + level) / 2.0)
-    terms = (
-        (z**3 + z) / 4.0,
-        (5.0 * z**5 + 16.0 * z**3 + 3.0 * z) / 96.0,
-        (3.0 * z**7 + 19.0 * z**5 + 17.0 * z**3 - 15.0 * z) / 384.0,
-        (79.0 * z**9 + 776.0 * z**7 + 1482.0 * z**5 - 1920.0 * z**3 - 945.0 * z) / 92160.0,
-    )
-    near = z + sum(term / freedom ** (power + 1) for power, term in enumerate(terms))
-    if freedom > _MANY:
-        return near
-    height = math.lgamma(0.5 * (freedom + 1.0)) - math.lgamma(0.5 * freedom)
-    height -= 0.5 * math.log(freedom * math.pi)
-    quantile = near if freedom > _SOME else z
-    for _ in range(_MOST_STEPS):
-        beyond = _find_tail(quantile, freedom) - (1.0 - level)
-        slope = 2.0 * math.exp(height - 0.5 * (freedom + 1.0) * math.log1p(quantile**2 / freedom))
-        quantile += beyond / slope
-        if abs(beyond) <= _EXACT * slope * quantile:
-            break
-    return quantile
+    return float(scipy.special.stdtrit(freedom, (1.0 + level) / 2.0)) if freedom > 0.0 else math.nan
 
 
 def normal_tail(deviations: Floats) -> Floats:
     """Upper tail probability of the standard normal distribution, shape (n,)."""
-    return np.array([0.5 * math.erfc(one * _ROOT_HALF) for one in deviations.tolist()])
+    return np.asarray(scipy.special.ndtr(-deviations))
 
 
 def jackknife_deviation(without: Floats) -> float:
@@ -414,74 +359,6 @@ def jackknife_deviation(without: Floats) -> float:
     return math.sqrt((without.size - 1.0) * float(np.mean((without - without.mean()) ** 2)))
 
 
-def _find_tail(t: float, freedom: float) -> float:
-    """Two-sided tail probability of Student's t distribution: an incomplete beta function."""
-    x = freedom / (freedom + t * t)
-    a, b = 0.5 * freedom, 0.5
-    front = math.lgamma(a + b) - math.lgamma(a) - math.lgamma(b) + a * math.log(x)
-    front += b * math.log(t * t / (freedom + t * t))
-    if x < (a + 1.0) / (a + b + 2.0):
-        return math.exp(front) * _continue_fraction(a, b, x) / a
-    return 1.0 - math.exp(front) * _continue_fraction(b, a, 1.0 - x) / b
-
-
-def _continue_fraction(a: float, b: float, x: float) -> float:
-    """Continued fraction of the incomplete beta function (Lentz's method; Abramowitz and Stegun 26.5.8)."""
-    c, d = 1.0, 1.0 / _keep_off_zero(1.0 - (a + b) * x / (a + 1.0))
-    fraction = d
-    for m in range(1, _MOST_STEPS):
-        even = m * (b - m) * x / ((a + 2 * m - 1.0) * (a + 2 * m))
-        odd = -(a + m) * (a + b + m) * x / ((a + 2 * m) * (a + 2 * m + 1.0))
-        for part in (even, odd):
-            d = 1.0 / _keep_off_zero(1.0 + part * d)
-            c = _keep_off_zero(1.0 + part / c)
-            fraction *= c * d
-        if abs(c * d - 1.0) < _EXACT:
-            break
-    return fraction
-
-
-def _keep_off_zero(value: float) -> float:
-    return value if abs(value) > _TINY else _TINY
-
-
-def solve_nonnegative(design: Floats, target: Floats) -> Floats:
-    """Non-negative least squares: minimize the norm of ``design @ numbers - target``, shape (p,).
-
-    Args:
-        design: shape (n, p), p in the tens.
-        target: shape (n,).
-
-    Source: Lawson and Hanson, Solving Least Squares Problems, 1974, chapter 23.
-    """
-    count = design.shape[1]
-    numbers, free = np.zeros(count), np.zeros(count, dtype=bool)
-    least = 10.0 * np.finfo(float).eps * float(np.abs(design).sum(axis=0).max()) * max(design.shape)
-    for _ in range(3 * count):
-        push = design.T @ (target - design @ numbers)
-        push[free] = -np.inf
-        if free.all() or push.max() <= least:
-            break
-        free[int(push.argmax())] = True
-        solved = _solve_free(design, target, free)
-        while (solved[free] <= 0.0).any():
-            # Longest step towards the solution without negative numbers; those that reach zero are fixed.
-            falling = free & (solved <= 0.0)
-            share = float(np.min(numbers[falling] / (numbers[falling] - solved[falling])))
-            numbers += share * (solved - numbers)
-            free &= numbers > least
-            numbers[~free] = 0.0
-            solved = _solve_free(design, target, free)
-        numbers = solved
-    return numbers
-
-
-def _solve_free(design: Floats, target: Floats, free: Flags) -> Floats:
-    solved = np.zeros(free.size)
-    solved[free] = np.linalg.lstsq(design[:, free], target, rcond=None)[0]
-    return solved
-
-
 def solve_banded(matrix: Floats, right: Floats) -> Floats:
     """Solution of a symmetric positive definite banded system, shape (n,).
 
@@ -489,32 +366,9 @@ def solve_banded(matrix: Floats, right: Floats) -> Floats:
         matrix: lower diagonals by row: ``matrix[k, i]`` is the element of row i and column i - k, zero where
             i < k; shape (1 + bandwidth, n).
         right: right-hand side, shape (n,).
-
-    Source: Golub and Van Loan, Matrix Computations, 4.3.5, as L D L^T.
     """
-    solution = right.copy()
-    _solve_banded(np.array(matrix.T, order="C"), solution)
-    return solution
-
-
-@compiled("float64[:, :], float64[:]")
-def _solve_banded(matrix: Floats, solution: Floats) -> None:
-    """`solve_banded` in place: ``solution`` is the right-hand side, ``matrix`` is transposed, overwritten."""
-    count, width = matrix.shape[0], matrix.shape[1]
-    for row in range(count):
-        first = max(0, row + 1 - width)
-        for column in range(first, row):
-            total = matrix[row, row - column]
-            for before in range(max(first, column + 1 - width), column):
-                total -= matrix[row, row - before] * matrix[column, column - before]
-            # Times the pivot until the row is complete.
-            matrix[row, row - column] = total
-        for column in range(first, row):
-            factor = matrix[row, row - column] / matrix[column, 0]
-            matrix[row, 0] -= factor * matrix[row, row - column]
-            matrix[row, row - column] = factor
-            solution[row] -= factor * solution[column]
-    for row in range(count - 1, -1, -1):
-        solution[row] /= matrix[row, 0]
-        for below in range(row + 1, min(row + width, count)):
-            solution[row] -= matrix[below, below - row] * solution[below]
+    count = right.size
+    lower = np.zeros(matrix.shape)
+    for below, diagonal in enumerate(matrix):
+        lower[below, : count - below] = diagonal[below:]
+    return np.asarray(scipy.linalg.solveh_banded(lower, right, lower=True))

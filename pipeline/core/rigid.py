@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, group_rows, robust_spread
 
@@ -19,8 +20,11 @@ if TYPE_CHECKING:
 
 GRAVITY_MPS2 = 9.80665
 """Standard gravity [m/s^2] (ISO 80000-3)."""
-_TINY = 1e-12
-"""Angle [rad] below which the first term of a series is exact to rounding."""
+
+
+def _turn(quaternion: Floats) -> Rotation:
+    # `Rotation` refuses arrays that cannot be written to.
+    return Rotation.from_quat(np.array(quaternion))
 
 
 def wrap_angle(angle: Floats) -> Floats:
@@ -35,17 +39,7 @@ def unwrap_yaw(yaw: Floats) -> Floats:
 
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
     """Hamilton product of quaternions of shape (n, 4); apply ``second``, then ``first``."""
-    ax, ay, az, aw = np.moveaxis(first, -1, 0)
-    bx, by, bz, bw = np.moveaxis(second, -1, 0)
-    return np.stack(
-        (
-            aw * bx + ax * bw + ay * bz - az * by,
-            aw * by - ax * bz + ay * bw + az * bx,
-            aw * bz + ax * by - ay * bx + az * bw,
-            aw * bw - ax * bx - ay * by - az * bz,
-        ),
-        axis=-1,
-    )
+    return (_turn(first) * _turn(second)).as_quat()
 
 
 def invert_quaternions(quaternion: Floats) -> Floats:
@@ -56,47 +50,28 @@ def invert_quaternions(quaternion: Floats) -> Floats:
 
 def rotate(quaternion: Floats, vector: Floats) -> Floats:
     """Rotate vectors (n, 3) by unit quaternions (n, 4)."""
-    axis, scalar = quaternion[..., :3], quaternion[..., 3:]
-    twice = 2.0 * np.cross(axis, vector)
-    return vector + scalar * twice + np.cross(axis, twice)
+    rotated: Floats = _turn(quaternion).apply(np.array(vector))
+    return rotated
 
 
 def rotation_vectors(quaternion: Floats) -> Floats:
     """Logarithm of unit quaternions (n, 4): rotation vectors (n, 3) [rad] of at most pi."""
-    flipped = np.where(quaternion[..., 3:] < 0.0, -quaternion, quaternion)
-    sine = np.linalg.norm(flipped[..., :3], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(sine, flipped[..., 3:])
-    scale = np.where(sine > _TINY, angle / np.maximum(sine, _TINY), 2.0)
-    return flipped[..., :3] * scale
+    return _turn(quaternion).as_rotvec()
 
 
 def quaternions_from_vectors(vector: Floats) -> Floats:
     """Exponential of rotation vectors (n, 3) [rad]: unit quaternions (n, 4)."""
-    angle = np.linalg.norm(vector, axis=-1, keepdims=True)
-    scale = np.where(angle > _TINY, np.sin(angle / 2.0) / np.maximum(angle, _TINY), 0.5)
-    return np.concatenate((vector * scale, np.cos(angle / 2.0)), axis=-1)
+    return Rotation.from_rotvec(np.array(vector)).as_quat()
 
 
 def quaternions_from_yaw(yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of rotations about z by ``yaw`` [rad], shape (n,)."""
-    zero = np.zeros_like(yaw)
-    return np.stack((zero, zero, np.sin(yaw / 2.0), np.cos(yaw / 2.0)), axis=-1)
+    return Rotation.from_euler("z", yaw[..., None]).as_quat()
 
 
 def quaternions_from_euler(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of intrinsic z-y-x rotations (yaw, then pitch, then roll) [rad]."""
-    sr, cr = np.sin(roll / 2.0), np.cos(roll / 2.0)
-    sp, cp = np.sin(pitch / 2.0), np.cos(pitch / 2.0)
-    sy, cy = np.sin(yaw / 2.0), np.cos(yaw / 2.0)
-    return np.stack(
-        (
-            sr * cp * cy - cr * sp * sy,
-            cr * sp * cy + sr * cp * sy,
-            cr * cp * sy - sr * sp * cy,
-            cr * cp * cy + sr * sp * sy,
-        ),
-        axis=-1,
-    )
+    return Rotation.from_euler("ZYX", np.stack((yaw, pitch, roll), axis=-1)).as_quat()
 
 
 def euler_from_quaternions(quaternion: Floats) -> tuple[Floats, Floats, Floats]:

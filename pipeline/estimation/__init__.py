@@ -13,8 +13,9 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
-from pipeline.core.compute import Budget, both_cores, usual_budget
+from pipeline.core.compute import Budget, usual_budget
 from pipeline.estimation import conclude
 from pipeline.estimation.acceptance import NEARLY, NotSignificant
 from pipeline.estimation.ambiguity import (
@@ -172,7 +173,8 @@ def diagnose_runs(
         context = prepare(runs, vehicle, chosen.source)
         driven = sum(run.duration_s for run in runs)
         budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
-        with both_cores(context.list_shared()):
+        # With more threads, the order of summation would depend on the number of cores.
+        with threadpool_limits(limits=1, user_api="blas"):
             ways, clocks = _explore(context, chosen.source, known, budget)
             return _conclude(recordings, context, chosen, ways, clocks)
 

@@ -12,7 +12,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import pairwise, permutations
 from typing import TYPE_CHECKING, Literal
 
@@ -27,7 +26,6 @@ from pipeline.core import (
     pick_finite,
 )
 from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
-from pipeline.core.compute import map_parallel
 from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
@@ -130,7 +128,7 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     # Models with the same first effects are adjacent, so that their common prediction is computed once.
     asked = sorted(list_subsets(players) - known.keys(), key=lambda one: [p in one for p in players])
     models = [fitted.state.drop([name for name in players if name not in one]) for one in asked]
-    known |= dict(zip(asked, map_parallel(partial(score, problem), models), strict=True))
+    known |= {one: score(problem, model) for one, model in zip(asked, models, strict=True)}
     stretches = _find_stretches(problem)
     losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
     split = share_out(players, losses)

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core.arrays import Floats, Ints, guarded_spread, guarded_spreads, robust_spread
-from pipeline.core.compute import map_parallel
 from pipeline.estimation.parts import RIDGE
 from pipeline.estimation.proposals import Candidate, leave_out_silent, list_trials
 
@@ -253,8 +252,8 @@ class Evidence:
         absent = [candidate for candidate in candidates if fit.state.find(candidate.id) is None]
         own = fit.jacobian[tiles.rows]
         columns, starts, count = [own], list[Start](), 0
-        for collected in map_parallel(partial(_collect, part, fit, largest, tiles), absent):
-            for effect, own_values, block in collected:
+        for candidate in absent:
+            for effect, own_values, block in _collect(part, fit, largest, tiles, candidate):
                 places = tuple(range(count, count + block.shape[2]))
                 starts.append(Start(effect, own_values, places))
                 columns.append(block)

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.optimize import nnls
 
-from pipeline.core.arrays import Flags, Floats, Ints, fit_rising, guarded_spreads, solve_nonnegative
+from pipeline.core.arrays import Flags, Floats, Ints, fit_rising, guarded_spreads
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import CLIP, average_lags, find_live
@@ -174,7 +175,7 @@ def _split(covariance: Floats) -> Makeup:
     weight = np.ones(_LAGS + 1)
     weight[0] = _FIRST
     design = np.column_stack(columns) * weight[:, None]
-    parts = solve_nonnegative(design, covariance / total * weight) * total
+    parts = nnls(design, covariance / total * weight)[0] * total
     known = len(_PASSING_S) + 2
     if covariance[2:5].mean() < _REPEATED * total:
         # A finite sample of random motion is correlated by chance: that is not structure.
@@ -211,11 +212,11 @@ def split_differences(squares: Floats, windows: int, corrected_s: float = 0.0) -
     if not measured.any():
         measured, squares = ~measured, np.full(squares.size, _LEAST)
     design, squares = design[measured], squares[measured]
-    parts = solve_nonnegative(design, squares)
+    parts = nnls(design, squares)[0]
     structure = float((design[:, known:] @ parts[known:])[-1])
     if structure < _GROWN * squares[-1] or windows < _FEWEST_LASTING:
         # Differences grow a little with the time between them by chance: that is not structure.
-        parts[:known] = solve_nonnegative(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])
+        parts[:known] = nnls(design[:_FORGOTTEN, :known], squares[:_FORGOTTEN])[0]
         parts[known:] = 0.0
     # Noise within two standard errors of the first square cannot be told from none.
     least = 2.0 * math.sqrt(2.0 * _PAIRS_EACH / max(windows, 1)) * float(squares[0])

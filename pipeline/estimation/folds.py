@@ -10,7 +10,6 @@ import numpy as np
 
 from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
-from pipeline.core.compute import map_parallel
 from pipeline.estimation.fit import PartFit, measure_loss, solve_step
 from pipeline.estimation.parts import Part
 from pipeline.estimation.state import (
@@ -218,7 +217,7 @@ def hold_out(problem: Problem, fitted: Fitted, learn: Learn | None = None) -> He
         fitted: the fit.
         learn: given the fitted state and the training windows, the effects to add to each run by its number.
     """
-    scored = map_parallel(partial(_score_fold, problem, fitted, learn), range(len(problem.training)))
+    scored = [_score_fold(problem, fitted, learn, fold) for fold in range(len(problem.training))]
     residuals = np.full((problem.whole.run.size, 3), np.nan)
     errors = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
     for fold, (held, reached) in zip(problem.folds, scored, strict=True):

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import cast
 
 from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
-from pipeline.core.compute import Budget, map_parallel
+from pipeline.core.compute import Budget
 from pipeline.estimation.acceptance import HALVES, LEAST_T, Improvement, compare, is_nameable
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.evidence import Evidence, Hypothesis, Noise
@@ -70,14 +70,6 @@ class Context:
     def has_gyro(self) -> bool:
         """Whether every run has a good gyro as heading and clock."""
         return all(comparison.has_gyro for comparison in self.problem.comparisons)
-
-    def list_shared(self) -> list[object]:
-        """Large objects that stay as they are throughout."""
-        problems = [self.problem, *([self.problem.behind_wheels] if self.has_encoders else [])]
-        return [
-            *problems,
-            *(one for problem in problems for one in (*vars(problem).values(), *problem.parts)),
-        ]
 
     @cached_property
     def conditions(self) -> Conditions:
@@ -252,7 +244,7 @@ class Selection:
 
     def enter_each(self, starts: Sequence[State | PartFit], useful: float = math.inf) -> list[CandidateModel]:
         """Fit states, those to the end that may reach a loss that makes them useful."""
-        fitted = map_parallel(partial(fit_part, self.part, self.weights, useful=useful), starts)
+        fitted = [fit_part(self.part, self.weights, start, useful=useful) for start in starts]
         return [CandidateModel(self.part, fit, self.folds) for fit in fitted]
 
     def approach_each(
@@ -267,7 +259,7 @@ class Selection:
             states: it with other effects or values.
             useful: loss that makes a state useful.
         """
-        tried = map_parallel(partial(try_part, self.part, self.weights, base=base.fit), states)
+        tried = [try_part(self.part, self.weights, state, base=base.fit) for state in states]
         models = [CandidateModel(self.part, fit, self.folds, is_rough=True) for fit in tried]
         grids = len(base.fit.free) - len(base.fit.smooth)
         near = [

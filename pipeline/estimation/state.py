@@ -94,7 +94,7 @@ class Weights:
         return float(self.cost(residual).mean())
 
 
-@compiled("float64[:, :], float64[:, :], float64[:, :], float64[:]")
+@compiled("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])")
 def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> None:
     """See `Weights.cost`."""
     for row in range(residual.shape[0]):

@@ -63,9 +63,70 @@ def boost(bins: Bytes, target: Floats, unseen: Bytes) -> Floats:
     return predicted
 
 
+@compiled()
+def _copy(source: Floats, target: Floats) -> None:
+    for feature in range(source.shape[0]):
+        for index in range(_BINS):
+            target[feature, index] = source[feature, index]
+
+
+@compiled()
+def _take_off(part: Floats, whole: Floats) -> None:
+    for feature in range(part.shape[0]):
+        for index in range(_BINS):
+            whole[feature, index] -= part[feature, index]
+
+
+@compiled()
+def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) -> None:
+    """Count some rows, and sum the residuals in them, by feature and bin."""
+    count[:] = 0.0
+    total[:] = 0.0
+    for row in rows:
+        for feature in range(bins.shape[1]):
+            index = bins[row, feature]
+            count[feature, index] += 1.0
+            total[feature, index] += rest[row]
+
+
+@compiled()
+def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
+    """What the best split of a leaf gains, and the last bin on its left, numbered through all features."""
+    rows, whole = count[0].sum(), total[0].sum()
+    best, last = -np.inf, 0
+    for feature in range(count.shape[0]):
+        below, summed = 0.0, 0.0
+        for index in range(_BINS):
+            below += count[feature, index]
+            summed += total[feature, index]
+            if min(below, rows - below) < _LEAST_ROWS:
+                continue
+            gained = summed**2 / (below + _RIDGE) + (whole - summed) ** 2 / (rows - below + _RIDGE)
+            if gained > best:
+                best, last = gained, feature * _BINS + index
+    return best - whole**2 / (rows + _RIDGE), last
+
+
+@compiled()
+def _part_rows(rows: Ints, bins: Bytes, split: int, aside: Ints) -> int:
+    """Put the rows on the left of a split before the others, each side in order; how many they are."""
+    feature, last = split // _BINS, split % _BINS
+    front, count = 0, 0
+    for row in rows:
+        if bins[row, feature] <= last:
+            rows[front] = row
+            front += 1
+        else:
+            aside[count] = row
+            count += 1
+    for row in range(count):
+        rows[front + row] = aside[row]
+    return front
+
+
 @compiled(
-    "uint8[:, :], float64[:], uint8[:, :], float64[:], int64[:], int64[:], int64[:], float64[:, :, :], "
-    "float64[:, :, :], int64[:, :], int64[:, :], float64[:], int64[:]"
+    "void(uint8[:, ::1], float64[::1], uint8[:, ::1], float64[::1], int64[::1], int64[::1], int64[::1], "
+    "float64[:, :, ::1], float64[:, :, ::1], int64[:, ::1], int64[:, ::1], float64[::1], int64[::1])"
 )
 def _grow_trees(
     bins: Bytes,
@@ -132,67 +193,6 @@ def _grow_trees(
                 rest[row] -= value
             for row in asked[begin[1, leaf] : end[1, leaf]]:
                 predicted[row] += value
-
-
-@compiled()
-def _copy(source: Floats, target: Floats) -> None:
-    for feature in range(source.shape[0]):
-        for index in range(_BINS):
-            target[feature, index] = source[feature, index]
-
-
-@compiled()
-def _take_off(part: Floats, whole: Floats) -> None:
-    for feature in range(part.shape[0]):
-        for index in range(_BINS):
-            whole[feature, index] -= part[feature, index]
-
-
-@compiled()
-def _tally(bins: Bytes, rest: Floats, rows: Ints, count: Floats, total: Floats) -> None:
-    """Count some rows, and sum the residuals in them, by feature and bin."""
-    count[:] = 0.0
-    total[:] = 0.0
-    for row in rows:
-        for feature in range(bins.shape[1]):
-            index = bins[row, feature]
-            count[feature, index] += 1.0
-            total[feature, index] += rest[row]
-
-
-@compiled()
-def _find_split(count: Floats, total: Floats) -> tuple[float, int]:
-    """What the best split of a leaf gains, and the last bin on its left, numbered through all features."""
-    rows, whole = count[0].sum(), total[0].sum()
-    best, last = -np.inf, 0
-    for feature in range(count.shape[0]):
-        below, summed = 0.0, 0.0
-        for index in range(_BINS):
-            below += count[feature, index]
-            summed += total[feature, index]
-            if min(below, rows - below) < _LEAST_ROWS:
-                continue
-            gained = summed**2 / (below + _RIDGE) + (whole - summed) ** 2 / (rows - below + _RIDGE)
-            if gained > best:
-                best, last = gained, feature * _BINS + index
-    return best - whole**2 / (rows + _RIDGE), last
-
-
-@compiled()
-def _part_rows(rows: Ints, bins: Bytes, split: int, aside: Ints) -> int:
-    """Put the rows on the left of a split before the others, each side in order; how many they are."""
-    feature, last = split // _BINS, split % _BINS
-    front, count = 0, 0
-    for row in rows:
-        if bins[row, feature] <= last:
-            rows[front] = row
-            front += 1
-        else:
-            aside[count] = row
-            count += 1
-    for row in range(count):
-        rows[front + row] = aside[row]
-    return front
 
 
 # Terms for what no effect of the catalogue takes: one-sided and world-frame formulas.

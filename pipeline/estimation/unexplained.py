@@ -6,13 +6,11 @@ import math
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
 from pipeline.core.arrays import Bytes, Flags, Floats, student_quantile
-from pipeline.core.compute import map_parallel
 from pipeline.estimation.acceptance import DECIDED_T, LEAST_TURN_RAD, LEAST_WAY_SHARE, compare_rivals
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
@@ -206,10 +204,10 @@ def measure_asked(selection: Selection) -> Floats:
 def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
     """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
     asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
-    scored = map_parallel(partial(_boost_fold, part, rest, bin_features(features)), asked)
+    bins = bin_features(features)
     stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
-    for (fold, channel), values in zip(asked, scored, strict=True):
-        predicted[stretch % _FOLDS == fold, channel] = values
+    for fold, channel in asked:
+        predicted[stretch % _FOLDS == fold, channel] = _boost_fold(part, rest, bins, (fold, channel))
     return predicted
 
 

@@ -46,7 +46,29 @@ def set_states(signal: Floats, resets: Resets, start: Floats) -> Floats:
     return states
 
 
-@compiled("float64[:], float64[:], float64, float64, float64[:]")
+@compiled()
+def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
+    """Mean and last value in a cell of a state that approaches its goal by at most ``most``."""
+    gap = goal - state
+    size = abs(gap)
+    if size < most:
+        return goal - gap * size / (2.0 * most), goal
+    step = most if gap > 0.0 else -most
+    return state + 0.5 * step, state + step
+
+
+@compiled()
+def _pull(goal: float, state: float, tau: float, limit: float, time: float) -> tuple[float, float]:
+    """Integral and last value of a state that approaches its goal for some time: a ramp, then a lag."""
+    gap = state - goal
+    ramp = min(max(abs(gap) / limit - tau, 0.0), time)
+    gone = limit * ramp if gap > 0.0 else -limit * ramp
+    rest = gap - gone
+    grown = -math.expm1((ramp - time) / tau)
+    return goal * time + ramp * (gap - 0.5 * gone) + tau * rest * grown, goal + rest * (1.0 - grown)
+
+
+@compiled("void(float64[::1], float64[::1], float64, float64, float64[::1])")
 def _lag(signal: Floats, states: Floats, tau: float, step_s: float, lagged: Floats) -> None:
     """Cell means of a first-order lag.
 
@@ -90,7 +112,7 @@ def limit_rate(signal: Floats, limit: float, step_s: float, resets: Resets, star
     return limited
 
 
-@compiled("float64[:], float64[:], float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64, float64[::1])")
 def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None:
     """Cell means of a signal that follows its input by at most ``most`` per cell.
 
@@ -114,17 +136,6 @@ def _limit(signal: Floats, states: Floats, most: float, limited: Floats) -> None
         limited[cell], state = _approach(asked, state, most)
 
 
-@compiled()
-def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
-    """Mean and last value in a cell of a state that approaches its goal by at most ``most``."""
-    gap = goal - state
-    size = abs(gap)
-    if size < most:
-        return goal - gap * size / (2.0 * most), goal
-    step = most if gap > 0.0 else -most
-    return state + 0.5 * step, state + step
-
-
 def lag_within(
     signal: Floats, tau: float, limit: float, step_s: float, resets: Resets, start: Floats
 ) -> Floats:
@@ -145,7 +156,7 @@ def lag_within(
     return lagged
 
 
-@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64, float64, float64, float64[::1])")
 def _lag_within(
     signal: Floats, states: Floats, tau: float, limit: float, step_s: float, lagged: Floats
 ) -> None:
@@ -169,17 +180,6 @@ def _lag_within(
             state = 0.0
 
 
-@compiled()
-def _pull(goal: float, state: float, tau: float, limit: float, time: float) -> tuple[float, float]:
-    """Integral and last value of a state that approaches its goal for some time: a ramp, then a lag."""
-    gap = state - goal
-    ramp = min(max(abs(gap) / limit - tau, 0.0), time)
-    gone = limit * ramp if gap > 0.0 else -limit * ramp
-    rest = gap - gone
-    grown = -math.expm1((ramp - time) / tau)
-    return goal * time + ramp * (gap - 0.5 * gone) + tau * rest * grown, goal + rest * (1.0 - grown)
-
-
 def lag_unevenly(
     signal: Floats, taus: tuple[float, float], step_s: float, resets: Resets, start: Floats
 ) -> Floats:
@@ -198,7 +198,7 @@ def lag_unevenly(
     return lagged
 
 
-@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64, float64, float64, float64[::1])")
 def _lag_unevenly(
     signal: Floats, states: Floats, up: float, down: float, step_s: float, lagged: Floats
 ) -> None:
@@ -265,7 +265,7 @@ def follow_with_play(signal: Floats, half: float, resets: Resets) -> Floats:
     return followed
 
 
-@compiled("float64[:], float64[:], float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64, float64[::1])")
 def _follow(signal: Floats, states: Floats, half: float, followed: Floats) -> None:
     """See `follow_with_play`."""
     now = signal[0]
@@ -299,7 +299,7 @@ def swing_signal(
     return swung
 
 
-@compiled("float64[:], float64[:], float64, float64, float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64, float64, float64, float64[::1])")
 def _swing(signal: Floats, states: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
     """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs constant in a cell."""
     rate, turned = damping / tau, abs(damping * damping - 1.0) ** 0.5 / tau

@@ -60,49 +60,6 @@ def walk_each(
     return rolled
 
 
-@compiled(
-    "float64[:, :, :], int64[:], int64[:], float64[:, :, :], float64, float64[:], int64, float64[:, :, :]"
-)
-def _walk(
-    asked: Floats,
-    source: Ints,
-    at: Ints,
-    states: Floats,
-    step_s: float,
-    rows: Floats,
-    count: int,
-    rolled: Floats,
-) -> None:
-    """Implicit midpoint rule, with a grip that is extrapolated.
-
-    Args:
-        asked: inputs, shape (k, 3, n).
-        source: input of each lane, shape (lanes,).
-        at: cells before which states are set, shape (e,).
-        states: speeds of both sides set there, and whether they are those at the start of a prediction,
-            shape (e, 3, lanes).
-        step_s: width of a cell [s].
-        rows: all that belongs to each lane: its numbers, and zeros.
-        count: number of lanes that are wanted.
-        rolled: the result [m/s], shape (`count` or more, 2, n).
-    """
-    event, lanes = 0, source.size
-    for cell in range(asked.shape[2]):
-        for k in range(lanes):
-            rows[_LEFT + k], rows[_RIGHT + k] = asked[source[k], 0, cell], asked[source[k], 1, cell]
-            rows[_IDLE + k] = asked[source[k], 2, cell]
-        if event < at.size and at[event] == cell:
-            _set_states(rows, lanes, states, event)
-            event += 1
-        _approach(rows, lanes, step_s)
-        for _ in range(3):
-            if _solve(rows, lanes, step_s) == 0:
-                break
-        _step(rows, lanes, step_s)
-        for k in range(count):
-            rolled[k, 0, cell], rolled[k, 1, cell] = rows[_MEAN_LEFT + k], rows[_MEAN_RIGHT + k]
-
-
 @compiled()
 def _set_states(rows: Floats, lanes: int, states: Floats, event: int) -> None:
     """Set the speeds of both sides; the body moves along, as its slip is not measured."""
@@ -117,6 +74,12 @@ def _set_states(rows: Floats, lanes: int, states: Floats, event: int) -> None:
         held = 0.5 * _OBSERVED * rows[_GAIN + k] * (new_right - new_left) * states[event, 2, k]
         rows[_PUSH_LEFT + k] -= held
         rows[_PUSH_RIGHT + k] += held
+
+
+@compiled()
+def _grip(speed: float, slipped: float, rolling: float, rest: float, scrub: float) -> float:
+    """Force of a side over its slip [1/s], from its speed and its squared slip in all directions."""
+    return 0.5 / math.sqrt(slipped * scrub + (rolling * speed * speed + rest))
 
 
 @compiled()
@@ -144,6 +107,13 @@ def _approach(rows: Floats, lanes: int, step_s: float) -> None:
         rows[_ASKED_LEFT + k] = gain * rows[_LEFT + k] + push_left
         rows[_ASKED_RIGHT + k] = gain * rows[_RIGHT + k] + push_right
         rows[_FREE_LEFT + k], rows[_FREE_RIGHT + k] = 1.0, 1.0
+
+
+@compiled()
+def _find_most(pull: float, speed: float, bound: float, slope: float) -> float:
+    """Largest push of a side [m/s^2] in the direction of a pull, at its speed [m/s]."""
+    most = bound - math.copysign(slope * speed, pull * speed)
+    return max(most, 0.0)
 
 
 @compiled()
@@ -193,6 +163,14 @@ def _solve(rows: Floats, lanes: int, step_s: float) -> int:
 
 
 @compiled()
+def _hold(grown: float, pull: float, most: float) -> float:
+    """What an integral part grows by: not beyond the largest push."""
+    room = most - abs(pull)
+    room = max(room, 0.0)
+    return math.copysign(room, grown) if (grown * pull > 0.0) & (abs(grown) > room) else grown
+
+
+@compiled()
 def _step(rows: Floats, lanes: int, step_s: float) -> None:
     """The state at the end of a cell."""
     for k in range(lanes):
@@ -215,22 +193,45 @@ def _step(rows: Floats, lanes: int, step_s: float) -> None:
         rows[_AHEAD + k], rows[_TURN + k] = rows[_MEAN_V + k] + step_v, rows[_MEAN_W + k] + step_w
 
 
-@compiled()
-def _grip(speed: float, slipped: float, rolling: float, rest: float, scrub: float) -> float:
-    """Force of a side over its slip [1/s], from its speed and its squared slip in all directions."""
-    return 0.5 / math.sqrt(slipped * scrub + (rolling * speed * speed + rest))
+@compiled(
+    "void(float64[:, :, ::1], int64[::1], int64[::1], float64[:, :, ::1], float64, float64[::1], int64, "
+    "float64[:, :, ::1])"
+)
+def _walk(
+    asked: Floats,
+    source: Ints,
+    at: Ints,
+    states: Floats,
+    step_s: float,
+    rows: Floats,
+    count: int,
+    rolled: Floats,
+) -> None:
+    """Implicit midpoint rule, with a grip that is extrapolated.
 
-
-@compiled()
-def _find_most(pull: float, speed: float, bound: float, slope: float) -> float:
-    """Largest push of a side [m/s^2] in the direction of a pull, at its speed [m/s]."""
-    most = bound - math.copysign(slope * speed, pull * speed)
-    return max(most, 0.0)
-
-
-@compiled()
-def _hold(grown: float, pull: float, most: float) -> float:
-    """What an integral part grows by: not beyond the largest push."""
-    room = most - abs(pull)
-    room = max(room, 0.0)
-    return math.copysign(room, grown) if (grown * pull > 0.0) & (abs(grown) > room) else grown
+    Args:
+        asked: inputs, shape (k, 3, n).
+        source: input of each lane, shape (lanes,).
+        at: cells before which states are set, shape (e,).
+        states: speeds of both sides set there, and whether they are those at the start of a prediction,
+            shape (e, 3, lanes).
+        step_s: width of a cell [s].
+        rows: all that belongs to each lane: its numbers, and zeros.
+        count: number of lanes that are wanted.
+        rolled: the result [m/s], shape (`count` or more, 2, n).
+    """
+    event, lanes = 0, source.size
+    for cell in range(asked.shape[2]):
+        for k in range(lanes):
+            rows[_LEFT + k], rows[_RIGHT + k] = asked[source[k], 0, cell], asked[source[k], 1, cell]
+            rows[_IDLE + k] = asked[source[k], 2, cell]
+        if event < at.size and at[event] == cell:
+            _set_states(rows, lanes, states, event)
+            event += 1
+        _approach(rows, lanes, step_s)
+        for _ in range(3):
+            if _solve(rows, lanes, step_s) == 0:
+                break
+        _step(rows, lanes, step_s)
+        for k in range(count):
+            rolled[k, 0, cell], rolled[k, 1, cell] = rows[_MEAN_LEFT + k], rows[_MEAN_RIGHT + k]

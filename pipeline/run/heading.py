@@ -59,7 +59,7 @@ class Grid:
         return places
 
 
-@compiled("float64[:], float64[:], float64[:], int64[:], float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64[::1], int64[::1], float64, float64[::1])")
 def _locate_edges(
     at: Floats, starts: Floats, ends: Floats, first: Ints, step_s: float, places: Floats
 ) -> None:
@@ -150,7 +150,7 @@ class MeasuredDrive:
         return Wheels(left, right, steering, rest[-1] if self._drifts else None)
 
 
-@compiled("float64[:], float64[:], float64[:, :], float64[:, :]")
+@compiled("void(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1])")
 def _interpolate(at: Floats, knots: Floats, values: Floats, signals: Floats) -> None:
     """Signals at times, linear between knots and constant outside.
 
@@ -242,7 +242,7 @@ def average_held(times: Floats, values: Floats, grid: Grid) -> Floats:
     return means
 
 
-@compiled("float64[:], float64[:], float64[:], float64, float64[:]")
+@compiled("void(float64[::1], float64[::1], float64[::1], float64, float64[::1])")
 def _average_held(times: Floats, values: Floats, middles: Floats, step_s: float, means: Floats) -> None:
     """See `average_held`."""
     first, last = 0, times.size - 1

@@ -305,7 +305,9 @@ def find_gaps(
     return gaps
 
 
-@compiled("float64[:], float64[:], float64[:], complex128[:], float64, complex128[:], float64[:]")
+@compiled(
+    "void(float64[::1], float64[::1], float64[::1], complex128[::1], float64, complex128[::1], float64[::1])"
+)
 def _integrate(
     x: Floats, y: Floats, w: Floats, heading: Complex, step_s: float, path: Complex, angle: Floats
 ) -> None:
@@ -318,7 +320,9 @@ def _integrate(
         path[cell + 1], angle[cell + 1] = position, turn
 
 
-@compiled("complex128[:], float64[:], int64[:], float64[:], int64[:], complex128[:], float64[:]")
+@compiled(
+    "void(complex128[::1], float64[::1], int64[::1], float64[::1], int64[::1], complex128[::1], float64[::1])"
+)
 def _average_nodes(
     path: Complex, angle: Floats, index: Ints, beyond: Floats, first: Ints, reached: Complex, faced: Floats
 ) -> None:
@@ -335,8 +339,8 @@ def _average_nodes(
 
 
 @compiled(
-    "complex128[:], float64[:], int64[:], int64[:], complex128[:], complex128[:], float64[:], float64[:], "
-    "float64[:, :]"
+    "void(complex128[::1], float64[::1], int64[::1], int64[::1], complex128[::1], complex128[::1], "
+    "float64[::1], float64[::1], float64[:, ::1])"
 )
 def _find_gaps(
     reached: Complex,
@@ -386,7 +390,8 @@ def average_spans(
 
 
 @compiled(
-    "float64[:], float64, int64[:], float64[:], int64[:], float64[:], float64[:], float64[:], float64[:]"
+    "void(float64[::1], float64, int64[::1], float64[::1], int64[::1], float64[::1], float64[::1], "
+    "float64[::1], float64[::1])"
 )
 def _average_spans(
     signal: Floats,

@@ -196,55 +196,6 @@ class ContactFriction(JointBody):
 ) = (LANES * row for row in range(15))  # fmt: skip
 
 
-@compiled(
-    "float64[:, :, :], int64[:], int64[:], float64[:, :, :], float64, int64, float64[:], int64, "
-    "float64[:, :, :]"
-)
-def _slide(
-    rolled: Floats,
-    source: Ints,
-    at: Ints,
-    states: Floats,
-    step_s: float,
-    steps: int,
-    rows: Floats,
-    count: int,
-    moved: Floats,
-) -> None:
-    """Cell means of the body velocity by the implicit midpoint rule, with the friction of each step's start.
-
-    Args:
-        rolled: rolling speeds [m/s] and yaw rates [rad/s], shape (k, 2, n).
-        source: index of these for each body, shape (lanes,).
-        at: cells before which velocities are set, shape (e,); the first one is among them.
-        states: these velocities, shape (e, 3, lanes).
-        step_s: width of a cell [s].
-        steps: number of integration steps per cell.
-        rows: all that belongs to each body: its numbers, and zeros.
-        count: number of bodies that are wanted.
-        moved: the result [m/s, m/s, rad/s], shape (`count` or more, 3, n).
-    """
-    event, lanes = 0, source.size
-    for cell in range(rolled.shape[2]):
-        if event < at.size and at[event] == cell:
-            for k in range(lanes):
-                rows[_X + k], rows[_Y + k] = states[event, 0, k], states[event, 1, k]
-                rows[_W + k] = states[event, 2, k]
-            event += 1
-        for k in range(lanes):
-            v0, w0, creep = rolled[source[k], 0, cell], rolled[source[k], 1, cell], rows[_CREEP + k]
-            left, right = v0 - rows[_ASIDE + k] * w0, v0 + rows[_ASIDE + k] * w0
-            rows[_LEFT + k], rows[_RIGHT + k] = left, right
-            rows[_ROLLING_LEFT + k] = creep * (left * left + _REST_MPS * _REST_MPS)
-            rows[_ROLLING_RIGHT + k] = creep * (right * right + _REST_MPS * _REST_MPS)
-            rows[_MEAN_X + k], rows[_MEAN_Y + k], rows[_MEAN_W + k] = 0.0, 0.0, 0.0
-        for _ in range(steps):
-            _step(rows, lanes, step_s / steps)
-        for k in range(count):
-            moved[k, 0, cell], moved[k, 1, cell] = rows[_MEAN_X + k] / steps, rows[_MEAN_Y + k] / steps
-            moved[k, 2, cell] = rows[_MEAN_W + k] / steps
-
-
 @compiled()
 def _step(rows: Floats, lanes: int, step: float) -> None:
     """One step of every body, added to its means."""
@@ -289,3 +240,52 @@ def _step(rows: Floats, lanes: int, step: float) -> None:
         rows[_MEAN_Y + k] += 0.5 * (before_y + y)
         rows[_MEAN_W + k] += w + 0.5 * change_w
         rows[_X + k], rows[_Y + k], rows[_W + k] = x, y, w + change_w
+
+
+@compiled(
+    "void(float64[:, :, ::1], int64[::1], int64[::1], float64[:, :, ::1], float64, int64, float64[::1], "
+    "int64, float64[:, :, ::1])"
+)
+def _slide(
+    rolled: Floats,
+    source: Ints,
+    at: Ints,
+    states: Floats,
+    step_s: float,
+    steps: int,
+    rows: Floats,
+    count: int,
+    moved: Floats,
+) -> None:
+    """Cell means of the body velocity by the implicit midpoint rule, with the friction of each step's start.
+
+    Args:
+        rolled: rolling speeds [m/s] and yaw rates [rad/s], shape (k, 2, n).
+        source: index of these for each body, shape (lanes,).
+        at: cells before which velocities are set, shape (e,); the first one is among them.
+        states: these velocities, shape (e, 3, lanes).
+        step_s: width of a cell [s].
+        steps: number of integration steps per cell.
+        rows: all that belongs to each body: its numbers, and zeros.
+        count: number of bodies that are wanted.
+        moved: the result [m/s, m/s, rad/s], shape (`count` or more, 3, n).
+    """
+    event, lanes = 0, source.size
+    for cell in range(rolled.shape[2]):
+        if event < at.size and at[event] == cell:
+            for k in range(lanes):
+                rows[_X + k], rows[_Y + k] = states[event, 0, k], states[event, 1, k]
+                rows[_W + k] = states[event, 2, k]
+            event += 1
+        for k in range(lanes):
+            v0, w0, creep = rolled[source[k], 0, cell], rolled[source[k], 1, cell], rows[_CREEP + k]
+            left, right = v0 - rows[_ASIDE + k] * w0, v0 + rows[_ASIDE + k] * w0
+            rows[_LEFT + k], rows[_RIGHT + k] = left, right
+            rows[_ROLLING_LEFT + k] = creep * (left * left + _REST_MPS * _REST_MPS)
+            rows[_ROLLING_RIGHT + k] = creep * (right * right + _REST_MPS * _REST_MPS)
+            rows[_MEAN_X + k], rows[_MEAN_Y + k], rows[_MEAN_W + k] = 0.0, 0.0, 0.0
+        for _ in range(steps):
+            _step(rows, lanes, step_s / steps)
+        for k in range(count):
+            moved[k, 0, cell], moved[k, 1, cell] = rows[_MEAN_X + k] / steps, rows[_MEAN_Y + k] / steps
+            moved[k, 2, cell] = rows[_MEAN_W + k] / steps
