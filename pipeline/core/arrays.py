@@ -368,7 +368,7 @@ def solve_banded(matrix: Floats, right: Floats) -> Floats:
         right: right-hand side, shape (n,).
     """
     count = right.size
-    lower = np.zeros(matrix.shape)
-    for below, diagonal in enumerate(matrix):
+    lower = np.zeros((min(matrix.shape[0], count), count))
+    for below, diagonal in enumerate(matrix[:count]):
         lower[below, : count - below] = diagonal[below:]
     return np.asarray(scipy.linalg.solveh_banded(lower, right, lower=True))

@@ -85,7 +85,8 @@ def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
     above = float(mannwhitneyu(second, first, method="asymptotic").statistic)
-    return 2.0 * above / (first.size * second.size) - 1.0
+    pairs = first.size * second.size
+    return (above - (pairs - above)) / pairs
 
 
 def name_delta(delta: float) -> str:
