@@ -116,19 +116,6 @@ hidden-effect-score: $(VENV)/.ready-dev ## ANSWERS=dir: score answers to the pub
 hidden-effect-baselines: $(VENV)/.ready-dev ## the baselines of the public test on rings/, with their scores [ARGS="--only sparse slip"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/hidden_effect/run_baselines.py $$ARGS
 
-pose-ages: $(VENV)/.ready-dev ## how near the ages of poses are to those of the gyro where it is withheld [ARGS="LOG... --set NAME=VALUE"]
-	@$(BIN)/python benchmarks/pose_ages.py $$ARGS
-
-late-starts: $(VENV)/.ready-dev ## whether starts that the wheels show to be late are late in the gyro, too [ARGS=WORD]
-	@$(BIN)/python benchmarks/late_starts.py $$ARGS
-
-ablate: $(VENV)/.ready-dev ## ablation: each rule of the diagnosis off in turn, on drawn logs and the recordings [SEED=81000-81038, SCORES=file, ARGS=]
-	@$(BIN)/python benchmarks/hidden/ablate.py --seeds "$${SEED:-81000-81038}" $${SCORES:+--out "$$SCORES" --resume} $$ARGS
-
-hidden-table: $(VENV)/.ready-dev ## SCORES=scores.jsonl: the scores of games played before
-	@[ -n "$$SCORES" ] || { echo "Say which: make hidden-table SCORES=scores.jsonl" >&2; exit 2; }
-	@$(BIN)/python benchmarks/hidden/play.py --table "$$SCORES"
-
 mysteries: $(VENV)/.ready-dev ## make the mystery logs in data_samples again, and their seals
 	$(BIN)/python benchmarks/hidden/mystery.py write data_samples
 
@@ -153,9 +140,6 @@ bench-batch: $(VENV)/.ready-dev ## batches of 10, 100 and 1,000 logs, on one and
 damage-results: $(VENV)/.ready-dev ## every byte of small results changed, files deleted, added and swapped: detected or not
 	$(BIN)/python benchmarks/damage_results.py $$ARGS
 
-bench-fleet: $(VENV)/.ready-dev ## levels, causes and trends of 300 runs: time and memory [ARGS="--runs 300"]
-	$(BIN)/python benchmarks/fleet_speed.py $$ARGS
-
 bench-check: $(VENV)/.ready-dev ## false alarms, power and causes of slip check [PART=null|power|causes|real, ARGS="--pairs 24"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/check.py "$${PART:-null}" $$ARGS
 
@@ -164,9 +148,6 @@ bench-constants: $(VENV)/.ready-dev ## effect of half and double of each constan
 
 bench-terrain: $(VENV)/.ready-dev ## slip by number of passes: drawn drives with truth and without, recordings [PART=drawn|real, ARGS="--runs 6"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/terrain.py "$${PART:-drawn}" $$ARGS
-
-run-spreads: $(VENV)/.ready-dev ## how much lags and dead times differ from run to run of the real recordings [ARGS="--results results"]
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/run_spreads.py $$ARGS
 
 check-again: $(VENV)/.ready-dev ## the stored measurements of bench-check, evaluated again [FILE=null.jsonl, PART=null|power, ARGS="--trials 400"]
 	@[ -n "$$FILE" ] || { echo "Say which: make check-again FILE=null.jsonl" >&2; exit 2; }
@@ -196,12 +177,6 @@ bench-writer: $(VENV)/.ready-dev ## serializing messages: ours beside mcap-ros2-
 rivals: $(VENV)/.ready-dev ## the named physics, models of the literature and learned ones on the real recordings [ARGS="--input measured"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/rivals.py $$ARGS
 
-learned-bands: $(VENV)/.ready-dev ## coverage of the bands of a learned term on a terrain left out
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/learned_bands.py $$ARGS
-
-few-shot: $(VENV)/.ready-dev ## a terrain of OUT left out: error of the fleet's prediction there and of fits to 5, 20, 60 s [OUT=results, ARGS=]
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/few_shot.py "$$OUT" $$ARGS
-
 fleets: $(VENV)/.ready-dev ## simulated fleets: levels (vehicle, terrain, run) at which hidden effects are found [ARGS="--fleets 4"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/fleets.py $$ARGS
 
@@ -222,12 +197,6 @@ live-replay: $(VENV)/.ready-dev ## cost of `slip watch ws://...`: CPU, memory, d
 
 watch-replay: $(VENV)/.ready-dev ## `slip watch` on growing drawn logs, compared with the final diagnosis [ARGS="--logs 20 --seed 0"]
 	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/watch.py $$ARGS
-
-plan-compare: $(VENV)/.ready-dev ## seconds until a question is answered: plans, DRIVE, figure eights, a person [ARGS="--seeds 3"]
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/plan_compare.py $$ARGS
-
-log-seconds: $(VENV)/.ready-dev ## seconds of each real recording that a diagnosis needs, as driven and in the best order
-	@OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/python benchmarks/log_seconds.py $$ARGS
 
 damage-season: $(VENV)/.ready-dev ## handling of each kind of odd entry in a folder of logs
 	$(BIN)/python tests/batch/damage_season.py
