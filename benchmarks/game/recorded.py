@@ -9,38 +9,34 @@ the injected effect has no number.
 from __future__ import annotations
 
 import math
-import sys
 import tempfile
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 import numpy as np
 import polars as pl
-from held_out import HeldOut, compose, measure_error, relate, walk
 from injections import Drive, Injection, list_injections
 from numpy.typing import NDArray
-from task_draws import HORIZON_S, NAMES, SIMULATED, Hidden
-from task_files import (
+
+from game.held_out import HORIZON_S, HeldOut, compose, measure_error, relate, walk
+from game.rings import (
     FORCE_STEP,
     GYRO_STEP,
     POSITION_STEP,
-    TRUTH_FORMAT,
     TURN_STEP,
-    VERSION,
     WHEEL_STEP,
+    derive,
+    describe_effect,
     describe_held_out,
-    describe_hidden,
-    list_topics,
+    format_truth,
+    list_names,
     round_to,
     write_held_out,
     write_manifest,
     write_sheet,
 )
-
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -76,27 +72,28 @@ class Recorded:
     end_s: float
 
 
-def make_real(ring: Path, recordings: Path, tell: Callable[[str], None]) -> Json:
+def make_real(ring: Path, recordings: Path, root: bytes, tell: Callable[[str], None]) -> dict[str, Json]:
     """Write a task for each recording that serves, the effects in turn.
 
     Args:
         ring: folder of the ring.
         recordings: folder of MCAP files.
+        root: from which salts follow.
         tell: called with a line after each.
 
     Returns:
-        The truth of the ring.
+        The truths of its tasks.
     """
     injections = list_listed()
-    truth: dict[str, Json] = {}
+    truths: dict[str, Json] = {}
     for path in sorted(recordings.glob("*.mcap")):
-        name, injection = f"real_{len(truth) + 1:03d}", injections[len(truth) % len(injections)]
+        name, injection = f"real_{len(truths) + 1:03d}", injections[len(truths) % len(injections)]
         try:
-            truth[name] = write_real(path, name, injection, ring / name)
+            truths[name] = write_real(path, name, injection, ring / name, derive(root, f"{name} salt").hex())
             tell(f"{name}  {path.name}: {injection.name}")
         except SlipError as problem:
             tell(f"{path.name}: left out: {problem}")
-    return {"format": TRUTH_FORMAT, "version": VERSION, "ring": "real", "tasks": truth}
+    return truths
 
 
 def list_listed() -> list[Injection]:
@@ -108,7 +105,7 @@ def list_listed() -> list[Injection]:
     ]
 
 
-def write_real(path: Path, name: str, injection: Injection, folder: Path) -> Json:
+def write_real(path: Path, name: str, injection: Injection, folder: Path, salt: str) -> Json:
     """Write the task of one recording.
 
     Raises:
@@ -134,24 +131,18 @@ def write_real(path: Path, name: str, injection: Injection, folder: Path) -> Jso
     later = times >= recorded.log_s
     named = {"time_s": times[later], "speed_mps": speed[later], "yaw_rate_radps": turn[later]}
     write_held_out(folder, held, named, FIRST_NS)
-    sheet = {"kind": "skid_steer", "wheel_radius_m": drive.radius_m, "track_width_m": drive.track_m}
+    sheet = {"kind": "differential", "wheel_radius_m": drive.radius_m, "track_width_m": drive.track_m}
     write_sheet(folder, sheet | {"wheelbase_m": vehicle.wheelbase_m or drive.track_m, "wheels_per_side": 2})
-    write_manifest(folder, name, recorded.log_s, sensors, list_topics("skid_steer", sensors[1:]))
-    first, *rest = dict.fromkeys(SIMULATED[label.split(".")[0]] for label in injection.numbers)
-    same = tuple(dict.fromkeys((*rest, *NAMES[first].get("same_as", ()))))
-    hidden = Hidden(first, dict.fromkeys(NAMES[first]["parameters"]), same)
-    return {
-        "effects": [describe_hidden(hidden)],
+    first, *rest = dict.fromkeys(label.split(".")[0] for label in injection.numbers)
+    truth = {
+        "effects": [describe_effect(first, {}) | {"same_as": rest}],
         "unlisted": None,
-        "tolerated": ["other", *NAMES],
+        "tolerated": ["other", *list_names()],
         "held_out": describe_held_out(held, floor=None),
-        "scene": {
-            "kind": "skid_steer",
-            "driving": "recorded",
-            "sensors": sensors,
-            "cause": f"{injection.name}, in {path.name}",
-        },
+        "scene": {"category": "real", "note": f"{injection.name}, in {path.name}", "salt": salt},
     }
+    write_manifest(folder, name, recorded.log_s, sensors, "differential", format_truth(truth))
+    return truth
 
 
 def refuse(what: str, where: str) -> SlipError:
@@ -226,11 +217,10 @@ def cut_real_windows(recorded: Recorded) -> HeldOut:
 
 
 def write_tables(recorded: Recorded, path: Path) -> list[str]:
-    """Write the log; its sensors are returned."""
+    """Write the log; sensors beside its poses are returned."""
     tables = {name: table.filter(pl.col("t") < recorded.log_s) for name, table in recorded.tables.items()}
     times, speed, turn = read_body_commands(tables["commands"], recorded.drive)
-    topics = list_topics("skid_steer", ["encoders", "gyro"])
-    poses, sensors = tables["poses"], ["poses"]
+    poses, sensors = tables["poses"], list[str]()
     with LogWriter(path) as writer:
 
         def write(topic: str, type_name: str, at: Floats, fields: Mapping[str, Any]) -> None:
@@ -238,14 +228,17 @@ def write_tables(recorded: Recorded, path: Path) -> list[str]:
             writer.write_columns(topic, type_name, stamps, dict(fields), header_time=stamps)
 
         body = {"twist.linear.x": speed, "twist.angular.z": turn, "header.frame_id": "base_link"}
-        write(topics["commands"], "geometry_msgs/msg/TwistStamped", times, body)
+        write("/cmd_vel", "geometry_msgs/msg/TwistStamped", times, body)
         place = {f"pose.pose.position.{axis}": _column(poses, axis, POSITION_STEP) for axis in "xyz"}
         attitude = {
             f"pose.pose.orientation.{axis}": _column(poses, f"q_{axis}", TURN_STEP) for axis in "xyzw"
         }
         frames = {"header.frame_id": "map", "child_frame_id": "base_link"}
         write(
-            topics["poses"], "nav_msgs/msg/Odometry", poses["t"].to_numpy(), {**place, **attitude, **frames}
+            "/localization/odometry",
+            "nav_msgs/msg/Odometry",
+            poses["t"].to_numpy(),
+            {**place, **attitude, **frames},
         )
         wheels = tables.get("wheels")
         if wheels is not None and not wheels.is_empty():
@@ -254,7 +247,7 @@ def write_tables(recorded: Recorded, path: Path) -> list[str]:
                 "name": [f"{one}_wheel_joint" for one in _JOINTS],
                 "velocity": np.column_stack((left, right) * 2),
             }
-            write(topics["encoders"], "sensor_msgs/msg/JointState", wheels["t"].to_numpy(), joints)
+            write("/joint_states", "sensor_msgs/msg/JointState", wheels["t"].to_numpy(), joints)
             sensors.append("encoders")
         imu = tables.get("imu")
         if imu is not None and not imu.is_empty():
@@ -266,7 +259,7 @@ def write_tables(recorded: Recorded, path: Path) -> list[str]:
             unknown = np.zeros((imu.height, 9))
             unknown[:, 0] = -1.0
             told = {"header.frame_id": "imu_link", "orientation.w": 1.0, "orientation_covariance": unknown}
-            write(topics["gyro"], "sensor_msgs/msg/Imu", imu["t"].to_numpy(), {**rates, **forces, **told})
+            write("/imu/data", "sensor_msgs/msg/Imu", imu["t"].to_numpy(), {**rates, **forces, **told})
             sensors.append("gyro")
     return sensors
 

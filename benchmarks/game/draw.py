@@ -1,13 +1,12 @@
-"""Logs whose missing effect is drawn by seed, and the sealed answers to them.
+"""Logs whose hidden effects are drawn by seed, and the answers to them.
 
 What is drawn spans what field logs have: vehicles, topic layouts, programs, pose rates and noise, random
-motion, drop-outs, jumps, decoys. The generator of the logs shares no code with the estimators.
+motion, drop-outs, jumps, decoys. The generator of the logs shares no code with the estimators. A category and
+a seed give the same bytes in every version: drawn logs are what versions of the diagnosis are compared on.
 """
 
 from __future__ import annotations
 
-import base64
-import json
 import math
 import zlib
 from collections.abc import Callable
@@ -17,10 +16,10 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-from closed_loop import close_loop
-from effect_sizes import draw_size
-from odd_physics import DRAWN, ODD
 
+from game.closed_loop import close_loop
+from game.odd import DRAWN, ODD
+from game.sizes import draw_size
 from pipeline.simulate import (
     LAYOUTS,
     MACHINES,
@@ -167,7 +166,11 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
 
 
 def write_riddle(riddle: Riddle, path: Path) -> list[Path]:
-    """Simulate and record a riddle, its further runs beside it; its answer stands there, too, sealed."""
+    """Simulate and record a riddle, its further runs beside it.
+
+    Returns:
+        The logs; nothing of the answer is in them.
+    """
     if riddle.machine is None:
         run = simulate_run(riddle.scenario)
     else:
@@ -175,18 +178,7 @@ def write_riddle(riddle: Riddle, path: Path) -> list[Path]:
     paths = [path, *(path.with_stem(f"{path.stem}_{n}") for n in range(1, len(riddle.more) + 1))]
     for made, log in zip((run, *map(simulate_run, riddle.more)), paths, strict=True):
         write_log(made, log)
-    path.with_suffix(".sealed").write_text(seal(riddle.answer), encoding="ascii")
     return paths
-
-
-def seal(answer: Answer) -> str:
-    """An answer that nobody reads by accident."""
-    return base64.b64encode(zlib.compress(json.dumps(vars(answer), sort_keys=True).encode())).decode()
-
-
-def open_seal(text: str) -> Answer:
-    """The answer of a seal."""
-    return Answer(**json.loads(zlib.decompress(base64.b64decode(text))))
 
 
 def _draw_scene(draw: np.random.Generator, seed: int, effect: str | None = None) -> Scenario:

@@ -12,8 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from draw import Answer  # noqa: TC002 - it runs as a script, too
-
+from game.draw import Answer
 from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect, format_model

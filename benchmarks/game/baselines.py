@@ -1,22 +1,16 @@
-"""Baselines of HiddenEffect that need nothing of this project: numpy, scipy and mcap-ros2-support.
+"""Peers of `slip` in the game that need nothing of it: numpy, scipy and mcap-ros2-support.
 
-    python benchmarks/hidden_effect/answer_simple.py RINGS/open --baseline sparse --out answers/sparse
-
-nothing          says that nothing is hidden; the ideal model predicts
-effective_track  always names effective_track, and fits it
-sparse           sparse regression over a library of 14 terms of the body velocity (sequentially thresholded
-                 least squares, Brunton et al. 2016); a term that stays names its effect
-full_linear      body velocity = matrix x wheel speeds (Baril et al. 2020); predicts, and names nothing
-icr_asymmetric   three centres of rotation and two speed factors (Mandow et al. 2007); names what of them
-                 is not at its neutral value
-bicycle_understeer  a car with an understeer gradient; on other vehicles it abstains
+nothing         says that nothing is hidden; the ideal model predicts
+full_linear     body velocity = matrix x commands (Baril et al. 2020); predicts, and names nothing
+sparse          sparse regression over a library of 13 terms of the body velocity (sequentially thresholded
+                least squares, Brunton et al. 2016); a term that stays names its effect
+icr_asymmetric  three centres of rotation and two speed factors (Mandow et al. 2007); names what of them
+                is not at its neutral value
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -24,13 +18,14 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from read_task import Read, list_tasks, predict_windows, read_task, walk_velocities
 from scipy.optimize import least_squares
+
+from game.read_task import Read, list_tasks, predict_windows, read_task, walk_velocities
+from game.score import ANSWER_FORMAT
 
 Floats = NDArray[np.float64]
 Json = dict[str, Any]
 
-FORMAT = "hidden-effect-answer/1"
 _CELL_S = 0.05
 _SPAN_S = 0.5  # long enough that the noise of poses leaves a velocity to within a few mm/s
 _SURE = 1.96
@@ -42,10 +37,10 @@ def drive_ideally(read: Read) -> tuple[Floats, Floats]:
     """Edges of cells [s] and the ideal body velocity (v_x, v_y, v_w) in each, from the commands."""
     edges = np.arange(0.0, max(read.windows[-1, 4], read.poses[-1, 0]) + _CELL_S, _CELL_S)
     at = np.searchsorted(read.commands[:, 0], 0.5 * (edges[:-1] + edges[1:]), side="right") - 1
-    speed, aside, turn = np.where(at[:, None] >= 0, read.commands[np.maximum(at, 0), 1:], 0.0).T
+    speed, turn = np.where(at[:, None] >= 0, read.commands[np.maximum(at, 0), 1:], 0.0).T
     if read.is_car:
         turn = speed * np.tan(turn) / read.sheet["wheelbase_m"]
-    return edges, np.column_stack((speed, aside, turn))
+    return edges, np.column_stack((speed, np.zeros_like(speed), turn))
 
 
 def measure_velocity(read: Read, edges: Floats, ideal: Floats) -> tuple[Floats, Floats]:
@@ -94,41 +89,30 @@ def answer_nothing(read: Read) -> Json:
     return {"none": True, "poses": predict_windows(read, edges, walk_velocities(edges, ideal))}
 
 
-def answer_effective_track(read: Read) -> Json:
-    edges, ideal = drive_ideally(read)
-    mean, measured = measure_velocity(read, edges, ideal)
-    gain, error = solve(mean[:, 2:], measured[:, 2])
-    k, spread = 1.0 / gain[0], error[0] / gain[0] ** 2
-    poses = walk_velocities(edges, ideal * [1.0, 1.0, gain[0]])
-    effects = [{"name": "effective_track", "parameters": {"k": tell(float(k), float(spread))}}]
-    return {"effects": effects, "poses": predict_windows(read, edges, poses)}
-
-
 Term = tuple[int, Callable[[Floats], Floats], str, str, Callable[[float], float]]
 
 
 def list_terms(*, is_car: bool) -> list[Term]:
-    """Channel, column of (v, s, w), name, parameter and its value by the coefficient."""
+    """Channel, column of (v, s, w), name (none: no effect fits), parameter, its value by coefficient."""
     turning = (
         (2, lambda b: b[2], "steering_gain", "g", lambda c: 1.0 + c)
         if is_car
         else (2, lambda b: b[2], "effective_track", "k", lambda c: 1.0 / max(1.0 + c, 0.05))
     )
     terms: list[Term] = [
-        (0, lambda b: b[0], "wheel_radius_scale", "k", lambda c: 1.0 + c),
-        (0, lambda b: b[0] * abs(b[0]), "slip_with_speed", "k", lambda c: -c),
-        (0, lambda b: b[0] * abs(b[2]), "slip_in_turns", "k", lambda c: -c),
-        (0, lambda b: np.minimum(b[0], 0.0), "slip_in_reverse", "k", lambda c: -c),
-        (0, lambda b: b[2], "rotation_centre_left", "y_icr", lambda c: c),
-        (1, lambda b: b[1], "sideways_scale", "k", lambda c: 1.0 + c),
-        (1, lambda b: b[0] * b[2], "outward_skid", "c", lambda c: -c),
-        (1, lambda b: b[2], "rotation_centre_forward", "x_icr", lambda c: -c),
-        (1, lambda b: b[0], "heading_misalignment", "psi", lambda c: -c),
-        (1, lambda b: np.sign(abs(b).sum(axis=0)), "sideways_drift", "c", lambda c: c),
+        (0, lambda b: b[0], "wheel_radius", "k", lambda c: 1.0 + c),
+        (0, lambda b: b[0] * abs(b[0]), "speed_slip", "k", lambda c: -c),
+        (0, lambda b: b[0] * abs(b[2]), "turning_resistance", "k", lambda c: -c),
+        (0, lambda b: np.minimum(b[0], 0.0), "", "", lambda c: -c),
+        (0, lambda b: b[2], "icr_lateral", "y_icr", lambda c: c),
+        (1, lambda b: b[0] * b[2], "lateral_skid", "c", lambda c: -c),
+        (1, lambda b: b[2], "icr_offset", "x_icr", lambda c: -c),
+        (1, lambda b: b[0], "yaw_misalignment", "psi", lambda c: -c),
+        (1, lambda b: np.sign(abs(b).sum(axis=0)), "lateral_drift", "c", lambda c: c),
         turning,
-        (2, lambda b: abs(b[0]) * b[2], "turn_gain_with_speed", "k", lambda c: c),
-        (2, lambda b: np.minimum(b[2], 0.0), "one_sided_turn_loss", "k", lambda c: -c),
-        (2, lambda b: np.sign(abs(b).sum(axis=0)), "yaw_rate_bias", "c", lambda c: c),
+        (2, lambda b: abs(b[0]) * b[2], "speed_track", "k", lambda c: c),
+        (2, lambda b: np.minimum(b[2], 0.0), "", "", lambda c: -c),
+        (2, lambda b: np.sign(abs(b).sum(axis=0)), "yaw_drift", "c", lambda c: c),
     ]
     return terms
 
@@ -136,7 +120,7 @@ def list_terms(*, is_car: bool) -> list[Term]:
 def answer_sparse(read: Read) -> Json:
     edges, ideal = drive_ideally(read)
     mean, measured = measure_velocity(read, edges, ideal)
-    velocity, effects = ideal.copy(), []
+    velocity, effects, unnamed = ideal.copy(), [], set[str]()
     for channel in range(3):
         terms = [term for term in list_terms(is_car=read.is_car) if term[0] == channel]
         columns = np.column_stack([term[1](mean.T) for term in terms])
@@ -153,11 +137,15 @@ def answer_sparse(read: Read) -> Json:
         for place, value, error in zip(kept, found, errors, strict=True) if kept else ():
             _, column, name, parameter, convert = terms[place]
             velocity[:, channel] += value * column(ideal.T)
+            if not name:
+                unnamed.add("xyw"[channel])
+                continue
             ends = sorted(convert(float(end)) for end in (value - _SURE * error, value + _SURE * error))
             number = {"value": convert(float(value)), "low": ends[0], "high": ends[1]}
             effects.append({"name": name, "parameters": {parameter: number}})
     poses = predict_windows(read, edges, walk_velocities(edges, velocity))
-    return {"effects": effects, "none": not effects, "poses": poses}
+    other = {"other": {"channels": sorted(unnamed)}} if unnamed else {}
+    return {"effects": effects, "none": not effects and not unnamed, "poses": poses, **other}
 
 
 def answer_full_linear(read: Read) -> Json:
@@ -168,7 +156,7 @@ def answer_full_linear(read: Read) -> Json:
 
 
 def answer_icr_asymmetric(read: Read) -> Json:
-    if read.is_car or read.sheet["kind"] == "mecanum":
+    if read.is_car:
         return {}
     half = 0.5 * read.sheet["track_width_m"]
     edges, ideal = drive_ideally(read)
@@ -190,11 +178,11 @@ def answer_icr_asymmetric(read: Read) -> Json:
     covariance = np.linalg.pinv(fit.jac.T @ fit.jac) * 2.0 * fit.cost / fit.fun.size
     effects = []
     for name, parameter, neutral, weights in (
-        ("wheel_radius_scale", "k", 1.0, [0.5, 0.5, 0.0, 0.0, 0.0]),
-        ("wheel_radius_difference", "e", 0.0, [-1.0, 1.0, 0.0, 0.0, 0.0]),
+        ("wheel_radius", "k", 1.0, [0.5, 0.5, 0.0, 0.0, 0.0]),
+        ("wheel_asymmetry", "e", 0.0, [-1.0, 1.0, 0.0, 0.0, 0.0]),
         ("effective_track", "k", 1.0, [0.0, 0.0, 0.5 / half, -0.5 / half, 0.0]),
-        ("rotation_centre_left", "y_icr", 0.0, [0.0, 0.0, 0.5, 0.5, 0.0]),
-        ("rotation_centre_forward", "x_icr", 0.0, [0.0, 0.0, 0.0, 0.0, 1.0]),
+        ("icr_lateral", "y_icr", 0.0, [0.0, 0.0, 0.5, 0.5, 0.0]),
+        ("icr_offset", "x_icr", 0.0, [0.0, 0.0, 0.0, 0.0, 1.0]),
     ):
         row = np.array(weights)
         value, error = float(row @ fit.x), float(np.sqrt(row @ covariance @ row))
@@ -204,33 +192,11 @@ def answer_icr_asymmetric(read: Read) -> Json:
     return {"effects": effects, "none": not effects, "poses": poses}
 
 
-def answer_bicycle_understeer(read: Read) -> Json:
-    if not read.is_car:
-        return {}
-    edges, ideal = drive_ideally(read)
-    mean, measured = measure_velocity(read, edges, ideal)
-    base = read.sheet["wheelbase_m"]
-
-    def turn(gradient: float, body: Floats) -> Floats:
-        return body[:, 2] * base / (base + gradient * body[:, 0] ** 2)
-
-    fit = least_squares(lambda k: turn(k[0], mean) - measured[:, 2], np.array([0.0]), bounds=(-0.01, 1.0))
-    error = float(np.sqrt(2.0 * fit.cost / fit.fun.size / max(float((fit.jac**2).sum()), 1e-12)))
-    value = float(fit.x[0])
-    shown = abs(value) > _LEAST_T * error
-    effects = [{"name": "understeer", "parameters": {"K": tell(value, error)}}] if shown else []
-    velocity = np.column_stack((ideal[:, :2], turn(value, ideal)))
-    poses = predict_windows(read, edges, walk_velocities(edges, velocity))
-    return {"effects": effects, "none": not effects, "poses": poses}
-
-
 BASELINES: dict[str, Callable[[Read], Json]] = {
     "nothing": answer_nothing,
-    "effective_track": answer_effective_track,
     "sparse": answer_sparse,
     "full_linear": answer_full_linear,
     "icr_asymmetric": answer_icr_asymmetric,
-    "bicycle_understeer": answer_bicycle_understeer,
 }
 
 
@@ -254,20 +220,6 @@ def write_answers(rings: Path, out: Path, solver: Callable[[Read], Json], *, res
         read = read_task(folder)
         said = solver(read)
         spent = {"cpu_s": round(time.process_time() - begun, 3)}
-        content = {"format": FORMAT, "task": read.id, **said, **spent}
+        content = {"format": ANSWER_FORMAT, "task": read.id, **said, **spent}
         (out / f"{read.id}.json").write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
     return len(folders)
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("rings", type=Path)
-    parser.add_argument("--baseline", choices=list(BASELINES), required=True)
-    parser.add_argument("--out", type=Path, required=True)
-    given = parser.parse_args()
-    print(f"{write_answers(given.rings, given.out, BASELINES[given.baseline])} answers in {given.out}")
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -10,13 +10,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from task_draws import HORIZON_S, Task
 
-from pipeline.simulate import Disturbance, Ground, SimulatedRun, simulate_run
+from pipeline.simulate import Disturbance, Ground, Scenario, SimulatedRun, simulate_run
 from pipeline.simulate.messages import record_truth
 
 Floats = NDArray[np.float64]
 
+HORIZON_S = 2.0
+"""How far a pose is predicted: the horizon of the project's errors, a planner's next manoeuvre."""
 _BEGINS_S = 0.5
 _RESTS_S = 2.0  # the programs stand still for so long at the end
 _DENSE_HZ = 100.0
@@ -41,11 +42,11 @@ class HeldOut:
     ideal: tuple[float, float]
 
 
-def cut_windows(task: Task, run: SimulatedRun) -> HeldOut:
-    """The windows of a task's run, one after the other."""
-    stamps, last_s = run.poses.stamp_s, task.scenario.duration_s - _RESTS_S
+def cut_windows(run: SimulatedRun, log_s: float) -> HeldOut:
+    """The windows of a run after the log's end [s], one after the other."""
+    stamps, last_s = run.poses.stamp_s, run.scenario.duration_s - _RESTS_S
     position, quaternion = run.poses.in_map()
-    begun = np.arange(task.log_s + _BEGINS_S, last_s - HORIZON_S, HORIZON_S)
+    begun = np.arange(log_s + _BEGINS_S, last_s - HORIZON_S, HORIZON_S)
     rows = np.unique(np.searchsorted(stamps, begun))
     rows = rows[rows < stamps.size]
     rows = rows[stamps[rows] + HORIZON_S <= last_s]
@@ -56,8 +57,8 @@ def cut_windows(task: Task, run: SimulatedRun) -> HeldOut:
     # A localization that jumped turned and moved its map: what follows is told in the map of the first pose.
     shift = np.column_stack((run.poses.correction[rows, :2], run.poses.correction_yaw[rows]))
     ends = compose(shift, after)
-    known = compose(compose(measured, relate(before, after)), _drift_at_random(task, run, starts_s, ends_s))
-    ideal = compose(measured, _drive_ideally(task, starts_s, ends_s))
+    known = compose(compose(measured, relate(before, after)), _drift_at_random(run, starts_s, ends_s))
+    ideal = compose(measured, _drive_ideally(run.scenario, starts_s, ends_s))
     return HeldOut(starts_s, ends_s, measured, ends, measure_error(known, ends), measure_error(ideal, ends))
 
 
@@ -115,21 +116,15 @@ def _look_up(poses: tuple[Floats, Floats], at: Floats) -> Floats:
     return np.column_stack([np.interp(at, times, column) for column in values.T])
 
 
-def _drift_at_random(task: Task, run: SimulatedRun, starts_s: Floats, ends_s: Floats) -> Floats:
+def _drift_at_random(run: SimulatedRun, starts_s: Floats, ends_s: Floats) -> Floats:
     """What is to be added to the true end of each window to have the end without random motion, (n, 3)."""
     path, drive = run.truth.path, run.truth.drive
     random = np.zeros_like(path.velocity)
-    middle = 0.5 * (path.time_s[:-1] + path.time_s[1:])
-    if task.driving == "closed_loop" and task.scenario.extra is not None:
-        # There the random motion is what was added on the way.
-        cells = (np.arange(run.truth.motion.velocity.shape[0]) + 0.5) * drive.step_s
-        rest = _look_up((cells, run.truth.motion.velocity), middle)
-        random = path.velocity - rest
-    elif task.machine is None:
-        calm = simulate_run(replace(task.scenario, disturbance=Disturbance())).truth.motion.velocity
+    if run.scenario.disturbance != Disturbance():
+        middle = 0.5 * (path.time_s[:-1] + path.time_s[1:])
+        calm = simulate_run(replace(run.scenario, disturbance=Disturbance())).truth.motion.velocity
         cells = (np.arange(calm.shape[0]) + 0.5) * drive.step_s
-        shaken = run.truth.motion.velocity - calm
-        random = _look_up((cells, shaken), middle)
+        random = _look_up((cells, run.truth.motion.velocity - calm), middle)
     moved = walk(path.time_s, path.velocity)
     calm_moves = walk(path.time_s, path.velocity - random)
     true = relate(_look_up(moved, starts_s), _look_up(moved, ends_s))
@@ -137,11 +132,9 @@ def _drift_at_random(task: Task, run: SimulatedRun, starts_s: Floats, ends_s: Fl
     return relate(true, without)
 
 
-def _drive_ideally(task: Task, starts_s: Floats, ends_s: Floats) -> Floats:
+def _drive_ideally(scene: Scenario, starts_s: Floats, ends_s: Floats) -> Floats:
     """The motion of the ideal vehicle in each window, shape (n, 3)."""
-    scene = replace(
-        task.scenario, effects={}, extra=None, machinery=None, disturbance=Disturbance(), ground=Ground()
-    )
-    moved = simulate_run(scene).truth.path
+    ideal = replace(scene, effects={}, extra=None, machinery=None, disturbance=Disturbance(), ground=Ground())
+    moved = simulate_run(ideal).truth.path
     poses = walk(moved.time_s, moved.velocity)
     return relate(_look_up(poses, starts_s), _look_up(poses, ends_s))

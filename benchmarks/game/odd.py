@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import odd_drives
+import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.simulate import Drive, Ground, State, Vehicle
+from pipeline.simulate.programs import follow
 
+Floats = NDArray[np.float64]
 Push = Callable[[State], tuple[float, float, float]]
 
 _PLANE = Ground()
@@ -148,6 +151,37 @@ def _crests(vehicle: Vehicle) -> Push:
     return push
 
 
+def _lock_sides(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Within 0.2 s of a change of speed by a quarter of the largest the axle locks for 2 s."""
+    mean, difference = 0.5 * (drive.left + drive.right), drive.right - drive.left
+    hard = 0.25 * vehicle.max_speed_mps / vehicle.wheel_radius_m
+    before = round(0.2 / drive.step_s)
+    jump = np.abs(mean - np.concatenate((np.zeros(before), mean[:-before]))) > hard
+    last = np.maximum.accumulate(np.where(jump, np.arange(mean.size), -mean.size))
+    locked = np.arange(mean.size) - last < 2.0 / drive.step_s
+    difference = np.where(locked, 0.3, 1.0) * difference
+    return replace(drive, left=mean - 0.5 * difference, right=mean + 0.5 * difference)
+
+
+def _wind_up(vehicle: Vehicle, drive: Drive) -> Drive:
+    """Proportional and integral speed control of a motor of 0.5 s whose voltage is limited."""
+    fastest = vehicle.max_speed_mps + 0.5 * vehicle.track_width_m * vehicle.max_turn_radps
+    top, step_s = fastest / vehicle.wheel_radius_m, drive.step_s
+
+    def regulate(asked: Floats) -> Floats:
+        gathered = 0.0
+
+        def step(now: float, goal: float) -> float:
+            nonlocal gathered
+            gathered += 3.0 * (goal - now) * step_s
+            voltage = min(max(goal + (goal - now) + gathered, -top), top)
+            return now + (voltage - now) * step_s / 0.5
+
+        return follow(asked, step)
+
+    return replace(drive, left=regulate(drive.left), right=regulate(drive.right))
+
+
 ODD: dict[str, Odd] = {
     "crosswind": Odd("a steady wind pushes in one direction of the world", "xy", _crosswind),
     "reverse_slip": Odd("wheels slip in reverse only", "x", _reverse_slip),
@@ -170,10 +204,8 @@ DRAWN = tuple(sorted(ODD))
 # saturates do to a planner; what an integrator or a lock does takes three numbers or more of one controller,
 # and is flagged; of crests the tilt of poses tells too little.
 ODD |= {
-    "locked_axle": Odd(
-        "after a hard start both sides turn together for a while", "w", drive=odd_drives.lock_sides
-    ),
-    "wind_up": Odd("the integrator of the speed loop winds up", "xw", drive=odd_drives.wind_up),
+    "locked_axle": Odd("after a hard start both sides turn together for a while", "w", drive=_lock_sides),
+    "wind_up": Odd("the integrator of the speed loop winds up", "xw", drive=_wind_up),
     "sinkage": Odd("wheels dig in on the way", "xw", _sinkage, alike=("time_drift",)),
     "saturating_skid": Odd("skid sideways that saturates", "y", _saturating_skid, alike=("lateral_skid",)),
     "crests": Odd(

@@ -1,22 +1,24 @@
-"""Write the three mystery logs of data_samples with their sealed answers; or set an answer beside a guess.
+"""The mystery logs of data_samples, and their truths beside a diagnosis.
 
-python benchmarks/hidden/mystery.py write data_samples
-python benchmarks/hidden/mystery.py reveal data_samples/mystery_1.mcap results
+    make mysteries
+    make reveal LOG=data_samples/mystery_1.mcap
+
+The truth of `mystery_1.mcap` is in `mystery_1.spoiler.json`, for nobody to read by accident.
 """
 
 from __future__ import annotations
 
-import sys
+import argparse
+import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parent))
-
-from draw import Category, Riddle, draw_riddle, open_seal, write_riddle
-from odd_physics import ODD
-from score import Json, Score, score_run
-
+from game.draw import Answer, Category, Riddle, draw_riddle, write_riddle
+from game.odd import ODD
+from game.play import score_runs
+from game.score import TaskScore
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import DIAGNOSIS
@@ -28,17 +30,25 @@ _NAME, _TRUTH = 20, 18
 
 
 def write_mysteries(folder: Path) -> list[Path]:
-    """Write mystery_1 to mystery_3 and their seals."""
+    """Write mystery_1 to mystery_3 and their truths."""
     written = []
     for number, (category, seed) in enumerate(_DRAWN, start=1):
         path = folder / f"mystery_{number}.mcap"
-        write_riddle(_shorten(draw_riddle(category, seed)), path)
+        riddle = _shorten(draw_riddle(category, seed))
+        write_riddle(riddle, path)
+        hidden = json.dumps(vars(riddle.answer), indent=1, sort_keys=True) + "\n"
+        spoil(path).write_text(hidden, encoding="utf-8")
         written.append(path)
     return written
 
 
+def spoil(log: Path) -> Path:
+    """The file of a mystery's truth."""
+    return log.with_suffix(".spoiler.json")
+
+
 def _shorten(riddle: Riddle) -> Riddle:
-    """The same riddle, small enough to be kept beside the code."""
+    """The same riddle, small enough to stand beside the code."""
     scene = riddle.scenario
     pose = replace(scene.pose, rate_hz=min(scene.pose.rate_hz, 20.0))
     duration = min(scene.duration_s, _LONGEST_S)
@@ -46,27 +56,26 @@ def _shorten(riddle: Riddle) -> Riddle:
 
 
 def reveal(log: Path, results: Path) -> list[str]:
-    """The guess of the program beside what its seal says: names, formulas, numbers with intervals.
+    """The guess of the program beside the truth: names, formulas, numbers with intervals.
 
     Args:
-        log: the mystery; its seal stands beside it.
+        log: the mystery; its truth stands beside it.
         results: where its diagnosis is, or is to be written.
     """
-    answer = open_seal(log.with_suffix(".sealed").read_text(encoding="ascii"))
+    answer = Answer(**json.loads(spoil(log).read_text(encoding="utf-8")))
     manifest = analyze_log(log, Options(out=results, diagnosis=True)).manifest
     guess = manifest.read_json(DIAGNOSIS)
-    score, formulas = score_run(answer, guess), {spec.id: spec.formula for spec in list_effects()}
+    score, formulas = score_runs(answer, [guess]), {spec.id: spec.formula for spec in list_effects()}
     named = {str(entry["id"]): entry["parameters"] for entry in guess["effects"]}
     lines = [f"{log.stem}", f"{'':{_NAME}}{'truth':<{_TRUTH}}guess, 95 % interval"]
     for name, truth in answer.effects.items():
         lines.append(f"{name:<{_NAME}}{formulas[name]}")
-        told = next((key for key in (name, *score.named) if key in named and name in score.found), "")
         # By another name of the same thing it has no number to compare.
         lines += _compare_numbers(truth, named.get(name, {}))
-        lines += [f"{'':{_NAME}}{word}" for word in _say_fate(name, told, score)]
+        lines += [f"{'':{_NAME}}{word}" for word in _describe_fate(name, score)]
     if answer.odd:
         lines.append(f"{answer.odd:<{_NAME}}{ODD[answer.odd].about} (in {answer.channel})")
-    lines += [f"{name:<{_NAME}}was named, but is not hidden" for name in score.false]
+    lines += [f"{name:<{_NAME}}was named, but is not hidden" for name in score.wrong_names]
     rest = guess.get("unexplained")
     if rest:
         lines.append(f"{'unexplained':<{_NAME}}guess: {rest['share']:.0%} of the residual: {rest['where']}")
@@ -77,7 +86,7 @@ def reveal(log: Path, results: Path) -> list[str]:
     return lines
 
 
-def _compare_numbers(truth: Mapping[str, float], guess: Json) -> list[str]:
+def _compare_numbers(truth: Mapping[str, float], guess: Mapping[str, Any]) -> list[str]:
     """A line a number: what it is, what it was taken for, and whether the interval holds it."""
     lines = []
     for key, value in truth.items():
@@ -92,23 +101,30 @@ def _compare_numbers(truth: Mapping[str, float], guess: Json) -> list[str]:
     return lines
 
 
-def _say_fate(name: str, told: str, score: Score) -> list[str]:
+def _describe_fate(name: str, score: TaskScore) -> list[str]:
     """What was said of an effect that was not named for itself."""
-    fates = {
-        f"named as {told}, another name of the same thing": bool(told) and told != name,
-        "left undecided": name in score.undecided,
-        "said to leave no trace in this log": name in score.unobservable,
-        "missed": name in score.missed,
+    if name in score.named:
+        return []
+    words = {
+        "right": "named by another name of the same thing",
+        "undecided": "left undecided",
+        "unobservable": "said to leave no trace in this log",
     }
-    return [f"guess: {words}" for words, true in fates.items() if true]
+    return [f"guess: {words.get(score.outcomes[name], 'missed')}"]
 
 
-if __name__ == "__main__":
-    match sys.argv[1:]:
-        case ["write", place]:
-            told = list(map(str, write_mysteries(Path(place))))
-        case ["reveal", place, results]:
-            told = reveal(Path(place), Path(results))
-        case _:
-            sys.exit("Say what: mystery.py write FOLDER, or mystery.py reveal LOG RESULTS")
-    sys.stdout.write("\n".join(told) + "\n")
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    commands = parser.add_subparsers(dest="command", required=True)
+    writing = commands.add_parser("write", help="write the mystery logs and their truths")
+    writing.add_argument("folder", type=Path)
+    revealing = commands.add_parser("reveal", help="set the truth beside the diagnosis")
+    revealing.add_argument("log", type=Path)
+    revealing.add_argument("results", type=Path)
+
+
+def run(given: argparse.Namespace) -> None:
+    """Write, or reveal."""
+    if given.command == "write":
+        print(*write_mysteries(given.folder), sep="\n")
+    else:
+        print(*reveal(given.log, given.results), sep="\n")

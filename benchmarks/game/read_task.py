@@ -24,8 +24,8 @@ class Read:
         id: of the task.
         folder: where it is.
         sheet: vehicle.toml.
-        commands: time, speed ahead [m/s], speed to the left [m/s], yaw rate [rad/s] or, of a car, steering
-            angle [rad], of log and held-out stretch, shape (n, 4).
+        commands: time, speed ahead [m/s], yaw rate [rad/s] or, of a car, steering angle [rad], of log and
+            held-out stretch, shape (n, 3).
         log_end_s: end of the log.
         poses: time, x [m], y [m], yaw [rad], shape (m, 4).
         windows: first time, x, y, yaw, last time, shape (k, 5).
@@ -62,8 +62,7 @@ def read_task(folder: Path) -> Read:
     later = _read_csv(folder / task["held_out"]["commands"])
     windows = _read_csv(folder / task["held_out"]["windows"])
     turn = "steering_rad" if "steering_rad" in later else "yaw_rate_radps"
-    aside = later.get("sideways_mps", [0.0] * len(later["stamp_ns"]))
-    rows["commands"] += list(zip(later["stamp_ns"], later["speed_mps"], aside, later[turn], strict=True))
+    rows["commands"] += list(zip(later["stamp_ns"], later["speed_mps"], later[turn], strict=True))
     first = rows["commands"][0][0]
     commands, poses = (_count_from(first, rows[key]) for key in ("commands", "poses"))
     ends = _count_from(first, list(zip(windows["end_ns"], strict=True)))
@@ -91,10 +90,10 @@ def _read_pose(told: Any) -> tuple[float, float, float]:  # noqa: ANN401 - made 
     return place.x, place.y, float(yaw)
 
 
-def _read_command(told: Any) -> tuple[float, float, float]:  # noqa: ANN401 - made from the log's schema
+def _read_command(told: Any) -> tuple[float, float]:  # noqa: ANN401 - made from the log's schema
     if hasattr(told, "drive"):
-        return told.drive.speed, 0.0, told.drive.steering_angle
-    return told.twist.linear.x, told.twist.linear.y, told.twist.angular.z
+        return told.drive.speed, told.drive.steering_angle
+    return told.twist.linear.x, told.twist.angular.z
 
 
 def _read_csv(path: Path) -> dict[str, list[Any]]:
@@ -110,7 +109,7 @@ def _count_from(first_ns: int, rows: list[tuple[Any, ...]]) -> Floats:
 def _stop_when_silent(commands: Floats, timeout_s: float) -> Floats:
     """Commands with a stop where none came for the controller's timeout."""
     silent = np.flatnonzero(np.diff(commands[:, 0]) > timeout_s)
-    stops = np.column_stack((commands[silent, 0] + timeout_s, np.zeros((silent.size, 3))))
+    stops = np.column_stack((commands[silent, 0] + timeout_s, np.zeros((silent.size, 2))))
     return np.insert(commands, silent + 1, stops, axis=0)
 
 

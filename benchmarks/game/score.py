@@ -1,21 +1,23 @@
-"""Score answers to HiddenEffect. One file: Python 3.11 and numpy, and names.toml beside it.
+"""The scorer of the game: one file, Python 3.11 and numpy, and names.json beside it.
 
-    python score_answers.py ANSWERS --rings RINGS        all rings whose truth.json is there
-    python score_answers.py ANSWERS --truth FILE --misses --json scores.json
+    python score.py ANSWERS --rings RINGS --truths TRUTHS [--misses] [--json scores.json]
 
-ANSWERS is a folder of <task>.json. An answer that is missing or broken counts as abstained, with one line on
-the error stream. Every score has its 95 % interval over tasks (bootstrap of 2,000 resamples). The rules are
-those of the page docs/pages/hidden_effect.md. Exit code 0; 1 where there is nothing to score with.
+ANSWERS is a folder of <task>.json, TRUTHS the folder of <ring>/<task>.json that the maker of the rings holds.
+A truth counts only if its SHA-256 is the one that its task was published with. An answer that is missing or
+broken counts as abstained, with one line on the error stream. Every score has its 95 % interval over tasks
+(bootstrap of 2,000 resamples). The rules are those of the page docs/pages/hidden_effect.md. Exit code 0; 1
+where there is nothing to score with.
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import math
 import sys
 import tomllib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,23 +26,39 @@ import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-Json = dict[str, Any]
+Json = Mapping[str, Any]
+Number = tuple[float, float | None, float | None]
 
-ANSWER_FORMAT, TRUTH_FORMAT = "hidden-effect-answer/1", "hidden-effect-truth/1"
-CHANNELS = ("x", "y", "yaw")
+ANSWER_FORMAT, TRUTH_FORMAT = "hidden-effect-answer/2", "hidden-effect-truth/2"
+CHANNELS = ("x", "y", "w")
 MOST_BYTES = 1_000_000  # an answer has some 5 kB
 MOST_EFFECTS, MOST_GROUPS, MOST_CANDIDATES = 10, 5, 6
 MOST_WORDS = 2_000
 MOST_TOLERATED = 4  # claims that nobody can judge; more of them dilute what is right
 LARGEST = 1e9  # numbers beyond it are no quantity of a vehicle, and their squares would overflow
 RESAMPLES = 2_000
-_OUTCOMES, _MEDIANS = ("right", "undecided", "abstained", "wrong"), ("width", "cpu_s")
-_KEYS = {"format", "task", "effects", "none", "undecided", "other", "poses", "cpu_s"}
+_OUTCOMES, _MEDIANS = ("right", "undecided", "unobservable", "abstained", "wrong"), ("width", "cpu_s")
+_KEYS = {"format", "task", "effects", "none", "undecided", "unobservable", "other", "poses", "cpu_s"}
 _LEAST = 1e-6  # smaller errors [m], [rad] are as good as none
+
+# Effects that some logs cannot tell apart: one stands for the other where the answer says that it may.
+ALIKE: Mapping[str, frozenset[str]] = {
+    "icr_offset": frozenset({"lever_arm"}),
+    "icr_lateral": frozenset({"lever_arm"}),
+    "lever_arm": frozenset({"icr_offset", "icr_lateral"}),
+    "clock_offset": frozenset({"transport_delay"}),
+    "transport_delay": frozenset({"clock_offset"}),
+    # Where wheels slide little and nothing is slow, friction is a wider track.
+    "contact_friction": frozenset({"effective_track"}),
+    "drive_lag": frozenset({"body_inertia"}),
+    "body_inertia": frozenset({"drive_lag"}),
+}
+# A point beside base_link is a centre of rotation shifted in two directions: both together, whatever is said.
+TOGETHER: Mapping[str, frozenset[str]] = {"lever_arm": frozenset({"icr_offset", "icr_lateral"})}
 
 
 class AnswerError(Exception):
-    """What is wrong with an answer, in one line."""
+    """What is wrong with an answer or a truth, in one line."""
 
 
 @dataclass(frozen=True)
@@ -49,21 +67,46 @@ class Answer:
 
     Attributes:
         effects: numbers (value, low, high) by name and parameter; low and high may be None.
+        same_as: of a named effect, others that the log does not tell apart from it.
         none: that nothing is hidden.
         undecided: groups of candidates of which one acts.
+        unobservable: effects of which the log does not tell.
         other: channels of physics that no name fits; empty where none was claimed.
         poses: predicted ends of the windows, shape (n, 3); None where none were given.
         cpu_s: seconds that it took; None where not told.
     """
 
-    effects: Mapping[str, Mapping[str, tuple[float, float | None, float | None]]] = field(
-        default_factory=dict
-    )
+    effects: Mapping[str, Mapping[str, Number]] = field(default_factory=dict)
+    same_as: Mapping[str, frozenset[str]] = field(default_factory=dict)
     none: bool = False
     undecided: tuple[frozenset[str], ...] = ()
+    unobservable: frozenset[str] = frozenset()
     other: frozenset[str] = frozenset()
     poses: Floats | None = None
     cpu_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Interval:
+    """The 95 % interval of a number that was named by its own name, beside the truth.
+
+    Attributes:
+        label: effect and parameter.
+        truth, value, low, high: in the parameter's unit.
+        scale: distance of the truth from the neutral value; None where there is none.
+    """
+
+    label: str
+    truth: float
+    value: float
+    low: float
+    high: float
+    scale: float | None = None
+
+    @property
+    def holds(self) -> bool:
+        """Whether the truth is inside."""
+        return self.low <= self.truth <= self.high
 
 
 @dataclass(frozen=True)
@@ -73,26 +116,44 @@ class TaskScore:
     Attributes:
         task: its id.
         points: -1 to 1.
-        outcomes: of each hidden effect, or of `nothing`: right, undecided, abstained or wrong.
+        outcomes: of each hidden effect, of `unlisted` or of `nothing`: right, undecided, unobservable,
+            abstained or wrong.
+        named: names of the answer.
+        groups: candidates of what it left undecided, joined by `|`.
+        flagged: channels of `other`.
         false: claims that are not true.
-        is_empty: whether nothing was hidden.
-        covered: of each interval of a number that was rightly named, whether it holds the truth.
-        widths: of these intervals, over the size of the effect.
+        intervals: of every number that was named by its own name.
         over_floor: errors of position and yaw over those of the true physics; None where these are not known.
-        over_ideal: the same over those of the ideal model.
+        over_ideal: the same over those of the ideal model; None without held-out windows.
         cpu_s: as told.
     """
 
     task: str
     points: float
     outcomes: Mapping[str, str]
-    false: tuple[str, ...]
-    is_empty: bool
-    covered: tuple[bool, ...]
-    widths: tuple[float, ...]
-    over_floor: tuple[float, float] | None
-    over_ideal: tuple[float, float]
-    cpu_s: float | None
+    named: tuple[str, ...] = ()
+    groups: tuple[str, ...] = ()
+    flagged: str = ""
+    false: tuple[str, ...] = ()
+    intervals: tuple[Interval, ...] = ()
+    over_floor: tuple[float, float] | None = None
+    over_ideal: tuple[float, float] | None = None
+    cpu_s: float | None = None
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing was hidden."""
+        return "nothing" in self.outcomes
+
+    @property
+    def wrong_names(self) -> tuple[str, ...]:
+        """Names that are not true: claims of the gravest kind."""
+        return tuple(name for name in self.named if name in self.false)
+
+    def list_hidden(self, *outcomes: str) -> tuple[str, ...]:
+        """Hidden effects that came out in one of these ways."""
+        listed = set(self.outcomes) - {"nothing", "unlisted"}
+        return tuple(name for name in sorted(listed) if self.outcomes[name] in outcomes)
 
 
 def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -> Answer:
@@ -123,9 +184,13 @@ def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -
     for key, wanted in (("format", ANSWER_FORMAT), ("task", task)):
         if content.get(key) != wanted:
             raise AnswerError(f"{key} is {_shorten(content.get(key))}, not {wanted!r}")
-    effects = _read_effects(content.get("effects", []), names)
+    effects, same_as = _read_effects(content.get("effects", []), names)
     undecided = _read_groups(content.get("undecided", []), names, set(effects))
     other = _read_other(content.get("other"))
+    unobservable = frozenset(
+        _read_name(one, names)
+        for one in _read_list(content.get("unobservable", []), len(names), "unobservable")
+    )
     none = content.get("none", False)
     if not isinstance(none, bool):
         raise AnswerError(f"none is {_shorten(none)}, not true or false")
@@ -134,10 +199,11 @@ def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -
     cpu_s = content.get("cpu_s")
     if cpu_s is not None and _read_number(cpu_s, "cpu_s") < 0.0:
         raise AnswerError("cpu_s is below zero")
-    return Answer(effects, none, undecided, other, _read_poses(content.get("poses"), windows), cpu_s)
+    poses = _read_poses(content.get("poses"), windows)
+    return Answer(effects, same_as, none, undecided, unobservable, other, poses, cpu_s)
 
 
-def _read_object(pairs: list[tuple[str, Any]]) -> Json:
+def _read_object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key stands twice in an object")
@@ -176,12 +242,13 @@ def _read_number(given: object, what: str) -> float:
 
 def _read_effects(
     given: object, names: Mapping[str, Any]
-) -> dict[str, dict[str, tuple[float, float | None, float | None]]]:
-    found: dict[str, dict[str, tuple[float, float | None, float | None]]] = {}
+) -> tuple[dict[str, dict[str, Number]], dict[str, frozenset[str]]]:
+    found: dict[str, dict[str, Number]] = {}
+    same_as: dict[str, frozenset[str]] = {}
     for entry in _read_list(given, MOST_EFFECTS, "effects"):
         if not isinstance(entry, dict):
             raise AnswerError("an effect is not an object")
-        _check_keys(entry, {"name", "parameters"}, "an effect")
+        _check_keys(entry, {"name", "parameters", "same_as"}, "an effect")
         name = _read_name(entry.get("name"), names)
         if name in found:
             raise AnswerError(f"{name} is named twice")
@@ -190,10 +257,12 @@ def _read_effects(
             raise AnswerError(f"parameters of {name} are not an object")
         _check_keys(parameters, set(names[name]["parameters"]), name)
         found[name] = {key: _read_interval(value, f"{name}.{key}") for key, value in parameters.items()}
-    return found
+        alike = _read_list(entry.get("same_as", []), MOST_CANDIDATES, f"same_as of {name}")
+        same_as[name] = frozenset(_read_name(one, names) for one in alike)
+    return found, same_as
 
 
-def _read_interval(given: object, what: str) -> tuple[float, float | None, float | None]:
+def _read_interval(given: object, what: str) -> Number:
     if not isinstance(given, dict):
         raise AnswerError(f"{what} is not an object")
     _check_keys(given, {"value", "low", "high"}, what)
@@ -246,68 +315,96 @@ def _read_poses(given: object, windows: int) -> Floats | None:
 
 
 def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
-    """Compare an answer with the truth of its task."""
-    hidden, tolerated = truth["effects"], set(truth["tolerated"])
-    words = {effect["name"]: {effect["name"], *effect["same_as"]} for effect in hidden}
-    accepted = set[str]().union(*words.values())
+    """Compare an answer with the truth of its task.
+
+    Args:
+        task: its id.
+        truth: its effects (name, parameters, same_as), unlisted (channels) or None, names that are tolerated,
+            and held_out or None.
+        answer: what was said.
+    """
+    hidden, tolerated, unlisted = truth["effects"], set(truth["tolerated"]), truth["unlisted"]
     outcomes: dict[str, str] = {}
-    credit = 0.0
-    for name, same in words.items():
-        groups = [group for group in answer.undecided if group & same]
-        if same & set(answer.effects):
+    credit, answering, accepted = 0.0, set[str](), set[str]()
+    for effect in hidden:
+        name = effect["name"]
+        words = {name, *effect["same_as"]}
+        match = _find_match(name, words, answer)
+        answering |= match | (TOGETHER.get(name, frozenset()) & set(answer.effects))
+        words |= ALIKE.get(name, frozenset())
+        accepted |= words
+        groups = [group for group in answer.undecided if group & words]
+        if match:
             outcomes[name] = "right"
             credit += 1.0
         elif groups:
             outcomes[name] = "undecided"
             credit += 1.0 / min(map(len, groups))
-    is_open = len(outcomes) < len(words)
-    odd = [frozenset([name]) for name in answer.effects if name not in accepted]
+        elif answer.unobservable & words:
+            outcomes[name] = "unobservable"
+    is_open = any(outcomes.get(effect["name"]) not in {"right", "undecided"} for effect in hidden)
+    odd = [frozenset([name]) for name in answer.effects if name not in answering]
     odd += [group for group in answer.undecided if not group & accepted]
     false = ["|".join(sorted(group)) for group in odd if not group & tolerated]
     diluted = MOST_TOLERATED / max(len(odd) - len(false), MOST_TOLERATED)
-    unlisted = truth["unlisted"]
     if answer.other and unlisted is not None and answer.other & set(unlisted["channels"]):
         outcomes["unlisted"] = "right"
         credit += 1.0
     elif answer.other and "other" not in tolerated and (unlisted is not None or not is_open):
         false.append("other")
-    is_empty = not words and unlisted is None
-    things = [*words, *(["unlisted"] if unlisted is not None else []), *(["nothing"] if is_empty else [])]
-    if answer.none and is_empty:
+    things = [effect["name"] for effect in hidden] + ["unlisted"] * (unlisted is not None) or ["nothing"]
+    if answer.none and things == ["nothing"]:
         outcomes["nothing"] = "right"
         credit = 1.0
     elif answer.none:
         # It denies each of them.
         false += ["none"] * len(things)
     silent = "wrong" if false else "abstained"
-    over = _judge_poses(truth["held_out"], answer.poses)
-    covered, widths = _judge_intervals(hidden, answer)
+    over_floor, over_ideal = _judge_poses(truth.get("held_out"), answer.poses)
     return TaskScore(
-        task, max((diluted * credit - len(false)) / len(things), -1.0),
-        {name: outcomes.get(name, silent) for name in things}, tuple(false), is_empty, covered, widths,
-        *over, answer.cpu_s,
-    )  # fmt: skip
+        task,
+        max((diluted * credit - len(false)) / len(things), -1.0),
+        {name: outcomes.get(name, silent) for name in things},
+        tuple(answer.effects),
+        tuple("|".join(sorted(group)) for group in answer.undecided),
+        "".join(sorted(answer.other)),
+        tuple(false),
+        tuple(list_intervals(hidden, answer)),
+        over_floor,
+        over_ideal,
+        answer.cpu_s,
+    )
 
 
-def _judge_intervals(hidden: Sequence[Json], answer: Answer) -> tuple[tuple[bool, ...], tuple[float, ...]]:
-    """Intervals of numbers of effects that were named by their own name: holds the truth, relative width."""
-    covered, widths = [], []
+def _find_match(name: str, words: set[str], answer: Answer) -> set[str]:
+    """Names of the answer that stand for a hidden effect."""
+    if words & set(answer.effects):
+        return words & set(answer.effects)
+    together = TOGETHER.get(name)
+    if together is not None:
+        return set(together) if together <= set(answer.effects) else set()
+    alike = ALIKE.get(name, frozenset())
+    said = [one for one, same in answer.same_as.items() if name in same and one in alike]
+    return set(sorted(said)[:1])
+
+
+def list_intervals(hidden: Sequence[Json], answer: Answer) -> Iterator[Interval]:
+    """Intervals of numbers of effects that were named by their own name."""
     for effect in hidden:
         told = answer.effects.get(effect["name"], {})
         for name, true in effect["parameters"].items():
-            _, low, high = told.get(name, (0.0, None, None))
-            if low is None or high is None or true["value"] is None:
-                continue
-            covered.append(low <= true["value"] <= high)
-            if true["scale"]:
-                widths.append((high - low) / true["scale"])
-    return tuple(covered), tuple(widths)
+            value, low, high = told.get(name, (0.0, None, None))
+            if low is not None and high is not None and true["value"] is not None:
+                label = f"{effect['name']}.{name}"
+                yield Interval(label, true["value"], value, low, high, true["scale"])
 
 
 def _judge_poses(
-    held_out: Json, told: Floats | None
-) -> tuple[tuple[float, float] | None, tuple[float, float]]:
+    held_out: Json | None, told: Floats | None
+) -> tuple[tuple[float, float] | None, tuple[float, float] | None]:
     """Errors over those of the true physics and of the ideal model; no poses count as the ideal's."""
+    if held_out is None:
+        return None, None
     ideal = (held_out["ideal"]["position_m"], held_out["ideal"]["yaw_rad"])
     errors = ideal
     if told is not None:
@@ -341,28 +438,23 @@ def measure_scores(scores: Sequence[TaskScore]) -> dict[str, tuple[float, float,
     return measured
 
 
-def pool_scores(name: str, scores: Sequence[TaskScore]) -> float:
-    """One score over tasks."""
-    return _join(name, [_list_values(score)[name] for score in scores])
-
-
 def _list_values(score: TaskScore) -> dict[str, list[float]]:
     """What a task adds to each score; nothing where it tells nothing."""
     outcomes = list(score.outcomes.values())
-    over_floor = score.over_floor or (None, None)
+    over_floor, over_ideal = score.over_floor or (None, None), score.over_ideal or (None, None)
     given = {
         "position_over_floor": over_floor[0],
-        "position_over_ideal": score.over_ideal[0],
+        "position_over_ideal": over_ideal[0],
         "yaw_over_floor": over_floor[1],
-        "yaw_over_ideal": score.over_ideal[1],
+        "yaw_over_ideal": over_ideal[1],
         "cpu_s": score.cpu_s,
     }
     return {
         "points": [score.points],
         **{kind: [float(kind == said) for said in outcomes] for kind in _OUTCOMES},
         "false_in_empty": [float(len(score.false))] if score.is_empty else [],
-        "coverage": [float(one) for one in score.covered],
-        "width": list(score.widths),
+        "coverage": [float(one.holds) for one in score.intervals],
+        "width": [(one.high - one.low) / one.scale for one in score.intervals if one.scale],
         **{name: [] if value is None else [value] for name, value in given.items()},
     }
 
@@ -380,23 +472,23 @@ def _join(name: str, parts: Sequence[Sequence[float]]) -> float:
 
 
 def score_ring(
-    answers: Path, truth: Json, names: Mapping[str, Any], tell: Callable[[str], None]
+    answers: Path, truths: Mapping[str, Json], names: Mapping[str, Any], tell: Callable[[str], None]
 ) -> list[TaskScore]:
     """Score every task of a ring; an answer with a fault counts as abstained, and a line tells the fault."""
     scores, missing = [], 0
-    for task, true in truth["tasks"].items():
+    for task, truth in truths.items():
         path = answers / f"{task}.json"
         answer = Answer()
         if not path.exists():
             missing += 1
         else:
             try:
-                answer = read_answer(path, task, len(true["held_out"]["poses"]), names)
+                answer = read_answer(path, task, len(truth["held_out"]["poses"]), names)
             except (AnswerError, OSError) as problem:
                 tell(f"{path}: {problem}; it counts as abstained")
-        scores.append(score_task(task, true, answer))
+        scores.append(score_task(task, truth, answer))
     if missing:
-        tell(f"{truth['ring']}: {missing} of {len(scores)} tasks have no answer; they count as abstained")
+        tell(f"{missing} of {len(scores)} tasks have no answer; they count as abstained")
     return scores
 
 
@@ -404,6 +496,7 @@ _WORDS = {
     "points": "points a task, -1 to 1",
     "right": "names: right",
     "undecided": "names: undecided, right one among them",
+    "unobservable": "names: said not to show in the log",
     "abstained": "names: abstained",
     "wrong": "names: wrong",
     "false_in_empty": "false claims in an empty log",
@@ -438,21 +531,43 @@ def list_misses(scores: Sequence[TaskScore]) -> list[str]:
     return lines
 
 
-def read_truth(path: Path) -> Json:
-    """The truth of a ring.
+def read_truth(path: Path, task: Path) -> Json:
+    """The truth of a task.
+
+    Args:
+        path: its file, which the maker holds.
+        task: folder of the task, which has had its hash since it was published.
 
     Raises:
-        AnswerError: it is none.
+        AnswerError: it is none, or not the one that was published.
     """
     try:
-        truth = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError) as problem:
-        raise AnswerError(
-            f"{path}: no truth can be read ({_shorten(problem)}); give a ring's truth.json"
-        ) from None
-    if not isinstance(truth, dict) or truth.get("format") != TRUTH_FORMAT or not truth.get("tasks"):
-        raise AnswerError(f"{path}: not a truth of the format {TRUTH_FORMAT}; give a ring's truth.json")
+        text = path.read_bytes()
+        published = tomllib.loads((task / "task.toml").read_text("utf-8"))["truth_sha256"]
+    except (OSError, KeyError, ValueError) as problem:
+        raise AnswerError(f"{task.name}: no truth can be read: {_shorten(problem)}") from None
+    if hashlib.sha256(text).hexdigest() != published:
+        raise AnswerError(f"{path}: not the truth whose hash its task was published with")
+    truth: Json = json.loads(text)
+    if truth.get("format") != TRUTH_FORMAT:
+        raise AnswerError(f"{path}: not a truth of the format {TRUTH_FORMAT}")
     return truth
+
+
+def read_truths(rings: Path, truths: Path) -> dict[str, dict[str, Json]]:
+    """Truths by ring and task, of the tasks that have one.
+
+    Raises:
+        AnswerError: there is none, or one is not what was published.
+    """
+    found: dict[str, dict[str, Json]] = {}
+    for task in sorted(path.parent for path in rings.glob("*/*/task.toml")):
+        path = truths / task.parent.name / f"{task.name}.json"
+        if path.exists():
+            found.setdefault(task.parent.name, {})[task.name] = read_truth(path, task)
+    if not found:
+        raise AnswerError(f"{truths}: no truth of a task of {rings}; make the rings, or give --truths FOLDER")
+    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -460,13 +575,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("answers", type=Path)
     parser.add_argument("--rings", type=Path, default=Path("rings"), help="folder of the rings")
-    parser.add_argument("--truth", type=Path, help="one truth.json, in place of all of the rings")
-    parser.add_argument("--names", type=Path, default=Path(__file__).with_name("names.toml"))
+    parser.add_argument("--truths", type=Path, default=Path("truths"), help="folder of their truths")
     parser.add_argument("--misses", action="store_true", help="a line for each task that is not all right")
     parser.add_argument("--json", type=Path, help="write the scores there")
     given = parser.parse_args(arguments)
+    if not given.answers.is_dir():
+        parser.error(f"{given.answers}: no folder; give the folder of the answers")
     try:
-        written = {truth["ring"]: _show_ring(given, truth) for truth in _read_truths(given)}
+        names = json.loads((given.rings / "names.json").read_text("utf-8"))
+        truths = read_truths(given.rings, given.truths)
+        written = {ring: _show_ring(given, ring, tasks, names) for ring, tasks in truths.items()}
         if given.json:
             given.json.write_text(json.dumps(written, indent=1) + "\n", encoding="utf-8")
     except (AnswerError, OSError) as problem:
@@ -475,20 +593,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 0
 
 
-def _read_truths(given: argparse.Namespace) -> list[Json]:
-    paths = [given.truth] if given.truth else sorted(given.rings.glob("*/truth.json"))
-    if not given.answers.is_dir():
-        raise AnswerError(f"{given.answers}: no folder; give the folder of the answers")
-    if not paths:
-        raise AnswerError(f"{given.rings}: no truth.json of a ring; make the rings, or give --truth FILE")
-    return [read_truth(path) for path in paths]
-
-
-def _show_ring(given: argparse.Namespace, truth: Json) -> dict[str, list[float | None]]:
-    names = tomllib.loads(given.names.read_text("utf-8"))
-    scores = score_ring(given.answers, truth, names, lambda line: print(line, file=sys.stderr))
+def _show_ring(
+    given: argparse.Namespace, ring: str, truths: Mapping[str, Json], names: Mapping[str, Any]
+) -> dict[str, list[float | None]]:
+    scores = score_ring(given.answers, truths, names, lambda line: print(line, file=sys.stderr))
     measured = measure_scores(scores)
-    print(*format_scores(truth["ring"], len(scores), measured), sep="\n")
+    print(*format_scores(ring, len(scores), measured), sep="\n")
     if given.misses:
         print(*list_misses(scores), sep="\n")
     return {name: [None if math.isnan(one) else one for one in values] for name, values in measured.items()}
