@@ -1,7 +1,7 @@
 """The runner of benchmarks: `make bench` lists them, `make bench NAME=reader ARGS="--repeat 3"` runs one.
 
-A benchmark is a file of this folder that has a function `run(given)`; its name is the file's, the first line of
-its docstring says what it measures, `add_arguments(parser)` declares its options. A file that is there is
+A benchmark is a file of this folder that has a function `run(given)`; its name is the file's, the first line
+of its docstring says what it measures, `add_arguments(parser)` declares its options. A file that is there is
 listed: adding a benchmark is adding a file.
 """
 
