@@ -49,13 +49,14 @@ def convert(log: Path, folder: Path) -> dict[str, Path]:
     return {"rosbag2 SQLite file": file, "ROS 1 bag, lz4": folder / "run.bag"}
 
 
-def main() -> int:
-    """Write the files, read each, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=935.0, help="length of the generated drive")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--keep", type=Path, help="keep the files there, or use what is there")
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Write the files, read each, print the table."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.keep or Path(temporary)
         log = folder / "drive_0.mcap"
@@ -71,7 +72,3 @@ def main() -> int:
             print(f"{name:24s} {size:6.2f} {times} {number(row, 'peak_mb'):8.0f}")
             checks.append(row["checks"])
     return int(any(each != checks[0] for each in checks))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

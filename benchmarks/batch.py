@@ -150,15 +150,14 @@ def compare_processes(logs: Path, work: Path, count: int, rounds: int) -> None:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--counts", type=int, nargs="*", default=COUNTS)
     parser.add_argument("--compare", type=int, nargs="*", default=COMPARED)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--folder", type=Path, default=None)
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = given.folder or Path(temporary)
         make_logs(work / "logs", max((*given.counts, *given.compare)))
@@ -167,7 +166,3 @@ def main() -> None:
             measure_growth(work / "logs", work, given.counts)
         for count in given.compare:
             compare_processes(work / "logs", work, count, given.rounds)
-
-
-if __name__ == "__main__":
-    main()

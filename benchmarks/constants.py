@@ -98,9 +98,7 @@ def choose_numbers(files: Sequence[Path], names: Sequence[str]) -> list[tuple[st
     return chosen
 
 
-def main() -> None:
-    """Print what each number does."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--names", nargs="*", default=[])
     parser.add_argument("--sample", type=int, help="how many of these numbers, at random")
@@ -108,7 +106,10 @@ def main() -> None:
     parser.add_argument("--log", dest="logs", nargs="*", type=Path, default=list(LOGS))
     parser.add_argument("--factors", nargs="*", type=float, default=[0.5, 2.0])
     parser.add_argument("--diagnosis", action="store_true")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
+    """Print what each number does."""
     numbers = every = choose_numbers(asked.files, asked.names)
     if asked.sample is not None:
         chance = np.random.default_rng(asked.seed)
@@ -128,7 +129,3 @@ def main() -> None:
     print(
         f"{speaking} of {len(numbers)} numbers, {len(every)} in all, change what is said, {moving} a median"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -178,12 +178,13 @@ def _remember(counts: Counter[tuple[str, str, str]], content: bytes, place: int)
     counts["silent in record", f"0x{content[record]:02x}", "SILENT"] += 1
 
 
-def main() -> int:
-    """Damage every log, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--step", type=int, default=1, help="every so many bytes")
     parser.add_argument("--json", type=Path, help="also write the table there")
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Damage every log, print the table."""
     print(f"{'log':27s} {'covered by':11s} {'pattern':9s}" + "".join(f"{name:>17s}" for name in OUTCOMES))
     rows = []
     silent = 0
@@ -212,7 +213,3 @@ def main() -> int:
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 1 if silent else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

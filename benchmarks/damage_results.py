@@ -208,7 +208,7 @@ def list_contents(files: room.DiskFiles | Mirror) -> list[str]:
     )
 
 
-def run(every: int, *, in_bucket: bool) -> int:
+def damage_all(every: int, *, in_bucket: bool) -> int:
     """Print the tables; how many changes were not noticed."""
     folder = Path(tempfile.mkdtemp(prefix="damage-"))
     try:
@@ -232,13 +232,10 @@ def run(every: int, *, in_bucket: bool) -> int:
         shutil.rmtree(folder)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=97, help="of tables and pages only every n-th byte")
     parser.add_argument("--bucket", action="store_true", help="results on an object store in memory")
-    asked = parser.parse_args()
-    raise SystemExit(os.EX_OK if run(asked.every, in_bucket=asked.bucket) == 0 else 1)
 
 
-if __name__ == "__main__":
-    main()
+def run(asked: argparse.Namespace) -> None:
+    raise SystemExit(os.EX_OK if damage_all(asked.every, in_bucket=asked.bucket) == 0 else 1)

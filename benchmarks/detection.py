@@ -16,12 +16,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent / "hidden"))
-
-from draw import draw_riddle
-from json_lines import add_row, read_rows
-from play import parse_seeds
+from game.draw import draw_riddle
+from game.play import parse_seeds
+from measuring import add_row, read_rows
 
 from pipeline.estimation import RunDiagnosis, diagnose_runs
 from pipeline.job import Options
@@ -83,12 +80,13 @@ def describe(rows: list[dict[str, object]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", default=list(range(20)), type=parse_seeds)
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each log")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> int:
     rows = read_rows(asked.out) if asked.resume else []
     done = {row["seed"] for row in rows}
     for seed in asked.seeds:
@@ -97,7 +95,3 @@ def main() -> int:
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
-from json_lines import add_row, read_rows
+from measuring import RECORDINGS, add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
@@ -43,7 +43,6 @@ if TYPE_CHECKING:
     from pipeline.sources.configuration import Configuration
     from pipeline.stages.extract import Extracted
 
-LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
@@ -433,8 +432,7 @@ def note(injection: Injection, before: Answer, after: Answer) -> str:
     return ", ".join([*parts, *([f"no more {', '.join(gone)}"] if gone else [])])
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--logs", nargs="*", default=[""], help="words of the recordings' names")
     parser.add_argument("--only", nargs="*", default=[""], help="words of the injections' names")
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each answer")
@@ -442,7 +440,9 @@ def main() -> int:
     parser.add_argument(
         "--table", type=Path, help="file of --out of which the table is printed, asking nothing"
     )
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> int:
     if asked.table is not None:
         sys.stdout.write(describe(read_rows(asked.table)))
         return 0
@@ -451,7 +451,7 @@ def main() -> int:
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
     logs = [
         log
-        for log in sorted(LOGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
+        for log in sorted(RECORDINGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
         if not log.stem.startswith(STANDING) and any(word in log.name for word in asked.logs)
     ]
     for log in logs:
@@ -469,7 +469,3 @@ def main() -> int:
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

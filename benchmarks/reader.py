@@ -22,6 +22,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from measuring import RUNNER
+
 ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
@@ -156,7 +158,7 @@ def measure(name: str, path: Path, repeat: int) -> dict[str, object]:
     """Best wall and CPU of several processes, highest memory."""
     runs = []
     for _ in range(repeat):
-        command = [sys.executable, __file__, "--only", name, "--keep", str(path)]
+        command = [*RUNNER, "reader", "--only", name, "--keep", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = done.stderr.strip().splitlines()[-1]
@@ -196,15 +198,16 @@ def number(row: dict[str, object], key: str) -> float:
     return value
 
 
-def main() -> int:
-    """Generate the log, measure every reader, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=935.0, help="length of the generated drive")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--keep", type=Path, help="write the log there, or use it when it is there")
     parser.add_argument("--json", type=Path, help="also write the table there")
     parser.add_argument("--only", choices=list(READERS), help=argparse.SUPPRESS)
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Generate the log, measure every reader, print the table."""
     if given.only:
         measure_here(given.only, given.keep)
         return 0
@@ -230,7 +233,3 @@ def main() -> int:
     for line in broken:
         print(f"differs: {line}")
     return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

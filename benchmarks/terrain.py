@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from json_lines import add_row
+from measuring import RECORDINGS, add_row
 
 from pipeline.fleet.terrain import PassEffect
 from pipeline.job import Options
@@ -95,19 +95,16 @@ def play_real(logs: Path) -> None:
         print(f"! {note}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("part", choices=["drawn", "real"])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--logs", type=Path, default=Path("../shared/logs"))
+    parser.add_argument("--logs", type=Path, default=RECORDINGS)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
     if asked.part == "real":
         play_real(asked.logs)
     else:
         play_drawn(asked.seed, asked.runs, asked.out)
-
-
-if __name__ == "__main__":
-    main()

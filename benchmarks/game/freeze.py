@@ -25,6 +25,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from measuring import RECORDINGS
+
 from game.draw import CATEGORIES, draw_riddle, write_riddle
 from game.play import THREADS, parse_seeds, score_runs
 from pipeline.core import SlipError
@@ -34,8 +36,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.store import Store
 
-LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
-RECORDINGS = "recordings"
+RECORDED = "recordings"
 _FROZEN, _RESULTS = "frozen.json", "results"
 _TIMES = frozenset({"timing", "cpu_s"})
 """Keys whose numbers no two runs of a program have in common."""
@@ -87,8 +88,8 @@ def freeze(case: Case, root: Path) -> str:
         return f"{case.category} {case.name}: is there"
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="freeze_") as scratch:
-        if case.category == RECORDINGS:
-            logs = [LOGS / f"{case.name}.mcap"]
+        if case.category == RECORDED:
+            logs = [RECORDINGS / f"{case.name}.mcap"]
         else:
             riddle = draw_riddle(case.category, int(case.name), None)  # type: ignore[arg-type]
             logs = write_riddle(riddle, Path(scratch) / "run.mcap")
@@ -161,7 +162,7 @@ def summarize(case: Case, runs: Sequence[Json]) -> str:
     errors = " ".join(f"{ladder[-1].get(key, float('nan')):.4f}" for key in ("t_mrmse_m", "r_mrmse_rad"))
     flag = (runs[0].get("unexplained") or {}).get("channel", "")
     verdict = ""
-    if case.category != RECORDINGS:
+    if case.category != RECORDED:
         answer = draw_riddle(case.category, int(case.name), None).answer  # type: ignore[arg-type]
         score = score_runs(answer, runs)
         ways = ", ".join(f"{name} {outcome}" for name, outcome in score.outcomes.items())
@@ -198,12 +199,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace) -> int:
     """Write or compare; 1 where an answer differs."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
-    wanted = given.categories.split(",") if given.categories else [*CATEGORIES, RECORDINGS]
+    wanted = given.categories.split(",") if given.categories else [*CATEGORIES, RECORDED]
     with ProcessPoolExecutor(given.jobs, multiprocessing.get_context("spawn")) as pool:
         if given.verb == "write":
-            names = sorted(log.stem for log in LOGS.glob("*.mcap")) if given.recordings else []
-            cases = [Case(RECORDINGS, name) for name in names]
-            cases += [Case(one, str(seed)) for seed in given.seeds for one in wanted if one != RECORDINGS]
+            names = sorted(log.stem for log in RECORDINGS.glob("*.mcap")) if given.recordings else []
+            cases = [Case(RECORDED, name) for name in names]
+            cases += [Case(one, str(seed)) for seed in given.seeds for one in wanted if one != RECORDED]
             for line in pool.map(freeze, cases, [given.folder] * len(cases)):
                 print(line, flush=True)
             return 0
