@@ -16,6 +16,8 @@ from pathlib import Path
 HERE = Path(__file__).parent
 ENTRIES = frozenset({"run", "main"})
 """Functions that make a file a benchmark; one with `main` alone reads its own command line."""
+CHECKS = frozenset({"audit", "house"})
+"""Commands of `make audit` and `make check`, which measure nothing."""
 
 
 def list_benchmarks() -> dict[str, str]:
@@ -25,7 +27,7 @@ def list_benchmarks() -> dict[str, str]:
         tree = ast.parse(path.read_text(encoding="utf-8"))
         functions = {node.name for node in tree.body if isinstance(node, ast.FunctionDef)}
         name = path.relative_to(HERE).with_suffix("").as_posix()
-        if functions & ENTRIES and path.name != "__main__.py":
+        if functions & ENTRIES and name not in {"__main__", *CHECKS}:
             found[name] = (ast.get_docstring(tree) or "").partition("\n")[0]
     return found
 

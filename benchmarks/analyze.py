@@ -1,7 +1,5 @@
 """How long a whole analysis takes: a 10-minute log, report included, as one process.
 
-    python benchmarks/analyze.py [--log LOG] [--runs N]
-
 Prints wall and CPU seconds and peak memory (medians over the runs). The peer in the same run is the official
 reader decoding the same topics and nothing more.
 """

@@ -1,7 +1,5 @@
 """What reading a bag takes beside reading the same messages from MCAP: time, processor, memory.
 
-    python benchmarks/bags.py [--seconds 935] [--repeat 3] [--keep FOLDER]
-
 The log of `reader.py` is written as MCAP (zstd), as an SQLite file of rosbag2 and as a bag of ROS 1 (lz4);
 the same eight topics are read from each, on two threads, each time in a process of its own. Exit code 1 when
 values differ.

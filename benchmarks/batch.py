@@ -1,7 +1,5 @@
 """What a batch costs: per log as the season grows, once more over nothing new, on one and two processes.
 
-    python benchmarks/batch.py [--counts 10 100 1000] [--compare 100 1000] [--rounds 3] [--folder DIR]
-
 Logs are simulated, ten seconds of a Husky each. Times are of the whole command, its start included. One and
 two processes take turns, so that other load hits both, and the best of the rounds counts. *Alone* is the time
 in which no log is worked on: until the first is begun, and after the last is done.

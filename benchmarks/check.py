@@ -1,7 +1,5 @@
 """Does `slip check` keep its word: false alarms, the power that it states, and the cause that it names.
 
-Run: python benchmarks/check.py null|power|causes|real [--pairs N] [--seed N] [--results FOLDER] [--out FILE]
-
 - `null`: pairs of drawn logs of one vehicle without a change, a third each in closed loop, driven naturally,
   and with effects; each log is diagnosed as `slip check` would. Printed is how many pairs raise an alarm.
 - `power`: pools of runs of one vehicle whose numbers differ from run to run as the catalogue declares; groups
@@ -306,7 +304,7 @@ def play_real(results: Path) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("part", choices=["null", "power", "causes", "real"])
+    parser.add_argument("part", nargs="?", default="null", choices=["null", "power", "causes", "real"])
     parser.add_argument("--pairs", type=int, default=24, help="pairs; runs of each pool of `power`")
     parser.add_argument("--seed", type=int, default=38000)
     parser.add_argument("--results", type=Path, default=Path("results"))

@@ -1,6 +1,4 @@
-"""`slip check` on readings that `benchmarks/check.py null --out FILE` kept: alarms, and power as it says.
-
-Run: python benchmarks/check_again.py null|drawn|power FILE [--trials N] [--seed N] [--others N]
+"""`slip check` on readings that the benchmark `check` wrote with --out: alarms, and power as it says.
 
 - `null`: the pairs judged again under the spreads that the catalogue declares now.
 - `drawn`: pairs without a change whose numbers are drawn: the errors and correlations of a kept pair, and a

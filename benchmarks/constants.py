@@ -1,8 +1,5 @@
 """What half and double of the numbers at the head of a file change: findings and medians of logs.
 
-    python benchmarks/constants.py [FILE...] [--names NAME ...] [--sample N --seed S] [--log LOG ...]
-                                   [--factors 0.5 2] [--diagnosis]
-
 Each number of the files, where none is given of all rooms that decide answers, or each of a random sample of
 them, is set to its value times each factor, alone, and the logs are analyzed again in this process. Prints
 one line a number and factor: `same`, or what differs, and last how many numbers change what is said (a named

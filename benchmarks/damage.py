@@ -1,7 +1,5 @@
 """Damages every byte of small logs, one at a time, and counts what the reader makes of it.
 
-    python benchmarks/damage.py [--step 1] [--json table.json]
-
 Each byte is changed in three ways: one bit flipped, all bits inverted, and set to 0x00 (0xFF where it was
 0x00 already). What is read is compared with the undamaged log: every message with its topic, times and
 fields, and the metadata. It fails where a checksum covers the byte and something else was returned without a

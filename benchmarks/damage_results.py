@@ -1,7 +1,5 @@
 """What `slip results verify` notices: bytes of small results changed, files and runs deleted and swapped.
 
-    python benchmarks/damage_results.py [--every 97] [--bucket]
-
 Results of two short simulated logs, one of them analyzed twice, with reports, pools and a comparison. Each
 change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
 and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Said*

@@ -1,9 +1,8 @@
 """How large an effect must be to be seen, against what the diagnosis says it must be.
 
-Run: python benchmarks/detection.py [--seeds 0-20] [--out FILE [--resume]]. Every seed draws a scene and an
-effect of one number (`benchmarks/hidden/draw.py`). The log without any effect is diagnosed: `detectable` says
-how large the effect would have had to be. Then the same scene is driven with the effect at shares of that
-size, and diagnosed. Printed is how often it was named, left undecided, or not seen, by share.
+Every seed draws a scene and an effect of one number (`game.draw`). The log without any effect is diagnosed:
+`detectable` says how large the effect would have had to be. Then the same scene is driven with the effect at
+shares of that size, and diagnosed. Printed is how often it was named, left undecided, or not seen, by share.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """How much CPU time `slip diagnose` takes, and where it goes.
 
-    python benchmarks/diagnose.py [LOG...] [--runs N] [--against CHECKOUT]
-
 Without a log, ten simulated minutes. For each log: the user CPU seconds of `slip diagnose --json` as a
 process of its own, the least of N runs; beside it those of another version in its own checkout, run in turns,
 and the ratio. Then one diagnosis more, on one core, with its CPU seconds by stage: what a stage calls that is

@@ -1,7 +1,5 @@
 """What exporting a long run as MCAP or CSV takes: time and peak memory against the length of the log.
 
-    python benchmarks/export.py [--hours 1 3 10] [--peer-hours 1]
-
 A simulated log of ten minutes is analyzed, and its tables are laid end to end until the run is long
 enough. Ours is `slip export --to mcap`, without a model and with one of two effects. The peer in the same run
 writes the same topics without the model, trail, path and findings: whole tables in memory, sorted, through

@@ -1,11 +1,10 @@
 """Simulated fleets: three vehicles on four terrains, three to five runs each, effects hidden at known levels.
 
-Run: python benchmarks/fleets.py [--fleets N] [--drawn N] [--seed N] [--jobs N] [--out FILE [--resume]]. Each
-of N fleets is driven in simulation, diagnosed run by run from its measured wheels, and fitted as `slip fleet
-fit` does; printed is whose each hidden number was, whose it is said to be, and how often intervals hold the
-truth, those forecast of every run from the others among them. One run of each fleet is damaged: a tyre is
-flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size
-of what is hidden in scatters of a run: the size from which levels are told.
+Each of N fleets is driven in simulation, diagnosed run by run from its measured wheels, and fitted as `slip
+fleet fit` does; printed is whose each hidden number was, whose it is said to be, and how often intervals hold
+the truth, those forecast of every run from the others among them. One run of each fleet is damaged: a tyre is
+flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size of what is hidden in
+scatters of a run: the size from which levels are told.
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
 """Faults and effects injected into the real recordings: recovered, reported as the fault it is, or missed.
 
-Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]; --table FILE
-prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
-every change of `injections.py`. A number is recovered where what was injected, put on top of what the
-unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
-An answer is the same where the names are, and the numbers within the same measure; it is at the `edge` where
-one of the two has a name for a number that the other one estimates alike and away from nothing, but does not
-name, or where it has a name that the unchanged recording says may act, too, and the numbers that it says come
-with it. A name that is the special case of one that is gone, with its number, is no extra name. `cannot`: the
-log is said not to tell of it, or only of larger ones.
-Exit code 0; the table says what was missed.
+Asked is every recording under ../shared/logs that moves, the shortest first, with every change of
+`injections.py`. A number is recovered where what was injected, put on top of what the unchanged recording
+says, lies within the two intervals together, or where both cancel and nothing is named. An answer is the same
+where the names are, and the numbers within the same measure; it is at the `edge` where one of the two has a
+name for a number that the other one estimates alike and away from nothing, but does not name, or where it has
+a name that the unchanged recording says may act, too, and the numbers that it says come with it. A name that
+is the special case of one that is gone, with its number, is no extra name. `cannot`: the log is said not to
+tell of it, or only of larger ones. Exit code 0; the table says what was missed.
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """Measure what the tables of README and handbook say, and write the tables.
 
-Run: python benchmarks/measure.py [paper] [accuracy] [rivals_command] [rivals_measured] [--jobs 2] [--logs N]
-(all four without a name). What is done is kept in build/measured/<version of the diagnosis>: stopped at any
+What is done is kept in build/measured/<version of the diagnosis>: stopped at any
 moment, the same command goes on. Each file of benchmarks/measured is written when its measurement is
 complete, and the pages with it (measured_tables.py). Logs are drawn from seeds of their own for every version
 of the diagnosis, so that none has been seen before. Recordings are those under ../shared/logs; without them

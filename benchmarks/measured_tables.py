@@ -1,6 +1,6 @@
 """Tables of README and handbook from what was measured: rendered, and held against the pages.
 
-Run: python benchmarks/measured_tables.py [--check]. What a command measured stands in a file of
+What a command measured stands in a file of
 benchmarks/measured: its rows, the command, the commit, the date, and the versions of the program that its
 numbers depend on. A page has the place of a table between two comments, `<!-- measured: NAME -->` and
 `<!-- /measured -->`; without --check what stands between them is written again. `make measure` measures.

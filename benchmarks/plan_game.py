@@ -1,7 +1,5 @@
 """Plans in closed loop: a poor first log, its diagnosis, a plan, a drive of it with the hidden physics.
 
-    python benchmarks/plan_game.py --draws 12 [--seed 1] [--out scores.jsonl]
-
 Each draw hides one to three effects in a simulated vehicle and drives it poorly. The plan is driven by
 the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One promise
 of each plan, drawn at random, is tested at its own second too: the drive is ended there and diagnosed again.

@@ -1,4 +1,4 @@
-"""What the program makes of logs as platforms publish them: `make platforms`.
+"""What the program makes of logs as platforms publish them.
 
 Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration.
 """

@@ -1,7 +1,5 @@
 """How fast topics are read out of a large log, against other readers and the bound, in one table.
 
-    python benchmarks/reader.py [--seconds 770] [--repeat 3] [--keep FILE] [--json FILE]
-
 Writes a log of about 1.2 GB (zstd, chunk checksums) with 420 000 small messages among images, then lets every
 reader read the same eight topics, each in a process of its own. The bound reads every chunk, inflates it and
 (with checksum) verifies it, nothing else. Exit code 1 when values differ.

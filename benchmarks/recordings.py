@@ -1,6 +1,6 @@
 """What the right effects, given by hand, leave of the ideal model's error on the real recordings.
 
-Run: python benchmarks/recordings.py [--ladders] [WORD...]. Every recording under ../shared/logs whose name
+Every recording under ../shared/logs whose name
 holds one of the words (all without any), from measured wheels and from commands: held-out errors after the
 effects over those of the ideal model, beside the table "On the real recordings" of METHODS.md section 5. With
 --ladders the effects are climbed one by one and every rung's 2 s error is printed: it falls, or it stops.

@@ -1,7 +1,6 @@
 """The named physics beside the models of the literature and learned ones, on every real recording.
 
-Run: python benchmarks/rivals.py [--results build/rivals] [--input command|measured] [--run TEXT]
-[--no-learned] [--rows FILE] and, of rows that are there, --table FILE. Recordings under ../shared/logs are
+Recordings under ../shared/logs are
 analyzed and diagnosed into the results where they are not yet; without recordings nothing is done, and it
 says so.
 

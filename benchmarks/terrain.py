@@ -1,7 +1,5 @@
 """Slip by number of passes: what the map says of drawn drives with and without such ground, and of real ones.
 
-Run: python benchmarks/terrain.py drawn|real [--runs N] [--seed N] [--logs FOLDER] [--out FILE]
-
 - `drawn`: laps of a Husky over ground that every pass compacts, at several rates, and over ground that does
   not change. Printed is how often a finding is reported, and how often its interval holds the truth.
 - `real`: recordings of a folder, each mapped; printed is what is found of the number of passes.
@@ -96,7 +94,7 @@ def play_real(logs: Path) -> None:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("part", choices=["drawn", "real"])
+    parser.add_argument("part", nargs="?", default="drawn", choices=["drawn", "real"])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--logs", type=Path, default=RECORDINGS)

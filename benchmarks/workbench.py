@@ -1,7 +1,5 @@
 """How fast the workbench answers on a 10-minute log: a value moved by hand, an effect added, dropped, undone.
 
-    python benchmarks/workbench.py [--log LOG] [--vehicle V] [--runs N]
-
 Asks a server over HTTP as the page does, numbers and figures, and prints the median and the slowest answer
 in seconds; promised is 0.5 s. Then the same in a browser, where there is one: from the press on *Add* until
 number, bar, path, map and *where* have changed on the page. The peer in the same run answers the same

@@ -1,7 +1,5 @@
 """What serializing a message takes: our columns beside the message-wise encoder of mcap-ros2-support.
 
-    python benchmarks/writer.py [--rows 20000]
-
 Both serialize the same values; the exit code is 1 where their bytes differ.
 """
 

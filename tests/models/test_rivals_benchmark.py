@@ -1,4 +1,4 @@
-"""The benchmark of `make rivals`: where a model comes from, who is marked as better, and no recordings."""
+"""The benchmark `rivals`: where a model comes from, who is marked as better, and no recordings."""
 
 from __future__ import annotations
 
