@@ -15,7 +15,15 @@ import numpy as np
 import pipeline as slip
 from game.baselines import drive_ideally
 from game.read_task import Read, predict_windows, walk_velocities
-from game.score import MOST_CANDIDATES, MOST_EFFECTS, MOST_GROUPS, MOST_WORDS, Answer, Number
+from game.score import (
+    MOST_CANDIDATES,
+    MOST_EFFECTS,
+    MOST_GROUPS,
+    MOST_UNOBSERVABLE,
+    MOST_WORDS,
+    Answer,
+    Number,
+)
 from pipeline.api import Diagnosis
 from pipeline.simulate import list_effects
 
@@ -105,7 +113,7 @@ def write_claims(run: Json) -> dict[str, Any]:
     return {
         "effects": effects,
         "undecided": groups,
-        "unobservable": sorted(said.unobservable & set(_LISTED)),
+        "unobservable": sorted(said.unobservable & set(_LISTED))[:MOST_UNOBSERVABLE],
         "none": not (effects or groups or rest),
         **other,
     }

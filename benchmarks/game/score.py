@@ -33,6 +33,7 @@ ANSWER_FORMAT, TRUTH_FORMAT = "hidden-effect-answer/2", "hidden-effect-truth/2"
 CHANNELS = ("x", "y", "w")
 MOST_BYTES = 1_000_000  # an answer has some 5 kB
 MOST_EFFECTS, MOST_GROUPS, MOST_CANDIDATES = 10, 5, 6
+MOST_UNOBSERVABLE = 15  # of some 50 names: whoever lists all of them says nothing
 MOST_WORDS = 2_000
 MOST_TOLERATED = 4  # claims that nobody can judge; more of them dilute what is right
 LARGEST = 1e9  # numbers beyond it are no quantity of a vehicle, and their squares would overflow
@@ -189,7 +190,7 @@ def read_answer(path: Path, task: str, windows: int, names: Mapping[str, Any]) -
     other = _read_other(content.get("other"))
     unobservable = frozenset(
         _read_name(one, names)
-        for one in _read_list(content.get("unobservable", []), len(names), "unobservable")
+        for one in _read_list(content.get("unobservable", []), MOST_UNOBSERVABLE, "unobservable")
     )
     none = content.get("none", False)
     if not isinstance(none, bool):
@@ -357,8 +358,8 @@ def score_task(task: str, truth: Json, answer: Answer) -> TaskScore:
         outcomes["nothing"] = "right"
         credit = 1.0
     elif answer.none:
-        # It denies each of them.
-        false += ["none"] * len(things)
+        # It denies each of them, but what it says does not show.
+        false += ["none"] * sum(outcomes.get(one) != "unobservable" for one in things)
     silent = "wrong" if false else "abstained"
     over_floor, over_ideal = _judge_poses(truth.get("held_out"), answer.poses)
     return TaskScore(

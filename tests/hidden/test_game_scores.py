@@ -100,6 +100,8 @@ def test_another_name_that_the_truth_lists_is_right(tmp_path: Path) -> None:
 def test_what_is_said_not_to_show_has_no_point_and_is_not_missed(tmp_path: Path) -> None:
     score = ask(tmp_path, make_truth([LAG]), unobservable=["drive_lag", "understeer"])
     assert (score.points, score.outcomes, score.false) == (0.0, {"drive_lag": "unobservable"}, ())
+    assert ask(tmp_path, make_truth([LAG]), unobservable=["drive_lag"], none=True).points == 0.0
+    assert ask(tmp_path, make_truth([LAG]), unobservable=["understeer"], none=True).points == -1.0
 
 
 def test_an_empty_log_wants_to_be_called_empty(tmp_path: Path) -> None:
@@ -176,6 +178,7 @@ HOSTILE = {
     "a pose of two numbers": GOOD + b', "poses": [[0, 0], [0, 0], [0, 0]]}',
     "a pose without end": GOOD + b', "poses": [[1e300, 0, 0], [0, 0, 0], [0, 0, 0]]}',
     "negative CPU": GOOD + b', "cpu_s": -1}',
+    "all effects said not to show": GOOD + f', "unobservable": {json.dumps(sorted(NAMES))}}}'.encode(),
 }
 
 
