@@ -34,13 +34,13 @@ def list_benchmarks() -> dict[str, str]:
 
 def main(words: list[str]) -> int:
     """Run the benchmark that is named first, or list all."""
-    benchmarks = list_benchmarks()
     if not words:
-        print(*(f"  {name:<18} {about}" for name, about in benchmarks.items()), sep="\n")
+        print(*(f"  {name:<18} {about}" for name, about in list_benchmarks().items()), sep="\n")
         return 0
     name, *arguments = words
-    if name not in benchmarks:
-        print(f"there is no benchmark {name}; there are {', '.join(benchmarks)}", file=sys.stderr)
+    # All files are read only where it helps: a benchmark may measure the memory of its process.
+    if not (HERE / f"{name}.py").is_file():
+        print(f"there is no benchmark {name}; there are {', '.join(list_benchmarks())}", file=sys.stderr)
         return 2
     module = import_module(name.replace("/", "."))
     if not hasattr(module, "run"):

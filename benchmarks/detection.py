@@ -18,13 +18,11 @@ import numpy as np
 from game.draw import draw_riddle
 from game.play import parse_seeds
 from measuring import add_row, read_rows
+from plan_game import record
 
 from pipeline.estimation import RunDiagnosis, diagnose_runs
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
-from pipeline.simulate import Scenario, simulate_run, write_log
+from pipeline.simulate import Scenario
 
 SHARES = (0.25, 0.5, 1.0, 2.0)
 ASKED = (
@@ -37,10 +35,7 @@ ASKED = (
 def diagnose(scenario: Scenario) -> RunDiagnosis:
     """Simulate, record, analyze and diagnose."""
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "run.mcap"
-        write_log(simulate_run(scenario), log)
-        options = Options(out=Path(folder) / "out", report=False)
-        vehicle, recording = read_recording(analyze_log(log, options).manifest)
+        vehicle, recording = record(scenario, Path(folder) / "run.mcap")
         return diagnose_runs([recording], vehicle).runs[0]
 
 

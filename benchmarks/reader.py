@@ -12,7 +12,6 @@ import json
 import os
 import resource
 import subprocess
-import sys
 import tempfile
 import time
 import zlib
@@ -21,9 +20,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from measuring import RUNNER
-
-ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
 
 if TYPE_CHECKING:
     from collections.abc import Callable

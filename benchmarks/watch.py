@@ -8,7 +8,6 @@ the finished log does not have, and the CPU time of a look.
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import tempfile
 import time
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import cast
 
 from game.draw import Category, draw_riddle, write_riddle
+from measuring import add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.job import Options
@@ -147,8 +147,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(asked: argparse.Namespace) -> int:
     """Replay the drawn logs of some seeds, each category in turn, and print the table."""
-    lines = asked.file.read_text().splitlines() if asked.file and asked.file.exists() else []
-    records: list[Content] = [json.loads(line) for line in lines]
+    records: list[Content] = [*read_rows(asked.file)]
     done = {(record["category"], record["seed"]) for record in records}
     begin = time.perf_counter()
     for number in range(0 if asked.table else asked.logs):
@@ -158,8 +157,6 @@ def run(asked: argparse.Namespace) -> int:
             continue
         records.append(replay(category, seed))
         print(f"{category} {seed}: {[(s['effect'], s['kept']) for s in judge(records[-1])]}", flush=True)
-        if asked.file:
-            with asked.file.open("a") as stream:
-                stream.write(json.dumps(records[-1]) + "\n")
+        add_row(asked.file, records[-1])
     print("\n".join(describe(records)))
     return 0
