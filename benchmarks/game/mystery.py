@@ -13,7 +13,7 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from game.draw import Answer, Category, Riddle, draw_riddle, write_riddle
 from game.odd import ODD
@@ -64,7 +64,7 @@ def reveal(log: Path, results: Path) -> list[str]:
     """
     answer = Answer(**json.loads(spoil(log).read_text(encoding="utf-8")))
     manifest = analyze_log(log, Options(out=results, diagnosis=True)).manifest
-    guess = manifest.read_json(DIAGNOSIS)
+    guess = cast("Mapping[str, Any]", manifest.read_json(DIAGNOSIS))
     score, formulas = score_runs(answer, [guess]), {spec.id: spec.formula for spec in list_effects()}
     named = {str(entry["id"]): entry["parameters"] for entry in guess["effects"]}
     lines = [f"{log.stem}", f"{'':{_NAME}}{'truth':<{_TRUTH}}guess, 95 % interval"]

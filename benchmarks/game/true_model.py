@@ -1,4 +1,4 @@
-"""The held-out errors of the ideal model, of the true one, and of what was named: after the seal was opened.
+"""The held-out errors of the ideal model, of the true one, and of what was named.
 
 The true model has the effects that were simulated, begins at their values and is fitted as any other; all
 models are fitted to and judged on the same windows. A clock that the gyro shows was put right before any
