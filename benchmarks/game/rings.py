@@ -103,13 +103,13 @@ def make_truth(answer: Answer) -> Json:
     return {"effects": effects, "unlisted": unlisted, "tolerated": tolerated, "held_out": None}
 
 
-def describe_effect(name: str, values: Mapping[str, float | None], *, rigid: bool = False) -> Json:
+def describe_effect(name: str, values: Mapping[str, float], *, rigid: bool = False) -> Json:
     """An effect of a truth; `scale` is what the width of an interval is measured by."""
     parameters = {}
     for key, value in values.items():
         neutral = _NEUTRAL[name, key]
-        size = None if value is None or not math.isfinite(neutral) else abs(value - neutral) or None
-        parameters[key] = {"value": value, "scale": size or (None if value is None else abs(value)) or None}
+        size = abs(value - neutral) if math.isfinite(neutral) else abs(value)
+        parameters[key] = {"value": value, "scale": size or None}
     # What contact makes of turning may be said by either name.
     same = ["effective_track"] if rigid and name == "contact_friction" else []
     return {"name": name, "parameters": parameters, "same_as": same}
