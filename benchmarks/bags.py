@@ -1,7 +1,5 @@
 """What reading a bag takes beside reading the same messages from MCAP: time, processor, memory.
 
-    python benchmarks/bags.py [--seconds 935] [--repeat 3] [--keep FOLDER]
-
 The log of `reader.py` is written as MCAP (zstd), as an SQLite file of rosbag2 and as a bag of ROS 1 (lz4);
 the same eight topics are read from each, on two threads, each time in a process of its own. Exit code 1 when
 values differ.
@@ -49,13 +47,14 @@ def convert(log: Path, folder: Path) -> dict[str, Path]:
     return {"rosbag2 SQLite file": file, "ROS 1 bag, lz4": folder / "run.bag"}
 
 
-def main() -> int:
-    """Write the files, read each, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=935.0, help="length of the generated drive")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--keep", type=Path, help="keep the files there, or use what is there")
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Write the files, read each, print the table."""
     with tempfile.TemporaryDirectory() as temporary:
         folder = given.keep or Path(temporary)
         log = folder / "drive_0.mcap"
@@ -71,7 +70,3 @@ def main() -> int:
             print(f"{name:24s} {size:6.2f} {times} {number(row, 'peak_mb'):8.0f}")
             checks.append(row["checks"])
     return int(any(each != checks[0] for each in checks))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

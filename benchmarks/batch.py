@@ -1,7 +1,5 @@
 """What a batch costs: per log as the season grows, once more over nothing new, on one and two processes.
 
-    python benchmarks/batch.py [--counts 10 100 1000] [--compare 100 1000] [--rounds 3] [--folder DIR]
-
 Logs are simulated, ten seconds of a Husky each. Times are of the whole command, its start included. One and
 two processes take turns, so that other load hits both, and the best of the rounds counts. *Alone* is the time
 in which no log is worked on: until the first is begun, and after the last is done.
@@ -150,15 +148,14 @@ def compare_processes(logs: Path, work: Path, count: int, rounds: int) -> None:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--counts", type=int, nargs="*", default=COUNTS)
     parser.add_argument("--compare", type=int, nargs="*", default=COMPARED)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--folder", type=Path, default=None)
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         work = given.folder or Path(temporary)
         make_logs(work / "logs", max((*given.counts, *given.compare)))
@@ -167,7 +164,3 @@ def main() -> None:
             measure_growth(work / "logs", work, given.counts)
         for count in given.compare:
             compare_processes(work / "logs", work, count, given.rounds)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Does `slip check` keep its word: false alarms, the power that it states, and the cause that it names.
 
-Run: python benchmarks/check.py null|power|causes|real [--pairs N] [--seed N] [--results FOLDER] [--out FILE]
-
 - `null`: pairs of drawn logs of one vehicle without a change, a third each in closed loop, driven naturally,
   and with effects; each log is diagnosed as `slip check` would. Printed is how many pairs raise an alarm.
 - `power`: pools of runs of one vehicle whose numbers differ from run to run as the catalogue declares; groups
@@ -23,13 +21,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from json_lines import add_row, read_rows
+from measuring import add_row, read_rows
 
-sys.path.insert(0, str(Path(__file__).parent / "hidden"))
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
-from closed_loop import close_loop
-from draw import draw_riddle
+from game.closed_loop import close_loop
+from game.draw import draw_riddle
 from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
@@ -306,21 +303,18 @@ def play_real(results: Path) -> None:
     print(f"recordings of one ground: {alarms} alarms in {pairs} pairs; log errors differ by {spread:.2f}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("part", choices=["null", "power", "causes", "real"])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("part", nargs="?", default="null", choices=["null", "power", "causes", "real"])
     parser.add_argument("--pairs", type=int, default=24, help="pairs; runs of each pool of `power`")
     parser.add_argument("--seed", type=int, default=38000)
     parser.add_argument("--results", type=Path, default=Path("results"))
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
     if asked.part == "real":
         play_real(asked.results)
     else:
         {"null": play_null, "power": play_power, "causes": play_causes}[asked.part](
             asked.seed, asked.pairs, asked.out
         )
-
-
-if __name__ == "__main__":
-    main()

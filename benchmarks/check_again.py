@@ -1,6 +1,4 @@
-"""`slip check` on readings that `benchmarks/check.py null --out FILE` kept: alarms, and power as it says.
-
-Run: python benchmarks/check_again.py null|drawn|power FILE [--trials N] [--seed N] [--others N]
+"""`slip check` on readings that the benchmark `check` wrote with --out: alarms, and power as it says.
 
 - `null`: the pairs judged again under the spreads that the catalogue declares now.
 - `drawn`: pairs without a change whose numbers are drawn: the errors and correlations of a kept pair, and a
@@ -21,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from json_lines import read_rows
+from measuring import read_rows
 
 from pipeline.core.arrays import Floats
 from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
@@ -158,14 +156,15 @@ def compare(
     return compare_sides([*before, *draw_group(kept, spread, draw, AFTER, shift)], usual)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("part", choices=["null", "drawn", "power"])
     parser.add_argument("file", type=Path)
     parser.add_argument("--trials", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--others", type=int, default=0, help="of `drawn`: further runs of the robot")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
     rows = read_rows(asked.file)
     if asked.part == "null":
         judge_pairs(rows)
@@ -173,7 +172,3 @@ def main() -> None:
         play_drawn(rows, asked.trials, asked.seed, asked.others)
     else:
         play_power(rows, asked.trials, asked.seed)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,8 +1,5 @@
 """What half and double of the numbers at the head of a file change: findings and medians of logs.
 
-    python benchmarks/constants.py [FILE...] [--names NAME ...] [--sample N --seed S] [--log LOG ...]
-                                   [--factors 0.5 2] [--diagnosis]
-
 Each number of the files, where none is given of all rooms that decide answers, or each of a random sample of
 them, is set to its value times each factor, alone, and the logs are analyzed again in this process. Prints
 one line a number and factor: `same`, or what differs, and last how many numbers change what is said (a named
@@ -98,9 +95,7 @@ def choose_numbers(files: Sequence[Path], names: Sequence[str]) -> list[tuple[st
     return chosen
 
 
-def main() -> None:
-    """Print what each number does."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("files", nargs="*", type=Path)
     parser.add_argument("--names", nargs="*", default=[])
     parser.add_argument("--sample", type=int, help="how many of these numbers, at random")
@@ -108,7 +103,10 @@ def main() -> None:
     parser.add_argument("--log", dest="logs", nargs="*", type=Path, default=list(LOGS))
     parser.add_argument("--factors", nargs="*", type=float, default=[0.5, 2.0])
     parser.add_argument("--diagnosis", action="store_true")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
+    """Print what each number does."""
     numbers = every = choose_numbers(asked.files, asked.names)
     if asked.sample is not None:
         chance = np.random.default_rng(asked.seed)
@@ -128,7 +126,3 @@ def main() -> None:
     print(
         f"{speaking} of {len(numbers)} numbers, {len(every)} in all, change what is said, {moving} a median"
     )
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Damages every byte of small logs, one at a time, and counts what the reader makes of it.
 
-    python benchmarks/damage.py [--step 1] [--json table.json]
-
 Each byte is changed in three ways: one bit flipped, all bits inverted, and set to 0x00 (0xFF where it was
 0x00 already). What is read is compared with the undamaged log: every message with its topic, times and
 fields, and the metadata. It fails where a checksum covers the byte and something else was returned without a
@@ -178,12 +176,13 @@ def _remember(counts: Counter[tuple[str, str, str]], content: bytes, place: int)
     counts["silent in record", f"0x{content[record]:02x}", "SILENT"] += 1
 
 
-def main() -> int:
-    """Damage every log, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--step", type=int, default=1, help="every so many bytes")
     parser.add_argument("--json", type=Path, help="also write the table there")
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Damage every log, print the table."""
     print(f"{'log':27s} {'covered by':11s} {'pattern':9s}" + "".join(f"{name:>17s}" for name in OUTCOMES))
     rows = []
     silent = 0
@@ -212,7 +211,3 @@ def main() -> int:
     if given.json:
         given.json.write_text(json.dumps(rows, indent=1) + "\n")
     return 1 if silent else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """What `slip results verify` notices: bytes of small results changed, files and runs deleted and swapped.
 
-    python benchmarks/damage_results.py [--every 97] [--bucket]
-
 Results of two short simulated logs, one of them analyzed twice, with reports, pools and a comparison. Each
 change is made alone and undone. Of manifests, lists, notes and other JSON every byte is changed, of tables
 and pages, which a hash covers as a whole, every n-th: in turn one bit, the sign bit, all bits. *Said*
@@ -208,7 +206,7 @@ def list_contents(files: room.DiskFiles | Mirror) -> list[str]:
     )
 
 
-def run(every: int, *, in_bucket: bool) -> int:
+def damage_all(every: int, *, in_bucket: bool) -> int:
     """Print the tables; how many changes were not noticed."""
     folder = Path(tempfile.mkdtemp(prefix="damage-"))
     try:
@@ -232,13 +230,10 @@ def run(every: int, *, in_bucket: bool) -> int:
         shutil.rmtree(folder)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n", maxsplit=1)[0])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--every", type=int, default=97, help="of tables and pages only every n-th byte")
     parser.add_argument("--bucket", action="store_true", help="results on an object store in memory")
-    asked = parser.parse_args()
-    raise SystemExit(os.EX_OK if run(asked.every, in_bucket=asked.bucket) == 0 else 1)
 
 
-if __name__ == "__main__":
-    main()
+def run(asked: argparse.Namespace) -> None:
+    raise SystemExit(os.EX_OK if damage_all(asked.every, in_bucket=asked.bucket) == 0 else 1)

@@ -1,9 +1,8 @@
 """How large an effect must be to be seen, against what the diagnosis says it must be.
 
-Run: python benchmarks/detection.py [--seeds 0-20] [--out FILE [--resume]]. Every seed draws a scene and an
-effect of one number (`benchmarks/hidden/draw.py`). The log without any effect is diagnosed: `detectable` says
-how large the effect would have had to be. Then the same scene is driven with the effect at shares of that
-size, and diagnosed. Printed is how often it was named, left undecided, or not seen, by share.
+Every seed draws a scene and an effect of one number (`game.draw`). The log without any effect is diagnosed:
+`detectable` says how large the effect would have had to be. Then the same scene is driven with the effect at
+shares of that size, and diagnosed. Printed is how often it was named, left undecided, or not seen, by share.
 """
 
 from __future__ import annotations
@@ -16,19 +15,14 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-
-sys.path.insert(0, str(Path(__file__).parent / "hidden"))
-
-from draw import draw_riddle
-from json_lines import add_row, read_rows
-from play import parse_seeds
+from game.draw import draw_riddle
+from game.play import parse_seeds
+from measuring import add_row, read_rows
+from plan_game import record
 
 from pipeline.estimation import RunDiagnosis, diagnose_runs
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
-from pipeline.simulate import Scenario, simulate_run, write_log
+from pipeline.simulate import Scenario
 
 SHARES = (0.25, 0.5, 1.0, 2.0)
 ASKED = (
@@ -41,10 +35,7 @@ ASKED = (
 def diagnose(scenario: Scenario) -> RunDiagnosis:
     """Simulate, record, analyze and diagnose."""
     with tempfile.TemporaryDirectory() as folder:
-        log = Path(folder) / "run.mcap"
-        write_log(simulate_run(scenario), log)
-        options = Options(out=Path(folder) / "out", report=False)
-        vehicle, recording = read_recording(analyze_log(log, options).manifest)
+        vehicle, recording = record(scenario, Path(folder) / "run.mcap")
         return diagnose_runs([recording], vehicle).runs[0]
 
 
@@ -83,12 +74,13 @@ def describe(rows: list[dict[str, object]]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", default=list(range(20)), type=parse_seeds)
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each log")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> int:
     rows = read_rows(asked.out) if asked.resume else []
     done = {row["seed"] for row in rows}
     for seed in asked.seeds:
@@ -97,7 +89,3 @@ def main() -> int:
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,5 @@
 """How much CPU time `slip diagnose` takes, and where it goes.
 
-    python benchmarks/diagnose.py [LOG...] [--runs N] [--against CHECKOUT]
-
 Without a log, ten simulated minutes. For each log: the user CPU seconds of `slip diagnose --json` as a
 process of its own, the least of N runs; beside it those of another version in its own checkout, run in turns,
 and the ratio. Then one diagnosis more, on one core, with its CPU seconds by stage: what a stage calls that is
@@ -13,7 +11,6 @@ from __future__ import annotations
 import argparse
 import functools
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -22,6 +19,8 @@ from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from typing import Any
+
+from measuring import measure_command, simulate_ten_minutes
 
 STAGES = {
     "import modules": ("_frozen_importlib._find_and_load",),
@@ -163,12 +162,7 @@ def measure(command: list[str], checkout: Path, folder: str) -> float:
     own = checkout / ".venv" / "bin" / "python"
     python = str(own) if own.exists() else sys.executable
     environment = os.environ | {"PYTHONPATH": str(checkout), "PYTHONDONTWRITEBYTECODE": ""}
-    process = subprocess.Popen([python, *command], cwd=folder, env=environment, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode not in {0, 3}:
-        sys.exit(f"{' '.join(command)} exited with {process.returncode}")
-    return usage.ru_utime
+    return measure_command([python, *command], folder=Path(folder), environment=environment).user_s
 
 
 def compare(log: Path, checkouts: list[Path], runs: int) -> None:
@@ -187,25 +181,18 @@ def compare(log: Path, checkouts: list[Path], runs: int) -> None:
         measure(["-c", TABLE, str(Path(__file__).parent), *asked], checkouts[0], folder)
 
 
-def main() -> None:
-    """Read the command line and measure."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("logs", type=Path, nargs="*")
     parser.add_argument("--runs", type=int, default=3)
     parser.add_argument("--against", type=Path, help="folder of another version's checkout")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
+    """Read the command line and measure."""
     checkouts = [HERE, *([asked.against.resolve()] if asked.against else [])]
     with tempfile.TemporaryDirectory() as folder:
         logs = [log.resolve() for log in asked.logs]
         if not logs:
-            logs = [Path(folder) / "ten_minutes.mcap"]
-            simulate = ["simulate", "husky_tile", "--duration", "600", "--file", str(logs[0])]
-            measure(["-m", "pipeline", *simulate], HERE, folder)
+            logs = [simulate_ten_minutes(Path(folder))]
         for log in logs:
             compare(log, checkouts, asked.runs)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,7 +8,6 @@ the lead is the time from the first alarm of digging in until the vehicle stands
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
+from measuring import RECORDINGS
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -159,19 +159,16 @@ def count_alarms(logs: Path) -> Iterator[str]:
     yield f"false alarms: {false.total()} in {hours:.2f} h, {false.total() / hours:.2f} an hour"
 
 
-def main() -> int:
-    """Print what is found of drawn events, and false alarms of recordings."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--count", type=int, default=60, help="how many drawn events")
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
-    parser.add_argument("--logs", type=Path, help="folder of recordings of normal driving")
-    asked = parser.parse_args()
+    parser.add_argument("--logs", type=Path, default=RECORDINGS, help="recordings of normal driving")
+
+
+def run(asked: argparse.Namespace) -> int:
+    """Print what is found of drawn events, and false alarms of recordings."""
     for line in play(asked.count, asked.seed):
         print(line, flush=True)
-    for line in count_alarms(asked.logs) if asked.logs else ():
+    for line in count_alarms(asked.logs) if asked.logs.is_dir() else ():
         print(line, flush=True)
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,5 @@
 """What exporting a long run as MCAP or CSV takes: time and peak memory against the length of the log.
 
-    python benchmarks/export.py [--hours 1 3 10] [--peer-hours 1]
-
 A simulated log of ten minutes is analyzed, and its tables are laid end to end until the run is long
 enough. Ours is `slip export --to mcap`, without a model and with one of two effects. The peer in the same run
 writes the same topics without the model, trail, path and findings: whole tables in memory, sorted, through
@@ -11,15 +9,14 @@ the official writer.
 from __future__ import annotations
 
 import argparse
-import os
 import shutil
 import subprocess
 import sys
 import tempfile
-import time
 from pathlib import Path
 
 import polars as pl
+from measuring import RUNNER, Cost, measure_command
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -113,29 +110,19 @@ def shift(table: pl.DataFrame, number: int) -> pl.DataFrame:
     return table.with_columns(*seconds, *stamps, *counts)
 
 
-def measure(command: list[str]) -> tuple[float, float]:
-    """Wall seconds and peak megabytes of a command."""
-    start = time.perf_counter()
-    process = subprocess.Popen(command, stdout=subprocess.DEVNULL)
-    _, status, usage = os.wait4(process.pid, 0)
-    wall = time.perf_counter() - start
-    process.returncode = os.waitstatus_to_exitcode(status)
-    if process.returncode:
-        sys.exit(f"{' '.join(command[:4])} exited with {process.returncode}")
-    # Linux counts the peak in KiB, macOS in bytes.
-    return wall, usage.ru_maxrss / (1024.0 if sys.platform != "darwin" else 1024.0**2)
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--hours", type=float, nargs="+", default=[1.0, 3.0, 10.0])
     parser.add_argument("--peer-hours", type=float, default=1.0, help="longest log that the peer is given")
-    chosen = parser.parse_args()
+    parser.add_argument("--prepare", type=Path, help=argparse.SUPPRESS)
+
+
+def run(chosen: argparse.Namespace) -> None:
+    if chosen.prepare:
+        prepare_run(chosen.prepare, chosen.hours[0])
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        prepare = [sys.executable, __file__, "--prepare", str(folder)]
+        prepare = [*RUNNER, "export", "--prepare", str(folder), "--hours"]
         model = folder / "model.toml"
         model.write_text(MODEL, encoding="utf-8")
         print(f"{'log':<8}{'':<34}{'wall s':>8}{'peak MB':>9}{'file MB':>9}")
@@ -157,18 +144,21 @@ def main() -> None:
                 ]
             folder_of_tables = folder / "out.csv"
             words = ["csv" if word == "mcap" else word for word in export[:-1]]
-            wall, peak = measure([*words, str(folder_of_tables)])
+            cost = measure_command([*words, str(folder_of_tables)])
             size = sum(file.stat().st_size for file in folder_of_tables.iterdir()) / 1e6
-            print(
-                f"{f'{hours:g} h':<8}{'slip export --to csv':<34}{wall:>8.1f}{peak:>9.0f}{size:>9.0f}",
-                flush=True,
-            )
+            show(hours, "slip export --to csv", cost, size)
             shutil.rmtree(folder_of_tables)
             for title, command in table.items():
-                wall, peak = measure(command)
+                cost = measure_command(command)
                 size = out.stat().st_size / 1e6
-                print(f"{f'{hours:g} h':<8}{title:<34}{wall:>8.1f}{peak:>9.0f}{size:>9.0f}", flush=True)
+                show(hours, title, cost, size)
                 out.unlink()
+
+
+def show(hours: float, title: str, cost: Cost, size_mb: float) -> None:
+    """Print a row."""
+    label = f"{hours:g} h"
+    print(f"{label:<8}{title:<34}{cost.wall_s:>8.1f}{cost.peak_mb:>9.0f}{size_mb:>9.0f}", flush=True)
 
 
 def prepare_run(folder: Path, hours: float) -> None:
@@ -179,10 +169,3 @@ def prepare_run(folder: Path, hours: float) -> None:
         analyze_log(log, Options(out=results, report=False, diagnosis=False))
     (piece,) = Store(results).manifests()
     lengthen(piece, folder / f"{hours:g}", hours)
-
-
-if __name__ == "__main__":
-    if sys.argv[1:2] == ["--prepare"]:
-        prepare_run(Path(sys.argv[2]), float(sys.argv[3]))
-    else:
-        main()

@@ -1,11 +1,10 @@
 """Simulated fleets: three vehicles on four terrains, three to five runs each, effects hidden at known levels.
 
-Run: python benchmarks/fleets.py [--fleets N] [--drawn N] [--seed N] [--jobs N] [--out FILE [--resume]]. Each
-of N fleets is driven in simulation, diagnosed run by run from its measured wheels, and fitted as `slip fleet
-fit` does; printed is whose each hidden number was, whose it is said to be, and how often intervals hold the
-truth, those forecast of every run from the others among them. One run of each fleet is damaged: a tyre is
-flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size
-of what is hidden in scatters of a run: the size from which levels are told.
+Each of N fleets is driven in simulation, diagnosed run by run from its measured wheels, and fitted as `slip
+fleet fit` does; printed is whose each hidden number was, whose it is said to be, and how often intervals hold
+the truth, those forecast of every run from the others among them. One run of each fleet is damaged: a tyre is
+flat. With --drawn, estimates of N fleets are drawn in place of runs, by the size of what is hidden in
+scatters of a run: the size from which levels are told.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-from json_lines import add_row, read_rows
+from measuring import add_row, read_rows
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
@@ -309,21 +308,18 @@ def play_few(fleets: int, seed: int) -> None:
         print(f"{label:<22}{there:>8.1%}{wide:>7.2f}{elsewhere:>11.1%}{wider:>7.2f}", flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--fleets", type=int, default=2)
     parser.add_argument("--drawn", type=int, default=0)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each run that is driven")
     parser.add_argument("--resume", action="store_true", help="go on where the file of --out ends")
-    chosen = parser.parse_args()
+
+
+def run(chosen: argparse.Namespace) -> None:
     if chosen.drawn:
         play_drawn(chosen.drawn, chosen.seed)
         play_few(chosen.drawn, chosen.seed)
     else:
         play_driven(chosen.fleets, chosen.seed, chosen.jobs, chosen.out, resume=chosen.resume)
-
-
-if __name__ == "__main__":
-    main()

@@ -1,15 +1,13 @@
 """Faults and effects injected into the real recordings: recovered, reported as the fault it is, or missed.
 
-Run: python benchmarks/inject.py [--logs WORD ...] [--only WORD ...] [--out FILE [--resume]]; --table FILE
-prints the table of what was asked. Every recording under ../shared/logs that moves, the shortest first, with
-every change of `injections.py`. A number is recovered where what was injected, put on top of what the
-unchanged recording says, lies within the two intervals together, or where both cancel and nothing is named.
-An answer is the same where the names are, and the numbers within the same measure; it is at the `edge` where
-one of the two has a name for a number that the other one estimates alike and away from nothing, but does not
-name, or where it has a name that the unchanged recording says may act, too, and the numbers that it says come
-with it. A name that is the special case of one that is gone, with its number, is no extra name. `cannot`: the
-log is said not to tell of it, or only of larger ones.
-Exit code 0; the table says what was missed.
+Asked is every recording under ../shared/logs that moves, the shortest first, with every change of
+`injections.py`. A number is recovered where what was injected, put on top of what the unchanged recording
+says, lies within the two intervals together, or where both cancel and nothing is named. An answer is the same
+where the names are, and the numbers within the same measure; it is at the `edge` where one of the two has a
+name for a number that the other one estimates alike and away from nothing, but does not name, or where it has
+a name that the unchanged recording says may act, too, and the numbers that it says come with it. A name that
+is the special case of one that is gone, with its number, is no extra name. `cannot`: the log is said not to
+tell of it, or only of larger ones. Exit code 0; the table says what was missed.
 """
 
 from __future__ import annotations
@@ -25,7 +23,7 @@ from typing import TYPE_CHECKING, Any, cast
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
-from json_lines import add_row, read_rows
+from measuring import RECORDINGS, add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
@@ -43,7 +41,6 @@ if TYPE_CHECKING:
     from pipeline.sources.configuration import Configuration
     from pipeline.stages.extract import Extracted
 
-LOGS = Path(__file__).parents[2] / "shared" / "logs"
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
@@ -433,8 +430,7 @@ def note(injection: Injection, before: Answer, after: Answer) -> str:
     return ", ".join([*parts, *([f"no more {', '.join(gone)}"] if gone else [])])
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--logs", nargs="*", default=[""], help="words of the recordings' names")
     parser.add_argument("--only", nargs="*", default=[""], help="words of the injections' names")
     parser.add_argument("--out", type=Path, help="file to add a JSON line to for each answer")
@@ -442,7 +438,9 @@ def main() -> int:
     parser.add_argument(
         "--table", type=Path, help="file of --out of which the table is printed, asking nothing"
     )
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> int:
     if asked.table is not None:
         sys.stdout.write(describe(read_rows(asked.table)))
         return 0
@@ -451,7 +449,7 @@ def main() -> int:
     chosen = [one for one in list_injections() if any(word in one.name for word in asked.only)]
     logs = [
         log
-        for log in sorted(LOGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
+        for log in sorted(RECORDINGS.glob("*.mcap"), key=lambda log: log.stat().st_size)
         if not log.stem.startswith(STANDING) and any(word in log.name for word in asked.logs)
     ]
     for log in logs:
@@ -469,7 +467,3 @@ def main() -> int:
             add_row(asked.out, row)
     sys.stdout.write(describe(rows))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

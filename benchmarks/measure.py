@@ -1,7 +1,6 @@
 """Measure what the tables of README and handbook say, and write the tables.
 
-Run: python benchmarks/measure.py [paper] [accuracy] [rivals_command] [rivals_measured] [--jobs 2] [--logs N]
-(all four without a name). What is done is kept in build/measured/<version of the diagnosis>: stopped at any
+What is done is kept in build/measured/<version of the diagnosis>: stopped at any
 moment, the same command goes on. Each file of benchmarks/measured is written when its measurement is
 complete, and the pages with it (measured_tables.py). Logs are drawn from seeds of their own for every version
 of the diagnosis, so that none has been seen before. Recordings are those under ../shared/logs; without them
@@ -20,22 +19,18 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).parent / "hidden"))
-
 import numpy as np
-from json_lines import read_rows
+from game.play import Record, read_records, read_version
+from game.tables import has_wrong_name, is_clean, is_exact, is_flagged, is_narrowed, is_owned_up_to
 from measured_tables import MEASURED, ROOT, list_versions
-from play import read_version
-from records import Record, read_records
-from rivals import LOGS, describe_sections
-from scoreboard import has_wrong_name, is_clean, is_exact, is_flagged, is_narrowed, is_owned_up_to
+from measuring import RECORDINGS, RUNNER, read_rows
+from rivals import describe_sections
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
 
-HERE = Path(__file__).parent
 CATEGORIES = (
     "single",
     "small",
@@ -79,10 +74,10 @@ def measure_accuracy(asked: Asked) -> dict[str, object]:
     """The game of hidden effects on logs that were never drawn before."""
     first = _FIRST_SEED + _SEEDS_A_VERSION * list_versions()["diagnosis"]
     seeds = f"{first}-{first + asked.logs}"
-    out = asked.folder / "scores.jsonl"
+    out = asked.folder / "played.jsonl"
     drawn = ("--category", ",".join(CATEGORIES), "--seeds", seeds)
     patience = ("--time-out", str(_PATIENCE_S), "--jobs", str(asked.jobs))
-    run_beside("hidden/play.py", *drawn, *patience, "--out", str(out), "--resume")
+    run_beside("game/play", *drawn, *patience, "--out", str(out), "--resume")
     wanted = range(first, first + asked.logs)
     records = [one for one in read_records([out]).values() if one.job.seed in wanted]
     if late := sum(one.outcome == "timeout" for one in records):
@@ -118,15 +113,12 @@ def summarize_records(records: Sequence[Record]) -> dict[str, object]:
             }
         )
     asked = [one for one in records if one.job.category != "odd"]
-    held: dict[str, list[bool]] = {}
-    for record in asked:
-        for way, _, truth, _, low, high in record.score.intervals if not record.is_weak else ():
-            held.setdefault(way, []).append(low <= truth <= high)
+    held = [one.holds for record in asked if not record.is_weak for one in record.score.intervals]
     return {
         "logs": len(asked),
         "wrong": sum(map(has_wrong_name, asked)),
         "rows": rows,
-        "intervals": [{"way": way, "held": sum(each), "of": len(each)} for way, each in sorted(held.items())],
+        "intervals": [{"held": sum(held), "of": len(held)}],
     }
 
 
@@ -136,7 +128,7 @@ def measure_rivals(source: str) -> Callable[[Asked], dict[str, object]]:
     def measure(asked: Asked) -> dict[str, object]:
         rows = asked.folder / f"rivals_{source}.jsonl"
         run_beside(
-            "rivals.py", "--results", str(asked.folder / "rivals"), "--input", source, "--rows", str(rows)
+            "rivals", "--results", str(asked.folder / "rivals"), "--input", source, "--rows", str(rows)
         )
         return {
             "command": f"make measure ARGS=rivals_{source}",
@@ -151,7 +143,7 @@ def measure_paper(asked: Asked) -> dict[str, object]:
     """Medians of the published chain, each with the interval of its run, and their ratios."""
     store = Store(asked.folder / "paper")
     for name in _PUBLISHED:
-        analyze_log(LOGS / f"{name}.mcap", Options(out=store.root, report=False))
+        analyze_log(RECORDINGS / f"{name}.mcap", Options(out=store.root, report=False))
     answer = compare_results(store, Question(by=("run",), as_published=True))
     found = {row["dataset"].rsplit("/", 1)[-1]: row for row in answer.intervals.to_dicts()}
     rows = [
@@ -184,14 +176,13 @@ def divide(above: Mapping[str, object], below: Mapping[str, object]) -> dict[str
     return round_interval({"value": a / b, "low": a / b * np.exp(-down), "high": a / b * np.exp(up)})
 
 
-def run_beside(script: str, *words: str) -> None:
+def run_beside(name: str, *words: str) -> None:
     """Run a benchmark; what it prints is kept out of ours.
 
     Raises:
         CalledProcessError: it failed.
     """
-    command = [sys.executable, str(HERE / script), *words]
-    subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+    subprocess.run([*RUNNER, name, *words], check=True, stdout=subprocess.DEVNULL)
 
 
 def write_measured(name: str, content: Mapping[str, object]) -> None:
@@ -214,31 +205,26 @@ MEASUREMENTS: dict[str, tuple[bool, Callable[[Asked], dict[str, object]]]] = {
 """By the name of the file: whether recordings are needed, and what measures."""
 
 
-def main() -> int:
-    """Measure what is asked for, one after the other."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", nargs="*", help=f"which: {', '.join(MEASUREMENTS)} (default: all)")
     parser.add_argument("--jobs", type=int, default=2, help="logs at a time")
     parser.add_argument("--logs", type=int, default=LOGS_EACH, help="drawn logs of each category")
-    chosen = parser.parse_args()
+
+
+def run(chosen: argparse.Namespace) -> int:
+    """Measure what is asked for, one after the other."""
     unknown = set(chosen.names) - set(MEASUREMENTS)
     if unknown:
-        parser.error(f"there is no {', '.join(sorted(unknown))}; there are {', '.join(MEASUREMENTS)}")
+        raise SystemExit(f"there is no {', '.join(sorted(unknown))}; there are {', '.join(MEASUREMENTS)}")
     folder = ROOT / "build" / "measured" / str(list_versions()["diagnosis"])
     folder.mkdir(parents=True, exist_ok=True)
     for name in chosen.names or MEASUREMENTS:
         needs_recordings, measure = MEASUREMENTS[name]
-        if needs_recordings and not any(LOGS.glob("*.mcap")):
-            sys.stdout.write(f"{name}: skipped, no recordings in {LOGS.name}\n")
+        if needs_recordings and not any(RECORDINGS.glob("*.mcap")):
+            sys.stdout.write(f"{name}: skipped, no recordings in {RECORDINGS.name}\n")
             continue
         write_measured(name, measure(Asked(chosen.logs, chosen.jobs, folder)))
         sys.stdout.write(f"{name}: measured\n")
         sys.stdout.flush()
-        run_beside("measured_tables.py")
+        run_beside("measured_tables")
     return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,6 +1,6 @@
 """Tables of README and handbook from what was measured: rendered, and held against the pages.
 
-Run: python benchmarks/measured_tables.py [--check]. What a command measured stands in a file of
+What a command measured stands in a file of
 benchmarks/measured: its rows, the command, the commit, the date, and the versions of the program that its
 numbers depend on. A page has the place of a table between two comments, `<!-- measured: NAME -->` and
 `<!-- /measured -->`; without --check what stands between them is written again. `make measure` measures.
@@ -260,11 +260,12 @@ def fill_page(text: str) -> str:
     return BLOCK.sub(fill, text)
 
 
-def main() -> int:
-    """Write the tables, or say which pages differ from what was measured."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--check", action="store_true", help="write nothing, say what differs or is outdated")
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> int:
+    """Write the tables, or say which pages differ from what was measured."""
     differ = [page for page in PAGES if fill_page(page.read_text("utf-8")) != page.read_text("utf-8")]
     for page in differ:
         sys.stdout.write(f"{page.relative_to(ROOT)}{' differs' if asked.check else ''}\n")
@@ -277,7 +278,3 @@ def main() -> int:
     ]
     sys.stdout.write("".join(f"{one}: make measure\n" for one in outdated))
     return int(asked.check and bool(differ or outdated))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,7 +1,5 @@
 """Plans in closed loop: a poor first log, its diagnosis, a plan, a drive of it with the hidden physics.
 
-    python benchmarks/plan_game.py --draws 12 [--seed 1] [--out scores.jsonl]
-
 Each draw hides one to three effects in a simulated vehicle and drives it poorly. The plan is driven by
 the simulator, which shares no code with the plan's models; then both logs are diagnosed together. One promise
 of each plan, drawn at random, is tested at its own second too: the drive is ended there and diagnosed again.
@@ -19,7 +17,7 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from json_lines import add_row, read_rows
+from measuring import add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.estimation import Named, Recording, diagnose_runs
@@ -192,15 +190,14 @@ def record(scenario: Scenario, path: Path) -> tuple[Vehicle, Recording]:
     return read_recording(analyze_log(path, options).manifest)
 
 
-def main() -> None:
-    """Play and count."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--draws", type=int, default=12)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
+    """Play and count."""
     scores = [Score(**row) for row in read_rows(asked.out)]
     known = {score.seed for score in scores}
     for seed in range(asked.seed, asked.seed + asked.draws):
@@ -232,7 +229,3 @@ def _report(scores: list[Score]) -> None:
 def _rate(scores: list[Score], part: str, whole: str) -> str:
     kept, asked = (sum(getattr(score, name) for score in scores) for name in (part, whole))
     return f"{kept} of {asked} ({kept / max(asked, 1):.1%})"
-
-
-if __name__ == "__main__":
-    main()

@@ -1,4 +1,4 @@
-"""What the program makes of logs as platforms publish them: `make platforms`.
+"""What the program makes of logs as platforms publish them.
 
 Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration.
 """
@@ -68,15 +68,12 @@ def print_table(rows: list[Row]) -> None:
         print(f"| {' | '.join(cells)} |", flush=True)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("platforms", nargs="*", help="which; all without")
     parser.add_argument("--seed", type=int, default=3)
-    chosen = parser.parse_args()
+
+
+def run(chosen: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory(prefix="slip-platforms-") as folder:
         names = chosen.platforms or list(PLATFORMS)
         print_table([try_platform(name, Path(folder), seed=chosen.seed) for name in names])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """How fast topics are read out of a large log, against other readers and the bound, in one table.
 
-    python benchmarks/reader.py [--seconds 770] [--repeat 3] [--keep FILE] [--json FILE]
-
 Writes a log of about 1.2 GB (zstd, chunk checksums) with 420 000 small messages among images, then lets every
 reader read the same eight topics, each in a process of its own. The bound reads every chunk, inflates it and
 (with checksum) verifies it, nothing else. Exit code 1 when values differ.
@@ -14,7 +12,6 @@ import json
 import os
 import resource
 import subprocess
-import sys
 import tempfile
 import time
 import zlib
@@ -22,8 +19,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(Path(__file__).parent)]
+from measuring import RUNNER
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -156,7 +152,7 @@ def measure(name: str, path: Path, repeat: int) -> dict[str, object]:
     """Best wall and CPU of several processes, highest memory."""
     runs = []
     for _ in range(repeat):
-        command = [sys.executable, __file__, "--only", name, "--keep", str(path)]
+        command = [*RUNNER, "reader", "--only", name, "--keep", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             reason = done.stderr.strip().splitlines()[-1]
@@ -196,15 +192,16 @@ def number(row: dict[str, object], key: str) -> float:
     return value
 
 
-def main() -> int:
-    """Generate the log, measure every reader, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seconds", type=float, default=935.0, help="length of the generated drive")
     parser.add_argument("--repeat", type=int, default=3)
     parser.add_argument("--keep", type=Path, help="write the log there, or use it when it is there")
     parser.add_argument("--json", type=Path, help="also write the table there")
     parser.add_argument("--only", choices=list(READERS), help=argparse.SUPPRESS)
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Generate the log, measure every reader, print the table."""
     if given.only:
         measure_here(given.only, given.keep)
         return 0
@@ -230,7 +227,3 @@ def main() -> int:
     for line in broken:
         print(f"differs: {line}")
     return 1 if broken else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

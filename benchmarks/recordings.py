@@ -1,6 +1,6 @@
 """What the right effects, given by hand, leave of the ideal model's error on the real recordings.
 
-Run: python benchmarks/recordings.py [--ladders] [WORD...]. Every recording under ../shared/logs whose name
+Every recording under ../shared/logs whose name
 holds one of the words (all without any), from measured wheels and from commands: held-out errors after the
 effects over those of the ideal model, beside the table "On the real recordings" of METHODS.md section 5. With
 --ladders the effects are climbed one by one and every rung's 2 s error is printed: it falls, or it stops.
@@ -8,6 +8,7 @@ effects over those of the ideal model, beside the table "On the real recordings"
 
 from __future__ import annotations
 
+import argparse
 import sys
 import tempfile
 from pathlib import Path
@@ -16,11 +17,10 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
 
+from measuring import RECORDINGS
 from real_recordings import CASES, Reached, Recordings, make_model, measure
 
 from pipeline.estimation import Problem, climb
-
-LOGS = Path(__file__).parents[2] / "shared" / "logs"
 
 
 def describe_values(reached: Reached) -> str:
@@ -41,16 +41,20 @@ def print_row(name: str, values: tuple[float, ...]) -> None:
     sys.stdout.write(f"  {name:<18}" + "".join(f"{value:8.3f}" for value in values) + "\n")
 
 
-def main() -> None:
-    words = [word for word in sys.argv[1:] if not word.startswith("-")]
-    chosen = [case for case in CASES if not words or any(word in case.log for word in words)]
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("words", nargs="*", help="of the recordings' names; all without any")
+    parser.add_argument("--ladders", action="store_true", help="climb the effects one by one")
+
+
+def run(given: argparse.Namespace) -> None:
+    chosen = [case for case in CASES if not given.words or any(word in case.log for word in given.words)]
     worst: list[tuple[float, str]] = []
     with tempfile.TemporaryDirectory() as folder:
-        recordings = Recordings(LOGS, Path(folder))
+        recordings = Recordings(RECORDINGS, Path(folder))
         for case in chosen:
-            run, vehicle = recordings.load(case.log)
-            if "--ladders" in sys.argv:
-                ladder = climb(Problem([run], vehicle, case.source), make_model(vehicle, case.effects))
+            driven, vehicle = recordings.load(case.log)
+            if given.ladders:
+                ladder = climb(Problem([driven], vehicle, case.source), make_model(vehicle, case.effects))
                 errors = [rung.errors.t_mrmse_m for rung in ladder.steps]
                 fell = "falls" if errors == sorted(errors, reverse=True) else "RISES"
                 names = ["ideal", *ladder.steps[-1].effects]
@@ -59,12 +63,12 @@ def main() -> None:
                 sys.stdout.write(f"  left out: {', '.join(ladder.idle) or 'none'}\n")
                 sys.stdout.flush()
                 continue
-            reached = measure(run, vehicle, case.source, case.effects)
+            reached = measure(driven, vehicle, case.source, case.effects)
             sys.stdout.write(
                 f"{case.log}, {case.source.value}: {reached.windows} windows, "
                 f"ideal {reached.t_before_m:.3f} m {reached.r_before_rad:.3f} rad, "
-                f"latencies vary {run.alignment.latency_spread_s:.3f} s, "
-                f"outliers {run.alignment.outlier_s:.1f} s of {run.duration_s:.0f} s\n"
+                f"latencies vary {driven.alignment.latency_spread_s:.3f} s, "
+                f"outliers {driven.alignment.outlier_s:.1f} s of {driven.duration_s:.0f} s\n"
                 f"  {describe_values(reached)}\n"
                 f"  {'':<18}{'x':>8}{'y':>8}{'w':>8}{'T':>8}{'R':>8}{'R turns':>8}\n"
             )
@@ -79,7 +83,3 @@ def main() -> None:
                     worst.append((share, f"{channel} of {case.log}, {case.source.value}"))
     for share, what in sorted(worst, reverse=True):
         sys.stdout.write(f"beyond 1.1: {share:.2f}  {what}\n")
-
-
-if __name__ == "__main__":
-    main()

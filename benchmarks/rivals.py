@@ -1,7 +1,6 @@
 """The named physics beside the models of the literature and learned ones, on every real recording.
 
-Run: python benchmarks/rivals.py [--results build/rivals] [--input command|measured] [--run TEXT]
-[--no-learned] [--rows FILE] and, of rows that are there, --table FILE. Recordings under ../shared/logs are
+Recordings under ../shared/logs are
 analyzed and diagnosed into the results where they are not yet; without recordings nothing is done, and it
 says so.
 
@@ -27,8 +26,8 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from json_lines import add_row, read_rows
 from measured_tables import render_section
+from measuring import RECORDINGS, add_row, read_rows
 from threadpoolctl import threadpool_limits
 
 from pipeline.core import SlipError
@@ -55,7 +54,6 @@ from pipeline.models.literature import list_models
 from pipeline.report.motion_view import load_motion_run, read_model_text
 from pipeline.store import Manifest, Store
 
-LOGS = Path(__file__).parents[2] / "shared" / "logs"
 NAMED, IDEAL, TREES, BEYOND = "named physics", "ideal", "learned_trees", "named + trees"
 KEPT = "named + learned"
 PLACES = ("in the run", "same ground", "other ground")
@@ -326,21 +324,22 @@ def summarize(rows: Sequence[Row], metric: str) -> dict[str, object]:
     }
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--results", type=Path, default=Path("build/rivals"))
     parser.add_argument("--input", choices=("command", "measured"), default="command")
     parser.add_argument("--run", default="", help="only recordings with this in their names")
     parser.add_argument("--no-learned", action="store_true")
     parser.add_argument("--rows", type=Path, help="JSON lines to add rows to; those that are there are kept")
     parser.add_argument("--table", type=Path, help="print the tables of these rows, and judge nothing")
-    chosen = parser.parse_args()
+
+
+def run(chosen: argparse.Namespace) -> None:
     if chosen.table:
         print_tables(read_rows(chosen.table))
         return
-    logs = sorted(LOGS.glob("*.mcap"))
+    logs = sorted(RECORDINGS.glob("*.mcap"))
     if not logs:
-        print(f"skipped: no recordings in {LOGS.name}")
+        print(f"skipped: no recordings in {RECORDINGS.name}")
         return
     done = read_rows(chosen.rows)
     known = {(row["run"], row["place"], row["input"]) for row in done}
@@ -356,7 +355,3 @@ def main() -> None:
                 add_row(chosen.rows, row)
                 print(f"{target.name}, {place}: judged", file=sys.stderr, flush=True)
     print_tables([row for row in done if row["input"] == chosen.input])
-
-
-if __name__ == "__main__":
-    main()

@@ -1,7 +1,5 @@
 """Slip by number of passes: what the map says of drawn drives with and without such ground, and of real ones.
 
-Run: python benchmarks/terrain.py drawn|real [--runs N] [--seed N] [--logs FOLDER] [--out FILE]
-
 - `drawn`: laps of a Husky over ground that every pass compacts, at several rates, and over ground that does
   not change. Printed is how often a finding is reported, and how often its interval holds the truth.
 - `real`: recordings of a folder, each mapped; printed is what is found of the number of passes.
@@ -16,7 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from json_lines import add_row
+from measuring import RECORDINGS, add_row
 
 from pipeline.fleet.terrain import PassEffect
 from pipeline.job import Options
@@ -95,19 +93,16 @@ def play_real(logs: Path) -> None:
         print(f"! {note}")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("part", choices=["drawn", "real"])
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("part", nargs="?", default="drawn", choices=["drawn", "real"])
     parser.add_argument("--runs", type=int, default=10)
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--logs", type=Path, default=Path("../shared/logs"))
+    parser.add_argument("--logs", type=Path, default=RECORDINGS)
     parser.add_argument("--out", type=Path)
-    asked = parser.parse_args()
+
+
+def run(asked: argparse.Namespace) -> None:
     if asked.part == "real":
         play_real(asked.logs)
     else:
         play_drawn(asked.seed, asked.runs, asked.out)
-
-
-if __name__ == "__main__":
-    main()

@@ -8,9 +8,7 @@ the finished log does not have, and the CPU time of a look.
 from __future__ import annotations
 
 import argparse
-import json
 import math
-import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -18,9 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
-sys.path.insert(0, str(Path(__file__).parent / "hidden"))
-
-from draw import Category, draw_riddle, write_riddle
+from game.draw import Category, draw_riddle, write_riddle
+from measuring import add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.job import Options
@@ -139,18 +136,18 @@ def _share(flags: list[bool]) -> str:
     return f"{count} of {len(flags)} ({count / size:.1%} +- {half:.1%})"
 
 
-def main() -> int:
-    """Replay the drawn logs of some seeds, each category in turn, and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, default=0, help="the first seed")
     parser.add_argument("--logs", type=int, default=20, help="how many logs")
     parser.add_argument("--closed", type=int, default=0, help="how many of them are driven in closed loop")
     parser.add_argument("--until", type=float, default=math.inf, help="minutes after which no log is begun")
     parser.add_argument("--file", type=Path, help="JSON lines of what was counted, gone on with")
     parser.add_argument("--table", action="store_true", help="only print the table of the file")
-    asked = parser.parse_args()
-    lines = asked.file.read_text().splitlines() if asked.file and asked.file.exists() else []
-    records: list[Content] = [json.loads(line) for line in lines]
+
+
+def run(asked: argparse.Namespace) -> int:
+    """Replay the drawn logs of some seeds, each category in turn, and print the table."""
+    records: list[Content] = [*read_rows(asked.file)]
     done = {(record["category"], record["seed"]) for record in records}
     begin = time.perf_counter()
     for number in range(0 if asked.table else asked.logs):
@@ -160,12 +157,6 @@ def main() -> int:
             continue
         records.append(replay(category, seed))
         print(f"{category} {seed}: {[(s['effect'], s['kept']) for s in judge(records[-1])]}", flush=True)
-        if asked.file:
-            with asked.file.open("a") as stream:
-                stream.write(json.dumps(records[-1]) + "\n")
+        add_row(asked.file, records[-1])
     print("\n".join(describe(records)))
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,5 @@
 """How fast the workbench answers on a 10-minute log: a value moved by hand, an effect added, dropped, undone.
 
-    python benchmarks/workbench.py [--log LOG] [--vehicle V] [--runs N]
-
 Asks a server over HTTP as the page does, numbers and figures, and prints the median and the slowest answer
 in seconds; promised is 0.5 s. Then the same in a browser, where there is one: from the press on *Add* until
 number, bar, path, map and *where* have changed on the page. The peer in the same run answers the same
@@ -160,14 +158,13 @@ def show(title: str, taken: list[tuple[float, float]]) -> None:
     )
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--log", type=Path, help="log to open; by default one of 10 minutes is simulated")
     parser.add_argument("--vehicle", help="its vehicle, where the log does not say it")
     parser.add_argument("--runs", type=int, default=5)
-    chosen = parser.parse_args()
+
+
+def run(chosen: argparse.Namespace) -> None:
     with tempfile.TemporaryDirectory() as name:
         log = chosen.log or simulate_case("husky_tile", out=Path(name) / "ten_minutes.mcap", duration_s=600.0)
         overrides = {"vehicle": {"preset": chosen.vehicle}} if chosen.vehicle else {}
@@ -205,7 +202,3 @@ def main() -> None:
                 press_in_browser(server, manifest.run)
             finally:
                 server.close()
-
-
-if __name__ == "__main__":
-    main()

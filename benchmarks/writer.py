@@ -1,7 +1,5 @@
 """What serializing a message takes: our columns beside the message-wise encoder of mcap-ros2-support.
 
-    python benchmarks/writer.py [--rows 20000]
-
 Both serialize the same values; the exit code is 1 where their bytes differ.
 """
 
@@ -30,11 +28,12 @@ def measure(work: Callable[[], list[bytes]]) -> tuple[float, list[bytes]]:
     return time.process_time() - before, payloads
 
 
-def main() -> int:
-    """Serialize every kind of message, print the table."""
-    parser = argparse.ArgumentParser(description=__doc__)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--rows", type=int, default=20_000)
-    given = parser.parse_args()
+
+
+def run(given: argparse.Namespace) -> int:
+    """Serialize every kind of message, print the table."""
     differ = False
     print(f"{'us a message':32s} {'ours':>8s} {'mcap-ros2-support':>18s}")
     for kind in sorted({kind for _, kind, _ in SMALL}):
@@ -49,7 +48,3 @@ def main() -> int:
         differ |= payloads != other
         print(f"{kind:32s} {ours / given.rows * 1e6:8.2f} {theirs / given.rows * 1e6:18.2f}")
     return int(differ)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

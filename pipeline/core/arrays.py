@@ -61,7 +61,7 @@ PAUSE_NS = 3_600_000_000_000
 drive contains an hour of which nothing was recorded."""
 _FEWEST_POINTS = 4
 """Minimum number of poses of a quadratic fit: its coefficients plus one, to average noise. With eight, slow
-poses are smoothed more: the median slip of one recording falls by 0.2 % (`benchmarks/constants.py`)."""
+poses are smoothed more: the median slip of one recording falls by 0.2 % (`make bench NAME=constants`)."""
 _BLOCK = 4096
 """Number of queries fitted at a time, which limits memory; results do not depend on it."""
 _SHORTEST_HOLD_S = 0.5
@@ -242,7 +242,8 @@ _SHARE_OF_RMS = 0.5
 """Minimum robust spread of a column as a share of its RMS: for normal values the spread is the RMS, for
 values that are mostly zero it is zero."""
 _ROUNDS = 10
-"""Number of reweightings; five or twenty change no finding of three recordings (`make bench-constants`)."""
+"""Number of reweightings; five or twenty change no finding of three recordings
+(`make bench NAME=constants`)."""
 _WIDTH = 2.0
 """Scale of Cauchy's weights in median sizes: 1.35 standard deviations of normal noise. Holland and Welsch use
 2.385; poses have more outliers. Half or double change no finding of three recordings."""

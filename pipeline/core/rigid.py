@@ -123,7 +123,7 @@ freedom."""
 _STEP = np.repeat([-0.5, 0.5], _SIDE)
 _PLAINLY = 3.0
 """Ratio of the squared residuals of a step to those of a bend above which it is a bend; half or double change
-no finding of three recordings (`benchmarks/constants.py`)."""
+no finding of three recordings (`make bench NAME=constants`)."""
 LONGEST_WAIT_S = 1.5
 """Longest time between two poses of a waiting localization [s]; above it, waiting and a vehicle at rest are
 not distinguishable. On the recordings 99 of 100 times are at most 1.2 s. Half and double change no finding of

@@ -133,7 +133,7 @@ def find_implausible(effect: Effect) -> str | None:
 
 LEAST_T = 5.0
 """Significance threshold [standard errors] for reporting an effect: the largest t of some 30 candidates on
-logs without any effect stays below it (`make hidden-effect CATEGORY=empty`)."""
+logs without any effect stays below it (`make bench NAME=game/play`, category `empty`)."""
 STABLE_T = 0.5 * LEAST_T
 """Evidence required without the ten seconds that contribute most: one event is not enough."""
 LEAST_GAIN = 0.01

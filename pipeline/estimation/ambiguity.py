@@ -43,7 +43,7 @@ _REACHES = 0.02
 """Fraction by which the 2 s error of another model must be lower for that model to be chosen."""
 _FAR_WORSE = 1.5
 """Ratio to the lowest 2 s error above which a model is no alternative: true ones differ by less than a tenth
-(`make hidden-effect CATEGORY=cars,natural SEED=985000-985050`)."""
+(`make bench NAME=game/play`, `cars` and `natural`, 985000-985050)."""
 _ALIKE = 0.7
 """Correlation between the prediction changes of two effects above which they are alternatives."""
 DETECTED = LEAST_T + 1.3

@@ -27,7 +27,7 @@ from pipeline.fleet.levels import weigh_run_spreads
 CHANCE = 0.02
 """Level of a check's tests, so that it reports any change where there is none in at most one of forty checks:
 of 2,400 drawn pairs 2.8 % were called changed at a level of 0.025, as spreads of other quantities enter as
-means (`make check-again PART=drawn`)."""
+means (`make bench NAME=check_again ARGS=drawn`)."""
 POWER = 0.8
 """Probability of detecting a change of the smallest reported size."""
 MOST_MORE = 30

@@ -289,7 +289,8 @@ DRAWS = 400
 RUNS_SHARE = USUAL_SPREAD / 0.67449
 """Prior scale of the spread between runs of one terrain, as a share of that between terrains (the usual size
 of the parameter). The half-normal prior then has the usual spread between runs as its median, and intervals
-of a terrain with two to four runs contain 93 to 97 % of drawn runs (`make fleets ARGS="--drawn 200"`)."""
+of a terrain with two to four runs contain 93 to 97 % of drawn runs (`make bench NAME=fleets`,
+`ARGS="--drawn 200"`)."""
 _ENDS = (0.025, 0.975)
 """Quantiles of draws that bound a 95 % interval."""
 _EVERYWHERE = "*"

@@ -29,7 +29,7 @@ _LEAST_SLIP = 1e-3
 """Lower limit of relative slip, which keeps its logarithm finite."""
 _BLOCK_S = 30.0
 """Length of the stretches of the jackknife [s]. Neighbouring crossings are correlated by turns or speed for
-seconds; `make bench-terrain` counts false findings on drives over ground that does not change."""
+seconds; `make bench NAME=terrain` counts false findings on drives over ground that does not change."""
 _SHORT_S = 10.0
 """Length of the stretches for the comparison of single passes [s], which have few of the longer ones."""
 _FEWEST_BLOCKS = 5

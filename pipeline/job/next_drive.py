@@ -46,8 +46,7 @@ MOST_JOINED = 24
 OTHER_GROUND = 0.1
 """Weight of a run on another terrain, so that runs on the requested terrain dominate and the others determine
 the remaining parameters. The median heading error of seven runs, divided by that of their own models, is 1.29
-with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows (`python
-benchmarks/transfer.py`)."""
+with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows."""
 LEAST_FALL = 0.01
 """Decrease of the mean logarithm of the runs' residual scale to add an effect: one percent of the error."""
 

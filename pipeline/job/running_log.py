@@ -288,7 +288,7 @@ def receive_live(
 Content = Mapping[str, object]
 
 RUNNING_T = 2.0 * LEAST_T
-"""Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make watch-replay` counts
+"""Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make bench NAME=watch` counts
 retracted names."""
 _MOST_ASKS = 3
 """Maximum number of manoeuvres to ask for at once: as many as can be read while driving."""

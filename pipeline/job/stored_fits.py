@@ -272,7 +272,7 @@ LOGARITHMS = (*ERRORS, *COMMANDED)
 """Quantities beside the parameters, in their order; all are compared as logarithms."""
 USUAL_LOG_RATIO = 0.4
 """Root mean square of the prior of such a logarithm's spread between runs on one terrain: the spread of the
-Warthog recordings (`make bench-check PART=real`)."""
+Warthog recordings (`make bench NAME=check ARGS=real`)."""
 USUAL_LOG_SHARE = 0.18
 """The same of the share of the commanded yaw rate: that of seven runs of a Warthog on three terrains."""
 MULTIPLIER_ERROR = 0.01

@@ -148,7 +148,7 @@ class Bands:
 
 LEAST_WAY_M = 0.1
 """Distance [m] added before an error is divided by the distance: errors remain at rest. With 2 cm
-bands are a third wider, with 30 cm they cover fewer errors on held-out ground (`make learned-bands`)."""
+bands are a third wider, with 30 cm they cover fewer errors on held-out ground (five grounds of a Warthog)."""
 
 
 class ResidualTerm(AddedEffect):

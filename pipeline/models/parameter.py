@@ -279,7 +279,7 @@ class Least:
 
 
 WARTHOG_RUNS = "nine runs of a Warthog on five terrains"
-WARTHOG_LAGS = "six runs of a Warthog on three terrains (`make run-spreads`)"
+WARTHOG_LAGS = "six runs of a Warthog on three terrains"
 
 
 @dataclass(frozen=True)

@@ -329,7 +329,7 @@ def earlier_in_span(context: RunContext, late: float) -> Flags:
 
 @dataclass(frozen=True)
 class Limits:
-    """Thresholds of `trace_traction`; `make events` measures misses, false alarms and lead times with them.
+    """Thresholds of `trace_traction`; `make bench NAME=events` measures misses, false alarms, lead times.
 
     Attributes:
         live: usual body speed above which traction is judged [m/s].

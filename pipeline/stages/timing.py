@@ -219,7 +219,7 @@ _HUBER = 3.0
 """Deviation [standard deviations] above which an age, or a displacement, has less weight."""
 _ACCELERATION_MPS2 = 2.0
 """Standard deviation of accelerations: with half or twice of it, ages of withheld turns are up to
-5 % nearer or 5 % farther off (`make pose-ages`)."""
+5 % nearer or 5 % farther off (against the gyro)."""
 _STEADY_S = 0.7
 """Correlation time of accelerations: with 0.3 or 2 s, ages of withheld turns change by up to 5 %."""
 _ROUGH = 0.2

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from draw import draw_riddle, write_riddle
-from truth import build_true
+from game.draw import draw_riddle, write_riddle
+from game.true_model import build_true
 
 from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
 from pipeline.estimation.floor import _take_away_changes, split_differences

@@ -195,7 +195,7 @@ def test_what_the_statistics_count_and_nobody_finds_is_told(tmp_path: Path) -> N
 
 @pytest.mark.parametrize("name", [name for name in damage.LOGS if "no checksum" not in name])
 def test_no_damaged_byte_that_a_checksum_covers_is_returned_as_good(tmp_path: Path, name: str) -> None:
-    """Some bytes of `make damage`, which tries them all."""
+    """Some bytes of `make bench NAME=damage`, which tries them all."""
     counts = damage.damage_log(tmp_path, damage.LOGS[name], 61)
     wrong = [key for key in counts if key[2] == "SILENT" and key[0] not in ("none", "silent in record")]
     assert not wrong

@@ -1,8 +1,8 @@
-"""The benchmark of `make rivals`: where a model comes from, who is marked as better, and no recordings."""
+"""The benchmark `rivals`: where a model comes from, who is marked as better, and no recordings."""
 
 from __future__ import annotations
 
-import sys
+import argparse
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -77,8 +77,9 @@ def test_a_difference_within_its_interval_is_no_win(
 def test_without_recordings_it_says_so_and_does_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(rivals, "LOGS", tmp_path / "logs")
-    monkeypatch.setattr(sys, "argv", ["rivals.py", "--results", str(tmp_path / "results")])
-    rivals.main()
+    monkeypatch.setattr(rivals, "RECORDINGS", tmp_path / "logs")
+    parser = argparse.ArgumentParser()
+    rivals.add_arguments(parser)
+    rivals.run(parser.parse_args(["--results", str(tmp_path / "results")]))
     assert capsys.readouterr().out == "skipped: no recordings in logs\n"
     assert not (tmp_path / "results").exists()

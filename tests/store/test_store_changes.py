@@ -53,7 +53,7 @@ def test_a_changed_byte_is_noticed_wherever_it_is(filled: Store) -> None:
     flips = cycle((0x01, 0x20, 0x80, 0xFF))
     for path in filter(is_held, list_files(filled.root)):
         whole = path.read_bytes()
-        # `benchmarks/damage_results.py` tries every byte.
+        # `make bench NAME=damage_results` tries every byte.
         for at in range(0, len(whole), 1 + len(whole) // 11):
             path.write_bytes(whole[:at] + bytes([whole[at] ^ next(flips)]) + whole[at + 1 :])
             assert filled.examine().problems, f"byte {at} of {path.relative_to(filled.root)}"
