@@ -6,15 +6,17 @@ import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
+from mcap_ros2.writer import Writer
 
 from pipeline.core import format_share
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text
 from pipeline.estimation import RunDiagnosis
-from pipeline.logs.writer import LogWriter
+from pipeline.logs.schema import definition_text
 from pipeline.models import format_value
 from pipeline.models.catalogue import find_effect
 from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_within, is_steered, join, wait
@@ -122,18 +124,43 @@ def read_promises(path: Path) -> Promised:
 
 
 def _write_mcap(plan: Plan, path: Path) -> None:
-    stamps = _START_NS + np.round(plan.commands.times * _SECOND).astype(np.int64)
-    fields: list[dict[str, Floats]]
+    topics = plan.topic.split(", ")
+    definition = definition_text(plan.type_name)
+    if definition is None:
+        raise AssertionError(plan.type_name)
+    with path.open("wb") as file, Writer(file) as writer:
+        schema = writer.register_msgdef(plan.type_name, definition)
+        for number, row in enumerate(zip(plan.commands.times, *_list_values(plan), strict=True)):
+            at = _START_NS + round(float(row[0]) * _SECOND)
+            for topic, message in zip(topics, row[1:], strict=True):
+                stamped = {"header": {"stamp": _split_time(at)}, **message}
+                writer.write_message(topic, schema, stamped, at, at, number)
+        writer.add_metadata("safety", {"text": " ".join(SAFETY)})
+
+
+def _list_values(plan: Plan) -> list[list[dict[str, object]]]:
+    """Messages of every topic, without header; fields that they lack are zero."""
     if plan.type_name == WHEELS and plan.wheels is not None:
-        fields = [{"data": side} for side in plan.wheels]
-    else:
-        speed, turn = _FIELDS[plan.type_name]
-        fields = [{speed: plan.commands.speed, turn: plan.commands.turn}]
-    header = stamps if plan.type_name.endswith("Stamped") else None
-    with LogWriter(path) as writer:
-        for topic, values in zip(plan.topic.split(", "), fields, strict=True):
-            writer.write_columns(topic, plan.type_name, stamps, values, header_time=header)
-        writer.metadata("safety", {"text": " ".join(SAFETY)})
+        return [[{"data": float(value)} for value in side] for side in plan.wheels]
+    paths = _FIELDS[plan.type_name]
+    pairs = zip(plan.commands.speed.tolist(), plan.commands.turn.tolist(), strict=True)
+    return [[_nest(dict(zip(paths, pair, strict=True))) for pair in pairs]]
+
+
+def _nest(values: Mapping[str, float]) -> dict[str, object]:
+    """Nested fields of a message from values by path, for example ``twist.linear.x``."""
+    message: dict[str, object] = {}
+    for path, value in values.items():
+        *outer, name = path.split(".")
+        inner: dict[str, Any] = message
+        for key in outer:
+            inner = inner.setdefault(key, {})
+        inner[name] = value
+    return message
+
+
+def _split_time(at_ns: int) -> dict[str, int]:
+    return {"sec": at_ns // _SECOND, "nanosec": at_ns % _SECOND}
 
 
 def _format_csv(plan: Plan) -> str:
