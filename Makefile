@@ -25,7 +25,7 @@ FORGIVE_ALERTS = || { code=$$?; [ $$code -eq 4 ] && echo "a level moved (see abo
 	late-starts log-seconds map measure mysteries check-again run-spreads pictures plan-compare plan-game platforms \
 	pose-ages reveal rivals samples screenshots serve \
 	test \
-	test-long trend twin watch-replay wheel
+	test-long trend watch-replay wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -177,9 +177,6 @@ bench-export: $(VENV)/.ready-dev ## exporting runs of 1, 3 and 10 hours as MCAP
 
 bench-real: $(VENV)/.ready-dev ## the right effects on the real recordings [ARGS="--ladders"]
 	$(BIN)/python benchmarks/recordings.py $$ARGS
-
-twin: $(VENV)/.ready-dev ## held-out error of replays in MuJoCo on six vehicles, and what is found in the twins' motion [ARGS="husky --logs run.mcap"]
-	@$(BIN)/python benchmarks/twin.py $$ARGS
 
 bench-workbench: $(VENV)/.ready-dev ## answers of the workbench on a 10-minute log
 	$(BIN)/python benchmarks/workbench.py
