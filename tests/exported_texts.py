@@ -10,7 +10,6 @@ import re
 from collections.abc import Callable
 from xml.etree import ElementTree as ET
 
-import mujoco
 import yaml
 
 RUNS = "EXECUTED"
@@ -83,11 +82,6 @@ def read_xml(text: str) -> tuple[object, list[str]]:
     root = ET.fromstring(text, parser)  # noqa: S314
     comments = [str(one.text).strip() for one in root.iter() if one.tag is ET.Comment]
     elements = [one for one in root.iter() if one.tag is not ET.Comment]
-    if root.tag == "mujoco":
-        mujoco.MjModel.from_xml_string(text)
-    entities = [root.attrib.pop("model")] if root.tag == "mujoco" else []
-    entities += [one.attrib.pop("name") for one in root.iter("model") if one.get("name") != "ground"]
-    assert all(re.fullmatch(r"\w+", name) for name in entities)
     for one in elements:
         require_finite(" ".join([one.text or "", *one.attrib.values()]).split())
     return [(one.tag, one.attrib, (one.text or "").strip()) for one in elements], list_literals(comments)
@@ -138,8 +132,6 @@ READERS: dict[str, Callable[[str], tuple[object, list[str]]]] = {
     "python": read_python,
     "traction": read_python,
     "gazebo": read_xml,
-    "mjcf": read_xml,
-    "sdf": read_xml,
     "px4": read_table,
     **dict.fromkeys(
         ("autoware", "nav2", "nav2_traction", "robot_localization", "ros2_control", "vesc"), read_parameters

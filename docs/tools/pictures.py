@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 
 FOLDER = ROOT / "docs" / "pages" / "pictures"
 LOG = "data_samples/warthog_ice.mcap"
-TWIN_LOG = "data_samples/husky_tile.mcap"
 SLIP = Path(sys.executable).parent / "slip"
 GROWING = "data_samples/husky_tile.mcap"
 WIDTH, HEIGHT = 1280, 800
@@ -45,7 +44,7 @@ FRAME_MS = 2000
 
 
 def draw_pictures(folder: Path) -> list[Path]:
-    """Make the pictures in a folder: report, twin, workbench, a watched log, the error as effects are added.
+    """Make the pictures in a folder: report, workbench, a watched log, the error as effects are added.
 
     Raises:
         RuntimeError: there is no Chromium.
@@ -61,14 +60,6 @@ def draw_pictures(folder: Path) -> list[Path]:
         chrome.open(page.as_uri())
         chrome.wait("document.querySelectorAll('svg, canvas').length > 3")
         chrome.picture(folder / "report.png")
-        twin = Path(work) / "twin.html"
-        asked = [SLIP, "simulate", "--twin", TWIN_LOG, "--page", twin, "--results", results]
-        subprocess.run(asked, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)  # noqa: S603
-        chrome.open(twin.as_uri())
-        chrome.wait(DRAWN)
-        chrome.run("document.getElementById('motion').scrollIntoView()")
-        time.sleep(1.0)
-        chrome.picture(folder / "twin.png")
         with serve_results(results) as address:
             chrome.open(address)
             frames = []
@@ -88,7 +79,7 @@ def draw_pictures(folder: Path) -> list[Path]:
         shutil.copy(frames[2], folder / "workbench.png")
         (folder / "falling.png").write_bytes(join_frames([frame.read_bytes() for frame in frames], FRAME_MS))
         _draw_terrain(chrome, Path(work), folder / "terrain.png")
-    names = ("report.png", "twin.png", "workbench.png", "falling.png", "live.png", "terrain.png")
+    names = ("report.png", "workbench.png", "falling.png", "live.png", "terrain.png")
     return [folder / name for name in names]
 
 

@@ -215,7 +215,7 @@ class Model:
         """Its values as parameters of what people run, as `slip model export` writes them.
 
         Args:
-            to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, mjcf, sdf, json or
+            to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or
                 python.
             current: for vesc and px4 the robot's file of parameters, which is corrected.
         """

@@ -1,8 +1,7 @@
-"""What people see on a terminal: the summary of a run, a batch, a log that grows, and a replay."""
+"""What people see on a terminal: the summary of a run, a batch, and a log that grows."""
 
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 import time
@@ -27,7 +26,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
     from pipeline.batch.season import Line
-    from pipeline.job.twin_replay import TwinReplay
 
     Seen = Mapping[str, object]
 
@@ -437,50 +435,3 @@ def _format_looks(seen: Seen, knowledge: Seen) -> str:
     parts = [f"diagnosed up to {format_duration(until)}" if until else "not diagnosed yet"]
     parts += ["diagnosing now"] if seen["diagnosing"] else []
     return f"{', '.join(parts)}; CPU {format_share(cast('float', seen['cpu_share']))} of a core"
-
-
-_SIDES = {"ideal": "ideal model", "model": "kinematic model", "twin": "twin in MuJoCo"}
-
-
-def describe_replay(result: TwinReplay, page: Path | None) -> list[str]:
-    """The errors as a table, what the twin is made of and what it lacks, as lines.
-
-    Args:
-        result: the replay.
-        page: the page that was written; None for none.
-    """
-    judged = "each with parameters fitted without its block of 10 s" if result.is_seen else "not fitted to it"
-    lines = [
-        f"run       {result.run}    {result.body.vehicle.name}",
-        f"model     {', '.join(result.model.ids) or 'ideal'}",
-        f"judged    {result.predictions} predictions of 2 s from measured poses, {judged}",
-        "",
-        f"{'':<18}{'position':>12}{'heading':>12}",
-    ]
-    for side, error in result.errors.items():
-        position, heading = 100.0 * error.t_mrmse_m, math.degrees(error.r_mrmse_rad)
-        lines.append(f"{_SIDES[side]:<18}{position:>9.2f} cm{heading:>8.2f} deg")
-    lines += ["", *_describe_twin(result)]
-    if result.body.controller:
-        names = ", ".join(effect.id for effect in result.body.controller)
-        lines.append(f"MuJoCo has no element for: {names}. The replay applies it before the servos.")
-    lines += [f"note      {note}" for note in result.body.notes]
-    return [*lines, *([f"page      {page}"] if page is not None else [])]
-
-
-def _describe_twin(result: TwinReplay) -> list[str]:
-    share = result.reproduced
-    lines = [f"The twin reproduces {100.0 * share:.0f} % of what the model explains."]
-    if math.isnan(share):
-        lines = ["The model explains nothing of this log beyond the ideal one, and so does the twin."]
-    if not result.is_worse and not result.missing:
-        return lines
-    model = result.errors["model"].t_mrmse_m
-    lines += [
-        f"Contact of wheels cannot reproduce {one.effect}: without it the model errs by "
-        f"{100.0 * one.t_mrmse_m:.2f} cm, not {100.0 * model:.2f} cm. {one.motion.rstrip('.')}."
-        for one in result.missing
-    ]
-    if result.is_worse and not result.missing:
-        lines.append("All of its effects are in the twin: contact reproduces one of them in part only.")
-    return lines

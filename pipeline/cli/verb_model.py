@@ -306,7 +306,7 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
-        to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo, mjcf, sdf,
+        to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo,
             traction, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy

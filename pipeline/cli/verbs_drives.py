@@ -1,4 +1,4 @@
-"""Commands on drives: plan, what to drive next; simulate, and its replay of a twin."""
+"""Commands on drives: plan, what to drive next; and simulate."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from pipeline.cli.conventions import (
     LOSSY,
     Choices,
     Results,
-    TrustCode,
     build_options,
     open_shown,
     print_json,
@@ -26,18 +25,14 @@ from pipeline.cli.conventions import (
     show_progress,
     spell_choices,
 )
-from pipeline.cli.model_runs import gather_runs, open_model
-from pipeline.core import SlipError, finite_or_none, naming_os_errors
+from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
     from pipeline.estimation import Recording, RunDiagnosis
     from pipeline.fleet.forecast import Forecast
     from pipeline.job import Options
-    from pipeline.job.twin_replay import TwinReplay
-    from pipeline.models.model_file import ModelFile
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
-    from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -317,69 +312,10 @@ def format_plan(
     return lines
 
 
-def replay(
-    twin: str, log: str | None, page: Path | None, results: Path, *, trust_code: bool, json: bool
-) -> int:
-    """Replay commands, print errors over 2 s, and write the page.
-
-    Args:
-        twin: a model file; or a log or a run, whose own model and commands are taken.
-        log: the log or run to replay; None for that of ``twin``.
-        page: the page to write; None for none.
-        results: results folder.
-        trust_code: trust the Python that the model file names.
-        json: print one JSON object.
-
-    Raises:
-        SlipError: a file cannot be read, or the twin cannot be made.
-    """
-    from pipeline.cli.screen import describe_replay  # noqa: PLC0415 - heavy
-    from pipeline.job.twin_replay import load_mujoco, replay_twin  # noqa: PLC0415 - heavy
-
-    # Report a missing package before an analysis, which may take a minute.
-    load_mujoco()
-    file, run = _open(twin, log, results, trust_code=trust_code, quiet=json)
-    result = replay_twin(file, run)
-    if page is not None:
-        _write_page(page, result, describe_replay(result, None))
-    return print_result(result.to_json(), lambda: describe_replay(result, page), json=json)
-
-
-def _open(
-    twin: str, log: str | None, results: Path, *, trust_code: bool, quiet: bool
-) -> tuple[ModelFile, MotionRun]:
-    from pipeline.job import Options  # noqa: PLC0415
-    from pipeline.job.twin_replay import find_run_model  # noqa: PLC0415 - heavy
-
-    if Path(twin).suffix == ".toml":
-        file = open_model(Path(twin), trust_code=trust_code)
-        if log is None:
-            what, hint = "no log is named whose commands are replayed", f"slip simulate RUN --twin {twin}"
-            raise SlipError("no_runs", what, where="--twin", hint=hint)
-    else:
-        options = Options(out=results, report=False, diagnosis=True)
-        with open_shown(twin, options, quiet=quiet) as opened:
-            file = find_run_model(opened.manifest, results)
-    _, (run,) = gather_runs([log or twin], file.model.vehicle, None, results, quiet=quiet)
-    return file, run
-
-
-def _write_page(path: Path, result: TwinReplay, lines: Sequence[str]) -> None:
-    from pipeline.report.drive_pages import render_twin  # noqa: PLC0415 - heavy
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
-
-    text = render_twin(result.to_json(), lines, result.paths, result.horizon_errors)
-    hint = "Check the folder and its permissions."
-    with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=path, hint=hint):
-        replace_file(path, text.encode())
-
-
 def simulate(  # noqa: D417 - arguments document themselves
     case: Annotated[
         str | None,
-        Parameter(
-            help="a named case; without one, a plain vehicle. With --twin MODEL: the log or run to replay"
-        ),
+        Parameter(help="a named case; without one, a plain vehicle"),
     ] = None,
     /,
     *,
@@ -396,16 +332,9 @@ def simulate(  # noqa: D417 - arguments document themselves
     platform: str | None = None,
     play: Path | None = None,
     cases: Annotated[bool, Parameter(negative=())] = False,
-    twin: Annotated[
-        str | None,
-        Parameter(help="replay commands in MuJoCo: a model file, or a log or run for its own model"),
-    ] = None,
-    page: Annotated[Path | None, Parameter(help="--twin: also write a page to this file")] = None,
-    results: Results = Path("results"),
-    trust_code: TrustCode = False,
     json: bool = False,
 ) -> int:
-    """Write a log with known physics, or replay one through a twin.
+    """Write a log with known physics.
 
     The log does not contain the true values.
 
@@ -421,16 +350,6 @@ def simulate(  # noqa: D417 - arguments document themselves
         cases: list the cases and effects instead.
         json: print one JSON object.
     """
-    made = {
-        "--effect": effect, "--file": file, "--seed": seed, "--duration": duration, "--vehicle": vehicle,
-        "--layout": layout, "--program": program, "--platform": platform, "--play": play,
-    }  # fmt: skip
-    idle = [name for name, value in made.items() if value is not None] if twin else ["--page"] * bool(page)
-    if idle:
-        what = f"{', '.join(idle)} {'has no meaning with' if twin else 'is for'} --twin, which replays a log"
-        raise SlipError("wrong_option", what, where="slip simulate", hint="Give only one of them.")
-    if twin is not None:
-        return replay(twin, case, page, results, trust_code=trust_code, json=json)
     from pipeline.simulate import PLATFORMS, list_cases, list_effects, simulate_case  # noqa: PLC0415 - heavy
 
     if cases:

@@ -23,7 +23,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 LANES = 16
 """Most walks through a signal in one loop: the numbers of twice as many do not fit the fastest memory."""
 
-_HOW = {"nogil": True, "error_model": "numpy", "_nrt": False}
+_HOW: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
 _loops: list[Any] = []
 
 
@@ -37,10 +37,11 @@ def compiled(signature: str | None = None) -> Callable[[Function], Function]:
     """
 
     def decorate(function: Function) -> Function:
+        compile_it: Any = numba.njit
         try:
-            loop: Any = numba.njit(signature, cache=True, **_HOW)(function)
+            loop = compile_it(signature, cache=True, **_HOW)(function)
         except RuntimeError:  # no directory of the cache can be written to
-            loop = numba.njit(signature, **_HOW)(function)
+            loop = compile_it(signature, **_HOW)(function)
         if signature:
             _loops.append(loop)
         return loop  # type: ignore[no-any-return]
@@ -50,7 +51,7 @@ def compiled(signature: str | None = None) -> Callable[[Function], Function]:
 
 def list_caches() -> set[str | None]:
     """Directories with cached loops, None for loops that are not cached; empty if loops run as Python."""
-    if numba.config.DISABLE_JIT:
+    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
         return set()
     return {None if loop.stats.cache_path is None else str(loop.stats.cache_path) for loop in _loops}
 

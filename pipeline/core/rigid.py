@@ -39,7 +39,7 @@ def unwrap_yaw(yaw: Floats) -> Floats:
 
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
     """Hamilton product of quaternions of shape (n, 4); apply ``second``, then ``first``."""
-    return (_turn(first) * _turn(second)).as_quat()
+    return np.asarray((_turn(first) * _turn(second)).as_quat())
 
 
 def invert_quaternions(quaternion: Floats) -> Floats:
@@ -56,22 +56,22 @@ def rotate(quaternion: Floats, vector: Floats) -> Floats:
 
 def rotation_vectors(quaternion: Floats) -> Floats:
     """Logarithm of unit quaternions (n, 4): rotation vectors (n, 3) [rad] of at most pi."""
-    return _turn(quaternion).as_rotvec()
+    return np.asarray(_turn(quaternion).as_rotvec())
 
 
 def quaternions_from_vectors(vector: Floats) -> Floats:
     """Exponential of rotation vectors (n, 3) [rad]: unit quaternions (n, 4)."""
-    return Rotation.from_rotvec(np.array(vector)).as_quat()
+    return np.asarray(Rotation.from_rotvec(np.array(vector)).as_quat())
 
 
 def quaternions_from_yaw(yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of rotations about z by ``yaw`` [rad], shape (n,)."""
-    return Rotation.from_euler("z", yaw[..., None]).as_quat()
+    return np.asarray(Rotation.from_euler("z", yaw[..., None]).as_quat())
 
 
 def quaternions_from_euler(roll: Floats, pitch: Floats, yaw: Floats) -> Floats:
     """Unit quaternions (n, 4) of intrinsic z-y-x rotations (yaw, then pitch, then roll) [rad]."""
-    return Rotation.from_euler("ZYX", np.stack((yaw, pitch, roll), axis=-1)).as_quat()
+    return np.asarray(Rotation.from_euler("ZYX", np.stack((yaw, pitch, roll), axis=-1)).as_quat())
 
 
 def euler_from_quaternions(quaternion: Floats) -> tuple[Floats, Floats, Floats]:

@@ -12,7 +12,6 @@ from typing import Final
 from pipeline.core import format_share
 from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.models.catalogue import find_effect
-from pipeline.models.parameter import TwinRole
 from pipeline.run import MotionRun
 
 GIVEN: Final = "encoder_scale_given"
@@ -21,8 +20,6 @@ _LEAST: Final = 0.02
 """Smallest misreading that is reported: unequal tyres and motors reach 0.035 between the sides."""
 _ONE: Final = 0.004
 """Deviation of the product from one within which it is one: the least size of a wheel radius worth a name."""
-_ROLES: Final = (TwinRole.SPEED_GAIN, TwinRole.RADIUS)
-"""What the two effects are to the motion: a gain of the drive, and a factor on the radius."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +62,7 @@ def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
     """Scale of the encoders that explains two identified effects; None if their product is not one."""
     if any(finding["id"] == GIVEN for finding in diagnosis.findings):
         return None
-    gain, radius = (next(_list_values(diagnosis.effects, role), None) for role in _ROLES)
+    gain, radius = (next(_list_values(diagnosis.effects, role), None) for role in ("gain", "radius"))
     if gain is None or radius is None or gain.is_undetermined or radius.is_undetermined:
         return None
     off = abs(math.log(gain.value * radius.value))
@@ -75,7 +72,7 @@ def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
     return EncoderScale(gain.value, radius.value)
 
 
-def _list_values(effects: Sequence[Named], role: TwinRole) -> Iterator[Value]:
+def _list_values(effects: Sequence[Named], role: str) -> Iterator[Value]:
     for effect in effects:
-        if find_effect(effect.id).twin is role:
+        if find_effect(effect.id).scale_role == role:
             yield from effect.parameters.values()

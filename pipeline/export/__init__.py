@@ -171,7 +171,7 @@ _LEAST_FACTOR = 0.01
 
 
 def require_factors(model: Model) -> None:
-    """Refuse effective lengths of almost zero, by which controllers and simulators divide.
+    """Refuse effective lengths of almost zero, by which controllers divide.
 
     Raises:
         MotionError: ``absurd_number``.

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping
 from copy import copy
 from functools import cached_property
 from string import Formatter
-from typing import ClassVar, Self, TypeVar
+from typing import ClassVar, Literal, Self, TypeVar
 
 from pipeline.core import format_angle, format_length, format_share, suffix_unit
 from pipeline.models.parameter import (
@@ -25,7 +25,6 @@ from pipeline.models.parameter import (
     Reading,
     Search,  # noqa: F401 - what a file of an effect needs
     Spread,  # noqa: F401 - what a file of an effect needs
-    TwinRole,
 )
 from pipeline.run import MotionError
 from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
@@ -103,7 +102,8 @@ class Effect(ABC):
         companions: effects that usually act beside it, with which a search begins at once.
         parts: parameters of other effects as which it is searched; identified together, they are this effect.
         late: what it delays, if a delay is its only parameter.
-        twin: its role in the body of the exported twin; None where that body cannot represent it.
+        scale_role: what a wrong scale of the encoders seems to be: a gain of the drive and a factor on the
+            radius; empty for all other effects.
         motion: name and numbers as a sentence, with `{name}` for a parameter. For the first parameter also
             `{size}`, the absolute value times `size_in`, `{way}`, the one of `ways` for its sign,
             `{percent}`, `{length}` or `{angle}`, the size in metres or radians as text, and `{share}`, the
@@ -137,7 +137,7 @@ class Effect(ABC):
     companions: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
     late: Late | None = None
-    twin: TwinRole | None = None
+    scale_role: Literal["", "gain", "radius"] = ""
     motion: str = ""
     clause: str = ""
     ways: tuple[str, str] = ("left", "right")

@@ -78,34 +78,6 @@ class Quantity(enum.Enum):
         self.join = join
 
 
-class TwinRole(enum.Enum):
-    """Role of an effect in the exported twin, a body on wheels that servos drive.
-
-    Parameters of the servos come first, then those of the wheels, of the contact and of the centre of mass.
-    """
-
-    DELAY = "dead time before the servos"
-    WHEEL_LIMIT = "largest wheel speed of the servos"
-    SPEED_LAG = "time constant of all driven wheels"
-    SIDE_LAGS = "time constants of the left and of the right wheels"
-    SPEED_GAIN = "wheel speed over its command"
-    SIDE_GAIN = "gain of the right wheels minus that of the left wheels"
-    STEERING_LAG = "time constant of the steering"
-    STEERING_GAIN = "steering angle over its command"
-    STEERING_OFFSET = "steering angle at zero command"
-    STEERING_MOUNT = "steering angle where the sensor reads zero"
-    RADIUS = "effective over nominal wheel radius"
-    RADIUS_DIFFERENCE = "right minus left radius over their mean"
-    TRACK = "effective over nominal track"
-    WHEELBASE = "effective over nominal wheelbase"
-    CREEP = "time constant by which the body follows its wheels"
-    CREEP_ASIDE = "time constant of creep along the axles"
-    SLIDING = "creep, friction and turning inertia of wheels that slide"
-    CREEP_OF_STEERED = "creep along the steered axle that grows with speed"
-    CENTRE_AHEAD = "centre of rotation ahead of base_link"
-    CENTRE_ASIDE = "centre of rotation left of base_link"
-
-
 Relative = Literal["", "speed", "turn", "wheel", "duration"]
 
 # Smallest delay between poses, headings and encoders to report [s]: time stamps are no more accurate.

@@ -40,8 +40,6 @@ PARSERS = {
     "python": ast.parse,
     "traction": ast.parse,
     "gazebo": ET.fromstring,
-    "mjcf": ET.fromstring,
-    "sdf": ET.fromstring,
     "px4": find_target("px4").read_current,
 }
 MEMORY = 3 << 30

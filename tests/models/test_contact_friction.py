@@ -15,7 +15,6 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import Part
 from pipeline.export import export_model
-from pipeline.export.twin_body import build_twin_body
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.models.model import JointBody
 from pipeline.models.parameter import Conditions, Largest
@@ -171,7 +170,6 @@ def test_a_body_without_turning_inertia_is_exported_and_turns_with_its_wheels() 
     rows = np.array(namespace["predict"]([(0.0, -0.2, 0.2)], 3.0))
     rolled = 0.2 * HUSKY.wheel_radius_m / HALF
     assert rows[-1, 6] == pytest.approx(rolled / ICE["k"], rel=0.02)
-    assert build_twin_body(model.model).turning_inertia_kgm2 > 0.0
 
 
 def test_friction_that_makes_nothing_late_is_a_wider_track() -> None:

@@ -12,7 +12,7 @@ import pytest
 from pipeline.models import Effect, catalogue, list_effects
 from pipeline.models.catalogue import find_late_effect, format_effect
 from pipeline.models.effect import Late
-from pipeline.models.parameter import Conditions, Largest, TwinRole, is_of_one_run
+from pipeline.models.parameter import Conditions, Largest, is_of_one_run
 from pipeline.run import MotionError
 
 EFFECTS = list_effects()
@@ -29,7 +29,7 @@ GENERIC = sorted(
 NAMESAKES = {
     "sources/recognition.py": {"'wheel_radius'"},
     # An element of Gazebo's DiffDrive and AckermannSteering.
-    "export/twin_gazebo.py": {"'wheel_radius'"},
+    "export/gazebo.py": {"'wheel_radius'"},
 }
 ASKED = Largest(1.5, 1.2, 9.0, 8.0, np.linspace(0.0, 300.0, 11))
 
@@ -57,11 +57,6 @@ def test_no_generic_file_knows_an_effect() -> None:
         if (name := str(path.relative_to(SOURCES)))
     }
     assert {path: lines for path, lines in knowing.items() if lines} == {}
-
-
-def test_each_role_in_the_body_of_the_twin_is_played_by_one_effect() -> None:
-    played = [effect.twin for effect in BY_ID.values() if effect.twin]
-    assert sorted(role.name for role in played) == sorted(role.name for role in TwinRole)
 
 
 def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:

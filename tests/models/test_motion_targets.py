@@ -35,7 +35,7 @@ CASES = [
 def test_targets_are_found_by_being_there() -> None:
     texts = [path.read_text("utf-8") for path in Path(export.__path__[0]).glob("[!_]*.py")]
     names = {target.name for target in list_targets()}
-    assert names == {*SCHEMAS, "json", "mjcf", "python", "sdf", "traction"}
+    assert names == {*SCHEMAS, "json", "python", "traction"}
     assert sum(text.count(" = Target(") for text in texts) == len(names)
     assert all(target.about and target.source for target in list_targets())
 
@@ -134,11 +134,6 @@ def test_what_is_not_known_is_not_written() -> None:
 def test_no_export_states_a_dimension_that_is_a_stand_in(target: export.Target, known: Vehicle) -> None:
     names = ["wheel_radius_m", *(["track_width_m"] if known is HUSKY else [])]
     guess = msgspec.structs.replace(known, wheel_radius_m=0.123, stand_ins=names)
-    if target.name in {"mjcf", "sdf"}:
-        with pytest.raises(MotionError, match=" and ".join(names)) as error:
-            export_model(make_full(guess), target.name)
-        assert "[vehicle]" in error.value.hint
-        return
     if known is HUSKY and target.name in {"autoware", "vesc"}:
         return
     text = export_model(make_full(guess), target.name)

@@ -17,7 +17,7 @@ from pipeline.core.arrays import join_parts, turn_units
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import Conditions, Quantity, TwinRole
+from pipeline.models.parameter import Conditions, Quantity
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 LEAST_LAG_S = 0.02
@@ -28,7 +28,6 @@ class BodyInertia(BodyEffect):
     """Body inertia: with little grip the body follows its wheels with a lag and slides on in turns."""
 
     id = "body_inertia"
-    twin = TwinRole.CREEP
     parameters = (
         replace(
             TIME_CONSTANT,

@@ -32,7 +32,7 @@ from pipeline.models.effect import INF, Effect, Excitation, Parameter, Plausible
 from pipeline.models.effects.body_inertia import LEAST_LAG_S
 from pipeline.models.effects.effective_track import EffectiveTrack
 from pipeline.models.model import JointBody
-from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
+from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 _LEAST_CREEP = 1e-3
@@ -112,7 +112,6 @@ class ContactFriction(JointBody):
     contains = ("effective_track", "body_inertia")
     companions = ("lateral_skid",)
     is_kinematic = True
-    twin = TwinRole.SLIDING
     python_state = ("body_x", "body_y", "body_w")
     python = """
         before, push_x, push_y, push_w, stiffness = (body_x, body_y, body_w), 0.0, 0.0, 0.0, 0.0

@@ -12,7 +12,7 @@ Source: steady state of a proportional speed controller; Astrom and Murray, Feed
 from dataclasses import replace
 
 from pipeline.models.effect import DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.parameter import Conditions, TwinRole
+from pipeline.models.parameter import Conditions
 from pipeline.run.signals import RunContext, Wheels
 
 SHARE = Parameter(
@@ -33,7 +33,7 @@ class DriveGain(DriveEffect):
     """Drive gain: all wheels reach a constant share of their commanded speed."""
 
     id = "drive_gain"
-    twin = TwinRole.SPEED_GAIN
+    scale_role = "gain"
     rank = 0
     parameters = (SHARE,)
     motion = "Drive gain: the wheels reach {percent} of the commanded speed"

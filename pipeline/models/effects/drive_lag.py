@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from pipeline.models.effect import DriveEffect, Effect, Excitation, Least, Parameter, Plausible, Spread
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import WARTHOG_LAGS, Conditions, Quantity, TwinRole
+from pipeline.models.parameter import WARTHOG_LAGS, Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 TIME_CONSTANT = Parameter(
@@ -33,7 +33,6 @@ class DriveLag(DriveEffect):
     """Drive lag: wheels follow the commanded speed like a first-order system."""
 
     id = "drive_lag"
-    twin = TwinRole.SPEED_LAG
     rank = 20
     parameters = (
         replace(

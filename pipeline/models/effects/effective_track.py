@@ -23,7 +23,7 @@ from pipeline.models.effect import (
     Spread,
 )
 from pipeline.models.effects.wheel_radius import WheelRadius
-from pipeline.models.parameter import Level, Quantity, Reading, TwinRole
+from pipeline.models.parameter import Level, Quantity, Reading
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
 
@@ -39,7 +39,6 @@ class EffectiveTrack(KinematicEffect):
     """Effective track: a skid-steered vehicle turns less than its track width predicts."""
 
     id = "effective_track"
-    twin = TwinRole.TRACK
     rank = 20
     kinds = SIDES
     parameters = (

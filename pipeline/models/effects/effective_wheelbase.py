@@ -20,7 +20,7 @@ from pipeline.models.effect import (
     Parameter,
     Plausible,
 )
-from pipeline.models.parameter import Level, Quantity, Reading, TwinRole
+from pipeline.models.parameter import Level, Quantity, Reading
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
 
@@ -29,7 +29,6 @@ class EffectiveWheelbase(KinematicEffect):
     """Effective wheelbase: a car turns less, or more, than its wheelbase and steering angle predict."""
 
     id = "effective_wheelbase"
-    twin = TwinRole.WHEELBASE
     rank = 30
     kinds = ACKERMANN
     parameters = (

@@ -10,7 +10,6 @@ Source: Mandow et al., IROS 2007, the lateral coordinates of the instantaneous c
 from collections.abc import Mapping
 
 from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Place, Plausible
-from pipeline.models.parameter import TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
@@ -18,7 +17,6 @@ class IcrLateral(LinearEffect):
     """Lateral ICR offset: turning drags the vehicle forward or backward, as with a load on one side."""
 
     id = "icr_lateral"
-    twin = TwinRole.CENTRE_ASIDE
     place = Place.CENTRE
     parameters = (
         Parameter(

@@ -21,7 +21,6 @@ from pipeline.models.effect import (
     Plausible,
     Spread,
 )
-from pipeline.models.parameter import TwinRole
 from pipeline.run.signals import Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
 
@@ -30,7 +29,6 @@ class IcrOffset(LinearEffect):
     """ICR offset: the vehicle turns about a point ahead of or behind its reference point."""
 
     id = "icr_offset"
-    twin = TwinRole.CENTRE_AHEAD
     place = Place.CENTRE
     parameters = (
         Parameter(

@@ -12,7 +12,7 @@ Source: Seegmiller and Kelly, RSS 2014, the centripetal term of the slip model.
 from collections.abc import Mapping
 
 from pipeline.models.effect import Column, Excitation, Least, LinearEffect, Parameter, Plausible, Spread
-from pipeline.models.parameter import LEAST_DELAY_S, TwinRole
+from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 
@@ -20,7 +20,6 @@ class LateralSkid(LinearEffect):
     """Lateral skid: in a turn the vehicle slides outward."""
 
     id = "lateral_skid"
-    twin = TwinRole.CREEP_ASIDE
     parameters = (
         Parameter(
             "c",

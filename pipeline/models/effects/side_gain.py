@@ -19,7 +19,7 @@ from pipeline.models.effect import (
     Plausible,
     name_side,
 )
-from pipeline.models.parameter import Conditions, TwinRole
+from pipeline.models.parameter import Conditions
 from pipeline.run.signals import RunContext, Wheels
 from pipeline.sources import Vehicle
 
@@ -28,7 +28,6 @@ class SideGain(DriveEffect):
     """Side gain: one side reaches a larger share of its commanded speed than the other."""
 
     id = "side_gain"
-    twin = TwinRole.SIDE_GAIN
     rank = 1
     kinds = ("differential", "mecanum")
     parameters = (

@@ -13,7 +13,6 @@ from dataclasses import replace
 from pipeline.models.effect import Excitation
 from pipeline.models.effects.drive_lag import TwoLags, time_constant
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import TwinRole
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -21,7 +20,6 @@ class SideLag(TwoLags):
     """Side lag: one side follows its commands more slowly than the other."""
 
     id = "side_lag"
-    twin = TwinRole.SIDE_LAGS
     rank = 35
     kinds = ("differential",)
     apart, least_apart_s = 0.15, 0.03

@@ -10,7 +10,7 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter, Plausible
-from pipeline.models.parameter import Quantity, TwinRole
+from pipeline.models.parameter import Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -18,7 +18,6 @@ class SteeringGain(DriveEffect):
     """Steering gain: the steering angle is a constant multiple of its command."""
 
     id = "steering_gain"
-    twin = TwinRole.STEERING_GAIN
     rank = 50
     kinds = ACKERMANN
     parameters = (

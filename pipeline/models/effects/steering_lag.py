@@ -12,7 +12,7 @@ from dataclasses import replace
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least
 from pipeline.models.effects.drive_lag import TIME_CONSTANT
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import Quantity, TwinRole
+from pipeline.models.parameter import Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -20,7 +20,6 @@ class SteeringLag(DriveEffect):
     """Steering lag: the steering angle follows its command like a first-order system."""
 
     id = "steering_lag"
-    twin = TwinRole.STEERING_LAG
     rank = 60
     kinds = ACKERMANN
     parameters = (

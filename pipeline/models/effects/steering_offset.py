@@ -10,7 +10,7 @@ Source: kinematic bicycle with an uncalibrated steering; Becker et al. 2023.
 from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, DriveEffect, Excitation, Least, Parameter
-from pipeline.models.parameter import Conditions, Quantity, TwinRole
+from pipeline.models.parameter import Conditions, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -18,7 +18,6 @@ class SteeringOffset(DriveEffect):
     """Steering offset: the steering angle is not zero at zero command."""
 
     id = "steering_offset"
-    twin = TwinRole.STEERING_OFFSET
     rank = 70
     kinds = ACKERMANN
     parameters = (

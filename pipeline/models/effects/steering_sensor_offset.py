@@ -15,7 +15,7 @@ import numpy as np
 
 from pipeline.models.effect import ACKERMANN, KinematicEffect
 from pipeline.models.effects.steering_offset import SteeringOffset
-from pipeline.models.parameter import Conditions, TwinRole
+from pipeline.models.parameter import Conditions
 from pipeline.run.signals import Rolling, RunContext
 
 
@@ -23,7 +23,6 @@ class SteeringSensorOffset(KinematicEffect):
     """Steering sensor offset: the steering angle is not zero where its sensor reads zero."""
 
     id = "steering_sensor_offset"
-    twin = TwinRole.STEERING_MOUNT
     # It belongs to the steering: before understeer and all effects that scale the rolling velocity.
     rank = 0
     kinds = ACKERMANN

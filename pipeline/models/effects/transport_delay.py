@@ -11,7 +11,7 @@ Source: dead time of a first order plus dead time process; Astrom and Hagglund, 
 from dataclasses import replace
 
 from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Spread
-from pipeline.models.parameter import LEAST_DELAY_S, WARTHOG_LAGS, Conditions, Quantity, TwinRole
+from pipeline.models.parameter import LEAST_DELAY_S, WARTHOG_LAGS, Conditions, Quantity
 from pipeline.run.signals import Commands, RunContext
 
 
@@ -19,7 +19,6 @@ class TransportDelay(CommandEffect):
     """Transport delay: the wheels follow their command after a dead time."""
 
     id = "transport_delay"
-    twin = TwinRole.DELAY
     rank = 40
     parameters = (
         Parameter(

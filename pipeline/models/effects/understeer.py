@@ -21,7 +21,6 @@ from pipeline.models.effect import (
     Plausible,
     format_share_of_gain,
 )
-from pipeline.models.parameter import TwinRole
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
 
@@ -30,7 +29,6 @@ class Understeer(KinematicEffect):
     """Understeer: the faster a car drives, the less it turns for the same steering."""
 
     id = "understeer"
-    twin = TwinRole.CREEP_OF_STEERED
     rank = 40
     kinds = ACKERMANN
     parameters = (

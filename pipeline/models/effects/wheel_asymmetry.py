@@ -20,7 +20,7 @@ from pipeline.models.effect import (
     Spread,
     name_side,
 )
-from pipeline.models.parameter import Quantity, TwinRole
+from pipeline.models.parameter import Quantity
 from pipeline.run.signals import Rolling, RunContext
 from pipeline.sources import Vehicle
 
@@ -29,7 +29,6 @@ class WheelAsymmetry(KinematicEffect):
     """Wheel asymmetry: the wheels of one side are larger than those of the other."""
 
     id = "wheel_asymmetry"
-    twin = TwinRole.RADIUS_DIFFERENCE
     rank = 10
     kinds = ("differential", "mecanum")
     parameters = (

@@ -8,7 +8,7 @@ Source: Borenstein and Feng, IEEE T-RA 1996 (UMBmark), the common scale error.
 """
 
 from pipeline.models.effect import Excitation, KinematicEffect, Least, Parameter, Plausible, Spread
-from pipeline.models.parameter import Level, Quantity, Reading, TwinRole
+from pipeline.models.parameter import Level, Quantity, Reading
 from pipeline.run.signals import Rolling, RunContext
 
 
@@ -16,7 +16,7 @@ class WheelRadius(KinematicEffect):
     """Wheel radius: all wheels are larger or smaller than nominal, or slip in proportion to their speed."""
 
     id = "wheel_radius"
-    twin = TwinRole.RADIUS
+    scale_role = "radius"
     rank = 30
     parameters = (
         Parameter(

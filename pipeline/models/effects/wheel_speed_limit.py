@@ -11,7 +11,7 @@ Source: saturation of the drive; measured on the DRIVE recordings.
 import numpy as np
 
 from pipeline.models.effect import INF, WHEELED, DriveEffect, Excitation, Parameter, Spread
-from pipeline.models.parameter import Conditions, Level, Quantity, TwinRole
+from pipeline.models.parameter import Conditions, Level, Quantity
 from pipeline.run.signals import RunContext, Wheels
 
 
@@ -19,7 +19,6 @@ class WheelSpeedLimit(DriveEffect):
     """Wheel speed limit: the speed of every wheel is limited."""
 
     id = "wheel_speed_limit"
-    twin = TwinRole.WHEEL_LIMIT
     rank = 4
     kinds = WHEELED
     parameters = (
