@@ -26,7 +26,7 @@ import numpy as np
 from json_lines import add_row, read_rows
 
 sys.path.insert(0, str(Path(__file__).parent / "hidden"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
 from closed_loop import close_loop
 from draw import draw_riddle
