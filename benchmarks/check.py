@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 from measuring import add_row, read_rows
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
 from game.closed_loop import close_loop
 from game.draw import draw_riddle

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 ROOT = Path(__file__).parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "logs")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures")]
 
 from mcap.writer import CompressionType, Writer  # noqa: E402 - the repository is put on the path first
 from mcap_files import payloads, record_starts, value_in_full  # noqa: E402

@@ -20,7 +20,7 @@ import numpy as np
 import polars as pl
 from measuring import add_row, read_rows
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "models"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
 from motion_runs import make_scenario, tables_of, vehicle_of
 

@@ -32,8 +32,7 @@ from pipeline.models import Model, find_effect
 from pipeline.report.motion_view import load_motion_run
 from pipeline.simulate import simulate_case
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "web"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
 from chrome import BROWSER, Chrome
 from workbench_server import Workbench

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 from chrome import BROWSER, Browser, Chrome
 from deep_folders import dig  # noqa: F401
+from golden import check_golden  # noqa: F401
 from hypothesis import settings
 
 if TYPE_CHECKING:
@@ -22,6 +23,11 @@ os.environ.pop("COLUMNS", None)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--golden", action="store_true", help="write the files of tests/golden anew")
+
 
 _CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 ROOT = Path(__file__).resolve().parents[2]
-sys.path.insert(0, str(ROOT / "tests"))
+sys.path.insert(0, str(ROOT / "tests" / "fixtures"))
 
 from chrome import BROWSER, Chrome  # noqa: E402 - found where the tests have it
 from moving_picture import join_frames  # noqa: E402 - beside this file

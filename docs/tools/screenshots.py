@@ -28,7 +28,7 @@ import markdown
 from pictures import ROOT, SLIP, open_browser, serve_results
 from screen_states import LIFTED, SAMPLES, Screen, list_states
 
-sys.path += [str(ROOT / "tests"), str(ROOT / "tests" / "fleet")]
+sys.path += [str(ROOT / "tests" / "fixtures")]
 
 from barriers import find_barriers
 from chrome import BROWSER, Chrome

@@ -1,15 +1,12 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from pipeline.simulate import simulate_case
-
-sys.path.insert(0, str(Path(__file__).parent))
 
 if find_spec("s3fs") and find_spec("moto"):
     # Tests that need an object store are left out where there is no library for it.

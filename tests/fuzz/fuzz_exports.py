@@ -25,7 +25,7 @@ from pathlib import Path
 from xml.etree import ElementTree as ET
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(Path(__file__).parent)]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures"), str(Path(__file__).parent)]
 
 from exported_texts import HOSTILE, READERS  # noqa: E402 - the repository is put on the path first
 from fuzz_texts import FORMULAS, mutate, require_one_line  # noqa: E402

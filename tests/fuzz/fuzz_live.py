@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, cast
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "job")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures"), str(ROOT / "tests" / "job")]
 
 from fuzzing import peak_mb  # noqa: E402 - the repository is put on the path first
 from live_servers import (  # noqa: E402 - as above

@@ -17,7 +17,7 @@ import warnings
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "logs")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures")]
 
 import numpy as np  # noqa: E402 - the repository is put on the path first
 from bag_files import BagWriter, write_bag, write_db3  # noqa: E402

@@ -26,7 +26,7 @@ from dataclasses import replace
 from pathlib import Path
 from urllib.parse import quote, urlencode
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "web"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "fixtures"))
 
 from workbench_server import LIMITS, RUN, TOKEN, Workbench
 

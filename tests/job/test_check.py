@@ -4,16 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
-
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation.diagnosis_lines import format_lines

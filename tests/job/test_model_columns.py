@@ -9,13 +9,13 @@ import numpy as np
 import polars as pl
 import pyarrow.parquet as pq
 import pytest
+from verbs import run_verb
 
 from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.parquet_tables import read_facts
-from tests.verbs import run_verb
 
 COLUMNS = ["model_x", "model_y", "model_w", "residual_modulus"]
 TAU_S, TRACK = 0.3, 1.8

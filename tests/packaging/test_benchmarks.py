@@ -35,8 +35,6 @@ def test_a_name_that_is_none_is_refused_with_those_that_are() -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("name", list_names())
 def test_a_benchmark_loads_and_says_how_it_is_asked(name: str) -> None:
-    if name == "twin":
-        pytest.importorskip("mujoco", reason="needs the extra `sim`")
     done = run(name, "--help")
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("usage: ")

@@ -12,12 +12,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from motion_runs import simulate
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "models"))
-
-from motion_runs import simulate
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED

@@ -10,7 +10,7 @@ import pytest
 
 from pipeline.store import Store
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "fixtures"
 
 StartWriter = Callable[..., "subprocess.Popen[str]"]
 
