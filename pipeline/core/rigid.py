@@ -16,15 +16,13 @@ if TYPE_CHECKING:
 # Rigid motions in the plane and in space, vectorised over the first axis.
 #
 # Quaternions are (x, y, z, w), unit length, and rotate vectors of the child frame into the parent frame, as
-# in ROS messages. Angles are in radians.
+# in ROS messages. Angles are in radians. SciPy's `Rotation` refuses a quaternion of zeros, which is what an
+# unset orientation has: what takes quaternions of a log is written out here.
 
 GRAVITY_MPS2 = 9.80665
 """Standard gravity [m/s^2] (ISO 80000-3)."""
-
-
-def _turn(quaternion: Floats) -> Rotation:
-    # `Rotation` refuses arrays that cannot be written to.
-    return Rotation.from_quat(np.array(quaternion))
+_TINY = 1e-12
+"""Angle [rad] below which the first term of a series is exact to rounding."""
 
 
 def wrap_angle(angle: Floats) -> Floats:
@@ -39,7 +37,17 @@ def unwrap_yaw(yaw: Floats) -> Floats:
 
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
     """Hamilton product of quaternions of shape (n, 4); apply ``second``, then ``first``."""
-    return np.asarray((_turn(first) * _turn(second)).as_quat())
+    ax, ay, az, aw = np.moveaxis(first, -1, 0)
+    bx, by, bz, bw = np.moveaxis(second, -1, 0)
+    return np.stack(
+        (
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ),
+        axis=-1,
+    )
 
 
 def invert_quaternions(quaternion: Floats) -> Floats:
@@ -50,13 +58,18 @@ def invert_quaternions(quaternion: Floats) -> Floats:
 
 def rotate(quaternion: Floats, vector: Floats) -> Floats:
     """Rotate vectors (n, 3) by unit quaternions (n, 4)."""
-    rotated: Floats = _turn(quaternion).apply(np.array(vector))
-    return rotated
+    axis, scalar = quaternion[..., :3], quaternion[..., 3:]
+    twice = 2.0 * np.cross(axis, vector)
+    return vector + scalar * twice + np.cross(axis, twice)
 
 
 def rotation_vectors(quaternion: Floats) -> Floats:
     """Logarithm of unit quaternions (n, 4): rotation vectors (n, 3) [rad] of at most pi."""
-    return np.asarray(_turn(quaternion).as_rotvec())
+    flipped = np.where(quaternion[..., 3:] < 0.0, -quaternion, quaternion)
+    sine = np.linalg.norm(flipped[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, flipped[..., 3:])
+    scale = np.where(sine > _TINY, angle / np.maximum(sine, _TINY), 2.0)
+    return flipped[..., :3] * scale
 
 
 def quaternions_from_vectors(vector: Floats) -> Floats:

@@ -102,7 +102,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
     without = {words for words, names in options.items() if names and "--results" not in names}
     assert without == {
         "batch schedule", "effects", "fleet map add", "fleet map merge", "model new", "model new-effect",
-        "model literature", "model show", "model trust", "model untrust", "model trusted",
+        "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
     for names in options.values():
         assert not names & {"--out", "--known"} - ({"--known"} if "--for" in names else set())
