@@ -194,13 +194,6 @@ def test_screens_and_pages_of_a_season(season: Path, check_golden: Check) -> Non
     for name, commands in SEASON.items():
         check_golden(f"screen_{name}", transcribe(commands, season))
     pages = [(one.name, one.read_text("utf-8")) for one in sorted((season / "results").glob("*.html"))]
-    assert [name for name, _ in pages] == [
-        "causes.html",
-        "comparison.html",
-        "fleet.html",
-        "map.html",
-        "trend.html",
-    ]
     check_golden("pages_of_a_season.txt", "\n\n".join(f"{name}:\n{read_page(page)}" for name, page in pages))
 
 
