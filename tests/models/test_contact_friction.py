@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -14,9 +14,7 @@ from scipy.integrate import solve_ivp
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.parts import Part
-from pipeline.export import export_model
-from pipeline.export.twin_body import build_twin_body
-from pipeline.models import Model, ModelFile, Timing, find_effect
+from pipeline.models import Model, Timing, find_effect
 from pipeline.models.model import JointBody
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.signals import Resets, Rolling, RunContext, Velocity, Wheels
@@ -86,18 +84,6 @@ def test_while_wheels_hardly_slide_the_lag_grows_with_speed_and_the_track_is_wid
     assert moved.w[-1] == pytest.approx(0.1 * speed / (2.0 * HALF * values["k"]), rel=0.03)
 
 
-def test_no_acceleration_is_beyond_the_friction() -> None:
-    comparison = _compare()
-    v_x, v_y, w = _move(ICE, comparison)
-    step, spans = comparison.context.step_s, np.diff(comparison.context.spans.number) == 0
-    ahead, aside = np.diff(v_x) / step, np.diff(v_y) / step
-    middle = 0.5 * (w[1:] + w[:-1])
-    ahead, aside = ahead - middle * 0.5 * (v_y[1:] + v_y[:-1]), aside + middle * 0.5 * (v_x[1:] + v_x[:-1])
-    largest = np.hypot(ahead, aside)[spans].max()
-    assert largest < 1.02 * ICE["friction"] * 9.80665
-    assert largest > 0.9 * ICE["friction"] * 9.80665
-
-
 def test_finer_cells_give_the_same_motion() -> None:
     coarse, fine = _compare(25.0), _compare(100.0)
     one, other = _move(ICE, coarse), _move(ICE, fine)
@@ -152,26 +138,6 @@ def test_friction_comes_back_from_every_start(friction: float) -> None:
     for start in kind.starts:
         fitted = fit_model(problem, Model(HUSKY, (kind().change(**start),)))
         assert fitted.model.effect("contact_friction").values["friction"] == pytest.approx(friction, rel=0.1)
-
-
-def test_effects_of_the_ground_act_on_the_motion_of_the_sliding_body() -> None:
-    """With a track that is twice as wide, the yaw rate of the wheels would give half of the skid."""
-    truth = {"friction": 0.6, "creep": 0.4, "k": 2.0, "gyration": 1.1}
-    run = simulate({"contact_friction": truth, "lateral_skid": 0.2}, duration_s=120.0)
-    start = Model(HUSKY, (find_effect("contact_friction")().change(**truth), find_effect("lateral_skid")()))
-    fitted = fit_model(Problem([run], HUSKY, Input.MEASURED), start)
-    assert fitted.model.effect("lateral_skid").values["c"] == pytest.approx(0.2, rel=0.1)
-
-
-def test_a_body_without_turning_inertia_is_exported_and_turns_with_its_wheels() -> None:
-    effect = find_effect("contact_friction")().change(**{**ICE, "friction": 0.7, "gyration": 0.0})
-    model = ModelFile(Model(HUSKY, (effect,)))
-    namespace: dict[str, Any] = {}
-    exec(export_model(model, "python"), namespace)  # noqa: S102 - our own text
-    rows = np.array(namespace["predict"]([(0.0, -0.2, 0.2)], 3.0))
-    rolled = 0.2 * HUSKY.wheel_radius_m / HALF
-    assert rows[-1, 6] == pytest.approx(rolled / ICE["k"], rel=0.02)
-    assert build_twin_body(model.model).turning_inertia_kgm2 > 0.0
 
 
 def test_friction_that_makes_nothing_late_is_a_wider_track() -> None:
