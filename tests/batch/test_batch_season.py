@@ -8,16 +8,14 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import polars as pl
 from batch_tools import Watch, ask, batch, counts, read_tables
 
-from pipeline.batch import Pruning, Shard, batch_plan, parse_shard, parse_size
+from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.season import run_batch
-from pipeline.core import measure_memory
 from pipeline.job import keys
 from pipeline.job.analyze import analyze_log, update_datasets
-from pipeline.store import Partition, Store
+from pipeline.store import Store
 
 if TYPE_CHECKING:
     import pytest
@@ -172,21 +170,6 @@ def test_a_fleet_file_from_elsewhere_holds_for_its_globs(season: Path, tmp_path:
     assert dict(runs.iter_rows()) == {f"season/{x}": "field" for x in "abc"} | {"season/d": "lake"}
 
 
-def test_partitions_open_only_their_files(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    batch(season, out)
-    store = Store(out)
-    for manifest in store.manifests():
-        if manifest.details["dataset"] != "warthog_ice":
-            (manifest.folder / "slip.parquet").write_bytes(b"not to be opened")
-    ice = Partition(vehicle="warthog", terrain="ice", dataset="warthog_ice")
-    assert store.scan("slip", ice).select("run").unique().collect()["run"].to_list() == ["season/d"]
-    day = store.scan("runs").collect()["day"][0]
-    answer = store.query("SELECT DISTINCT run FROM slip", replace(ice, day=day[:7]))
-    assert answer["run"].to_list() == ["season/d"]
-    assert store.query("SELECT run FROM slip", Partition(day="1999")).is_empty()
-
-
 def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     for rate in (20.0, 10.0, 5.0):
@@ -241,42 +224,3 @@ def test_reports_are_made_on_demand(season: Path, tmp_path: Path) -> None:
     assert 'href="runs/season/a/' in (out / "index.html").read_text()
     assert "report.html" in (out / "index.html").read_text()
     assert counts(batch(log, out)) == {"unchanged": 1}
-
-
-def test_the_catalogue_names_every_run_safely(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    (season / "a.mcap").rename(season / "<b>&'\".mcap")
-    batch(season, out)
-    page = (out / "index.html").read_text()
-    assert "<b>&'" not in page
-    assert "&lt;b&gt;&amp;" in page
-    assert page.count("<tr>") == 5
-    assert "http" not in page.replace("http-equiv", "")
-
-
-def test_sizes_and_shards_are_read() -> None:
-    assert parse_size("500MB") == 500_000_000
-    assert parse_size("1.5 g") == 1_500_000_000
-    assert parse_size("10") == 10
-    assert parse_shard("2/4") == Shard(number=2, count=4)
-
-
-def test_memory_is_what_the_control_group_leaves(tmp_path: Path) -> None:
-    whole = measure_memory(tmp_path / "none", tmp_path)
-    own, job = tmp_path / "cgroup", tmp_path / "groups" / "slurm" / "job_1"
-    job.mkdir(parents=True)
-    own.write_text("12:cpu:/elsewhere\n0::/slurm/job_1\n")
-    assert measure_memory(own, tmp_path / "groups") == whole
-    (job / "memory.max").write_text("max\n")
-    (job.parent / "memory.max").write_text("300000000\n")
-    assert measure_memory(own, tmp_path / "groups") == 300_000_000
-    assert 0 < measure_memory() <= whole
-
-
-def test_datasets_pool_the_runs(season: Path, tmp_path: Path) -> None:
-    batch(season, tmp_path / "out")
-    pools = Store(tmp_path / "out").scan("datasets").filter(pl.col("input") == "command").collect()
-    assert dict(pools.select("dataset", "runs").unique().iter_rows()) == {
-        "husky_a200_tile": 3,
-        "warthog_ice": 1,
-    }

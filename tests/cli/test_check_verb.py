@@ -103,39 +103,10 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
 
 
-def test_many_names_with_commas_are_no_name_that_is_too_long(place: Path) -> None:
-    check(place / "logs", "../husky.toml", ",".join(["b.mcap"] * 40), "--results", "../results", code=0)
-
-
 def test_a_folder_stands_for_its_logs(place: Path) -> None:
     content = json.loads(check(place, "husky.toml", "logs", "--json", code=3))
 
     assert [name.rpartition("/")[2] for name in content["after"]["runs"]] == ["a", "b", "late"]
-
-
-@pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (("husky.toml", "nowhere.mcap"), "nowhere.mcap"),
-        (("nowhere.json", "logs/b.mcap"), "the baseline cannot be read"),
-        (("husky.toml", "logs/b.mcap", "--limits", "nowhere.toml"), "the limits cannot be read"),
-        (("logs/b.mcap", "logs/b.mcap"), "a run is on both sides: logs/b. Give"),
-        (("logs/b.mcap", "husky.toml"), "husky.toml: AFTER is a model file, and not what was driven. Give a"),
-        (("logs/b.mcap", "robot.json"), "robot.json: AFTER is a baseline, and not what was driven. Give a"),
-        (("", "logs/b.mcap"), "the check has no runs BEFORE"),
-        (("husky.toml", ""), "the check has no runs AFTER"),
-        (("husky.toml", "logs/b.mcap", "--file", "check.md"), "Add --to markdown or --to junit"),
-    ],
-)
-def test_what_cannot_be_checked_is_said_in_one_line(
-    place: Path, arguments: tuple[str, ...], complaint: str
-) -> None:
-    done = run_verb("check", *arguments, cwd=place)
-
-    assert done.returncode == 1
-    assert complaint in done.stderr
-    assert len(done.stderr.strip().splitlines()[-1:]) == 1
-    assert done.stdout == ""
 
 
 def test_two_formats_are_not_printed_into_each_other(place: Path) -> None:

@@ -11,23 +11,13 @@ import pytest
 from verbs import run_program, run_verb
 
 from pipeline.cli import build_app
-from pipeline.estimation.diagnosis_lines import choose_lines
 from pipeline.simulate import simulate_case
-from pipeline.store import Store
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from cyclopts import App
 
-TASKS = {
-    "Analyze a run": {"analyze", "diagnose", "export", "inspect", "watch"},
-    "Change the model": {"effects", "model", "serve"},
-    "Plan and simulate drives": {"plan", "simulate"},
-    "Compare several runs": {"check", "compare", "fleet"},
-    "Batches and results": {"batch", "results"},
-    "The installation": {"doctor"},
-}
 MOVED = {
     "predict": "fleet predict",
     "trend": "fleet trend",
@@ -66,35 +56,6 @@ def test_a_command_that_moved_names_its_new_place(old: str, tmp_path: Path) -> N
     assert done.stderr == f"slip: slip {old} is now: slip {MOVED[old]}\n"
     assert MOVED[old] in dict(list_apps(build_app()))
     assert list(tmp_path.iterdir()) == []
-
-
-def test_help_groups_the_commands_by_task_one_line_each(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    build_app().help_print()
-    found: dict[str, set[str]] = {}
-    for line in capsys.readouterr().out.splitlines():
-        if line.startswith("╭"):
-            title = line.strip("╭╮─ ")
-        elif line.startswith("│"):
-            found.setdefault(title, set()).add(line[1:].split()[0])
-            assert line[2] != " ", f"goes on in a second line: {line}"
-    options = found.pop("Options")
-    assert found == TASKS
-    assert options == {"--help", "--version", "--install-completion"}
-
-
-def test_commands_of_commands_have_one_line_each(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    groups = {words: app for words, app in list_apps(build_app()) if dict(list_apps(app))}
-    assert groups.keys() == {"model", "batch", "fleet", "fleet map", "results"}
-    for app in groups.values():
-        app.help_print()
-        commands = capsys.readouterr().out.partition("Commands")[2].partition("╰")[0]
-        assert not [line for line in commands.splitlines() if line.startswith("│  ")]
 
 
 def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> None:
@@ -154,39 +115,6 @@ def test_completion_is_written_for_the_shell(tmp_path: Path, monkeypatch: pytest
     assert "completion is not installed" in refused.stderr
 
 
-def test_the_folded_line_is_not_shown_where_everything_is() -> None:
-    folded = "2 smaller effects: deadband, yaw drift (--all)"
-    lines = [("effects", "Drive lag"), ("", folded), ("smaller", "Deadband")]
-    assert [text for _, text in choose_lines(lines, everything=False)] == [text for _, text in lines[:2]]
-    assert [text for _, text in choose_lines(lines, everything=True)] == ["Drive lag", "Deadband"]
-
-
-@pytest.mark.parametrize(
-    ("words", "near"),
-    [
-        (("diagnose", "husky_tlie"), "Did you mean husky_tile? There are: field/husky_tile."),
-        (("diagnose", "field/husky_tlie"), "Did you mean field/husky_tile? There are: field/husky_tile."),
-        (("model", "export", "robot.toml", "--to", "ros_control"), "Did you mean ros2_control"),
-    ],
-    ids=["run", "run in its folder", "export"],
-)
-def test_a_name_that_is_nearly_one_that_is_known_is_guessed(
-    words: tuple[str, ...], near: str, tmp_path: Path
-) -> None:
-    with Store(tmp_path / "results").open_generation("field/husky_tile", "0" * 16) as generation:
-        generation.write_text("summary.json", "{}")
-        generation.commit({})
-    run_verb("model", "new", "robot.toml", "--vehicle", "husky_a200", cwd=tmp_path)
-    ended = run_verb(*words, cwd=tmp_path)
-    assert ended.returncode == 1
-    assert near in ended.stderr
-
-
 def test_help_is_a_command_too() -> None:
     assert run_verb("help").stdout == run_verb("--help").stdout
     assert run_verb("help", "model", "add").stdout == run_verb("model", "add", "--help").stdout
-
-
-def test_words_that_a_forecast_does_not_take_are_an_error() -> None:
-    ended = run_verb("fleet", "predict", "results", "--vehicle", "husky_a200", "--terrain", "ice")
-    assert ended.returncode == 2

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shlex
 import shutil
 from pathlib import Path
 
@@ -12,11 +11,9 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
-from pipeline.job import JobError, Options
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.keys import Owner, agree_on_vehicle
 from pipeline.simulate import simulate_case
-from pipeline.sources import find_preset
 from pipeline.store import Store
 from pipeline.store.checksums import decode_checked, encode_checked
 
@@ -120,42 +117,6 @@ def test_a_log_that_is_not_stored_is_storeds_own_vehicle_and_only_once(
     assert hash_tree(tmp_path / "analyzed" / "runs") == hash_tree(tmp_path / "fitted" / "runs")
 
 
-@pytest.mark.parametrize("verb", ["add", "fit", "compare"])
-def test_a_model_of_another_vehicle_is_asked_about(
-    place: Path, capsys: pytest.CaptureFixture[str], verb: str
-) -> None:
-    before = hash_tree(place / "results")
-    model = place / "jackal.toml"
-    assert slip("model", "new", model, "--vehicle", "jackal", "--quiet") == 0
-    asked = {"add": [model, "effective_track"], "fit": [model], "compare": [model, model]}[verb]
-
-    code = slip("model", verb, *asked, "--on", place / "field" / "wide.mcap", "--out", place / "results")
-    told = capsys.readouterr().err.splitlines()
-    assert code == 1
-    (line,) = [one for one in told if one.startswith("slip: ")]
-    for word in ("field/wide", "Husky", "Jackal", "wheel_radius_m", "--vehicle-of model", "--vehicle-of run"):
-        assert word in line
-    assert hash_tree(place / "results") == before
-
-
-@pytest.mark.parametrize("owner", [None, "run"])
-def test_runs_of_two_vehicles_get_no_choice_that_is_refused(owner: Owner | None) -> None:
-    husky, jackal = find_preset("husky_a200"), find_preset("jackal")
-    assert husky is not None
-    assert jackal is not None
-    runs = {"a": husky, "b": jackal}
-    for model, hint in ((None, "--vehicle-of model for that of a"), (jackal, "--vehicle-of model")):
-        with pytest.raises(JobError) as caught:
-            agree_on_vehicle(model, runs, owner)
-        assert caught.value.where == "b"
-        assert str(caught.value).endswith(
-            f", a of a {husky.name} (wheel_radius_m 0.165, "
-            f"track_width_m 0.55, wheelbase_m 0.512). Give runs of one vehicle, or {hint}."
-        )
-    assert agree_on_vehicle(None, runs, "model") == husky
-    assert agree_on_vehicle(jackal, runs, "model") == jackal
-
-
 def test_the_vehicle_that_is_chosen_is_the_one_that_counts(
     place: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -204,55 +165,11 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
     assert hash_tree(out) == before
 
 
-def test_the_next_command_writes_the_model_on_the_screen(
-    place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    said = ("--input", "measured", "--interval", "all", "--results", str(place / "results"))
-
-    def read_next() -> list[str]:
-        lines = capsys.readouterr().out.splitlines()
-        (line,) = [line for line in lines if line.startswith("next")]
-        return shlex.split(line)[1:]
-
-    assert slip("diagnose", "field/wide", *said) == 0
-    following = read_next()
-    assert following == ["slip", "diagnose", "field/wide", *said, "--apply", "model.toml"]
-    assert slip(*following[1:]) == 0
-    following = read_next()
-    assert following[:4] == ["slip", "model", "export", "model.toml"]
-    assert slip(*following[1:]) == 0
-
-
 def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, analyzed: Path) -> None:
     log = analyzed / "field" / "wide.mcap"
     for name in ("command", "measured"):
         assert slip("diagnose", log, "--out", tmp_path / name, "--input", name, "--quiet") == 0
     assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
-
-
-def test_a_log_without_the_input_that_is_asked_for_is_said_to_lack_it(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = tmp_path / "no_wheels.mcap"
-    simulate_case(None, out=log, duration_s=30.0, layout="body_command")
-    assert slip("diagnose", log, "--out", tmp_path, "--input", "measured", "--quiet") == 1
-    (line,) = capsys.readouterr().err.splitlines()
-    assert "no topic can serve as measured wheels" in line
-    assert "/mapping/icp_odom" in line
-    assert not (tmp_path / "runs").exists()
-
-
-def test_an_analysis_says_what_a_diagnosis_warns_of_and_nothing_twice(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    log = tmp_path / "short.mcap"
-    simulate_case("warthog_held_poses", out=log, duration_s=30.0)
-    assert slip("analyze", log, "--out", tmp_path / "results", "--no-report", "--quiet") == 0
-    assert slip("analyze", log, "--out", tmp_path / "results", "--no-report") == 0
-    screen = capsys.readouterr().out
-    assert screen.count("effects estimated from") == 1
-    assert screen.count("(the map was corrected") == 1
 
 
 def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
@@ -265,17 +182,6 @@ def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     assert slip("model", "fit", place / "husky.toml", "--on", log, "--out", place / "results") == 0
     assert f"slip analyze {log}" in capsys.readouterr().err
     assert hash_tree(place / "results") == before
-
-
-def test_a_known_model_of_another_vehicle_is_asked_about_by_a_diagnosis(
-    place: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    model = place / "jackal.toml"
-    assert slip("model", "new", model, "--vehicle", "jackal", "--quiet") == 0
-    asked = ("diagnose", "field/wide", "--out", place / "results", "--model", model)
-    assert slip(*asked, "--quiet") == 1
-    assert "--vehicle-of run" in capsys.readouterr().err
-    assert slip(*asked, "--vehicle-of", "run", "--quiet") == 0
 
 
 def test_no_verb_that_reads_writes_into_a_stored_run(

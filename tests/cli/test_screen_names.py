@@ -62,32 +62,6 @@ def test_a_log_cannot_write_lines_of_its_own(tmp_path: Path, capsys: pytest.Capt
     assert not any(line.startswith("all is well") for line in text.splitlines())
 
 
-def test_a_summary_keeps_to_its_lines() -> None:
-    log = {"losses": [], "duration_s": 1.0}
-    summary = {"run": "a\nb", "vehicle": "v\x1b", "terrain": "t", "log": log, "segments": 1}
-    text = format_run(summary, unchanged=False)
-    assert text.startswith("a\\nb    v\\x1b")
-    assert "\x1b" not in text
-
-
-def test_incidents_are_counted_and_the_longest_is_told() -> None:
-    log = {"losses": [], "duration_s": 90.0}
-    summary = {"run": "a", "vehicle": "v", "terrain": "t", "log": log, "segments": 1}
-    spans = ((10.0, 12.5, "stuck"), (30.0, 55.25, "it stood"))
-    findings = [
-        {"id": "i", "severity": "warning", "text": text, "t_start": start, "t_end": end}
-        for start, end, text in spans
-    ]
-    findings.insert(0, {"id": "pose", "severity": "error", "text": "no poses", "t_start": 3.0, "t_end": None})
-    text = format_run({**summary, "findings": findings}, unchanged=False)
-    assert (
-        "findings  !  2 incidents, the longest from 30.0 to 55.2 s: it stood\n          !! no poses" in text
-    )
-    assert "stuck" not in text
-    text = format_run({**summary, "findings": findings[:2]}, unchanged=False)
-    assert "findings  !  from 10.0 to 12.5 s: stuck" in text
-
-
 def test_incidents_of_different_kinds_have_rows_of_their_own_and_stand_once() -> None:
     log = {"losses": [], "duration_s": 90.0}
     spans = (
@@ -131,19 +105,6 @@ ROW = "effects   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.13
 FOLDED = """\
 effects   drive_lag           tau = 0.304 s [0.274, 0.333]
                               0.187 -> 0.133 m, 0.355 -> 0.304 rad"""
-TEXT = f"          {'':<20}Effective track 0.99 m (nominal 0.55): the robot turns at 56 % of the ideal rate"
-
-
-def test_a_line_is_folded_below_the_field_that_it_goes_on_with() -> None:
-    assert fold_line(ROW, 200) == fold_line(ROW, 0) == [ROW]
-    assert "\n".join(fold_line(ROW, 80)) == FOLDED
-    command = f"next      slip diagnose {'season/run ' * 10}--apply model.toml"
-    assert fold_line(command, 80) == [command]
-    assert fold_line("only within 0.029 s, or less", 40) == ["only within 0.029 s, or less"]
-    assert fold_line(f"{'x' * 30} within 0.029 s, or less", 42) == [f"{'x' * 30} within", "0.029 s, or less"]
-    parts = fold_line(TEXT, 80)
-    assert all(len(part) <= 80 and part[:30].isspace() and part[30] != " " for part in parts)
-    assert " ".join(part.strip() for part in parts) == TEXT.strip()
 
 
 @pytest.mark.parametrize(
@@ -165,8 +126,3 @@ def test_a_screen_of_80_columns_is_kept_to_and_a_file_takes_in_whole_lines(
     monkeypatch.setenv("COLUMNS", "80")
     print_lines([ROW])
     assert capsys.readouterr().out == f"{FOLDED}\n"
-
-
-def test_a_row_goes_on_below_its_second_column_where_that_is_far_to_the_right() -> None:
-    row = f"not shown {'contact_friction.creep':<30} 0.0188 -> 0.239  p = 1; too few runs to detect a"
-    assert fold_line(row, 80) == [row[: row.index("  p = 1")], " " * 10 + row[row.index("p = 1") :]]

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import polars as pl
@@ -25,18 +22,15 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
-from pipeline.estimation.floor import take_own_past
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.state import Free
-from pipeline.estimation.unexplained import is_felt
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
-from pipeline.run import MotionError
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -52,15 +46,10 @@ from pipeline.simulate import (
     Recording as Recorded,
 )
 from pipeline.sources import Vehicle, find_preset
-from schemas import contract_of
 
 _SCENE = Scenario(
     duration_s=120.0, seed=7, disturbance=Disturbance(0.02, 0.03), pose=PoseSensor(drift_m=0.005)
 )
-_PROMISED = {
-    "run", "input", "effects", "undecided", "unobservable", "unexplained", "findings", "ladder",
-    "noise_floor", "explained_share", "where", "timing",
-}  # fmt: skip
 
 
 def _record(scenario: Scenario, folder: Path) -> tuple[Recording, Vehicle]:
@@ -164,84 +153,6 @@ def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> 
     assert len(errors) == 3
     assert errors == sorted(errors, reverse=True)  # type: ignore[type-var]
     assert skidding.runs[0].explained_share > 0.9
-
-
-def test_every_promised_key_is_in_the_json_and_it_is_plain(skidding: Diagnosis) -> None:
-    (run,) = skidding.to_json()
-    assert set(run) >= _PROMISED
-    assert json.loads(json.dumps(run, allow_nan=False)) == run
-    (entry, *_) = run["effects"]  # type: ignore[misc, union-attr]
-    assert isinstance(entry, Mapping)
-    assert set(entry) >= {"id", "parameters", "gain", "equivalent_to", "confused_with", "corrected"}
-
-
-def test_a_heading_above_its_noise_floor_stands_beside_the_position(skidding: Diagnosis) -> None:
-    (run,) = skidding.runs
-    assert not any("in heading, noise floor" in text for _, text in list_lines(run))
-    heading = float(run.ladder[-1]["r_mrmse_rad"])  # type: ignore[arg-type]
-    quiet = replace(run, noise_floor={**run.noise_floor, "r_mrmse_rad": heading / 3.0})
-    assert any("degrees in heading, noise floor" in text for _, text in list_lines(quiet))
-
-
-def test_the_regions_say_where_it_fails(skidding: Diagnosis) -> None:
-    sentences = [region.sentence for region in skidding.runs[0].where]
-    assert any("ideal yaw rate" in text and "yaw error" in text for text in sentences)
-
-
-def test_the_screen_names_each_effect_and_the_fall(skidding: Diagnosis) -> None:
-    text = describe(skidding)
-    assert "effective_track" in text
-    assert "drive_lag" in text
-    assert "->" in text
-    # One interval a number: that of other runs is asked for.
-    assert "expected range between runs: " not in text
-    assert "expected range between runs: " in describe(skidding, everything=True)
-
-
-@pytest.mark.parametrize(("share", "shown"), [(0.004, "0.4 %"), (-0.004, "-0.4 %"), (-0.1, "-10 %")])
-def test_a_share_has_a_sign_with_a_reason_or_none(skidding: Diagnosis, share: float, shown: str) -> None:
-    run = skidding.runs[0]
-    budgets = tuple(
-        replace(budget, shares=(replace(budget.shares[0], share=share), *budget.shares[1:]))
-        for budget in run.budgets
-    )
-    text = describe(Diagnosis((replace(run, budgets=budgets),)), everything=True)
-    assert f"m/s): {budgets[0].shares[0].name} {shown}, " in text
-    assert ("negative: the effect increases slip" in text) is (share < 0.0)
-
-
-def test_what_runs_judged_together_share_is_said_once(skidding: Diagnosis) -> None:
-    run = skidding.runs[0]
-    spoiled = {"id": "imu_sign", "text": "the gyro turns the wrong way", "severity": "warning"}
-    text = describe(Diagnosis((run, replace(run, run="season/tuesday", findings=(spoiled,)))))
-    assert text.count("effective_track  ") == 1
-    assert "findings  !  season/tuesday: the gyro turns the wrong way" in text
-
-
-def test_what_removes_most_stands_first(skidding: Diagnosis) -> None:
-    run = skidding.runs[0]
-    assert [effect.id for effect in run.effects] == ["effective_track", "drive_lag"]
-    lines = list_lines(run)
-    place = [label for label, _ in lines].index("effects")
-    # What the vehicle does stands above the name and the numbers of each effect.
-    does, numbers, other = (text for _, text in lines[place : place + 3])
-    assert does == run.effects[0].motion
-    assert numbers.split()[0] == run.effects[0].id
-    assert other == run.effects[1].motion
-
-
-def test_the_longest_id_stands_apart_from_its_numbers(skidding: Diagnosis) -> None:
-    run = skidding.runs[0]
-    numbers = {"limit": next(iter(run.effects[0].parameters.values()))}
-    longest = replace(run.effects[0], id="turn_acceleration_limit", parameters=numbers)
-    text = describe(Diagnosis((replace(run, effects=(longest, *run.effects[1:])),)), everything=True)
-    assert "turn_acceleration_limit  limit = " in text
-
-
-def test_the_ladder_table_keeps_its_contract(skidding: Diagnosis) -> None:
-    table = skidding.tabulate("ladder", skidding.runs[0].run)
-    assert set(table.columns) <= set(contract_of("ladder").schema.columns())
-    assert table["kind"].to_list() == ["rung", "rung", "rung", "floor"]
 
 
 def test_nothing_is_named_beyond_a_model_that_says_it_all(skidding: Diagnosis, tmp_path: Path) -> None:
@@ -400,16 +311,6 @@ def test_two_runs_of_one_vehicle_are_judged_together(tmp_path: Path) -> None:
     assert all([effect.id for effect in run.effects] == ["effective_track"] for run in runs)
 
 
-def test_a_late_clock_that_is_corrected_stands_among_the_main_effects(tmp_path: Path) -> None:
-    # It has no step of the ladder, where a smaller effect shows that it is one.
-    scenario = replace(_SCENE, effects={"clock_offset": 0.35, "effective_track": 1.6}, imu=Imu())
-    diagnosis = _diagnose(scenario, tmp_path)
-    (clock,) = (effect for effect in diagnosis.runs[0].effects if effect.corrected)
-    (line,) = (line for line in describe(diagnosis).splitlines() if "poses are stamped" in line)
-    assert line.strip().removeprefix("effects").strip() == clock.motion
-    assert float(clock.motion.split()[-3]) == pytest.approx(350.0, abs=30.0)
-
-
 def test_a_log_without_encoders_and_gyro_is_answered_from_the_command_alone(tmp_path: Path) -> None:
     scenario = replace(
         _SCENE,
@@ -447,17 +348,6 @@ def test_a_late_clock_that_is_known_keeps_nothing_else_from_being_named(tmp_path
     assert [effect.id for effect in run.effects] == ["effective_track"]
 
 
-def test_a_track_depends_on_the_radius_and_on_nothing_else() -> None:
-    track = find_effect("effective_track")(k=1.65)
-    assert track.depends_on(find_effect("wheel_radius")(k=0.95))
-    assert not track.depends_on(find_effect("drive_lag")(tau=0.3))
-
-
-def test_an_effect_out_of_bounds_is_an_error_of_the_model() -> None:
-    with pytest.raises(MotionError):
-        find_effect("effective_track")(k=-1.0)
-
-
 @pytest.mark.long
 def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_path: Path) -> None:
     hidden = {"drive_lag": 0.55, "effective_track": 1.56, "deadband": 0.235}
@@ -467,24 +357,6 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
     # Between the commands that stood still and those that moved: nothing was asked closer to zero.
     (dead,) = next(effect.parameters for effect in found.effects if effect.id == "deadband").values()
     assert 0.0 < dead.low < 0.235 < dead.high
-
-
-def test_structure_that_no_planner_feels_is_not_said() -> None:
-    assert not is_felt("w", 0.001, part=0.5)
-    assert is_felt("w", 0.0013, part=0.001)
-    assert not is_felt("x", 1.0, part=0.004)
-    assert is_felt("y", 0.001, part=0.006)
-
-
-def test_residuals_lose_what_their_own_past_tells_of_them() -> None:
-    draw, times = np.random.default_rng(3), np.arange(0.0, 300.0, 0.5)
-    lasting, fresh = np.zeros(times.size), draw.normal(size=times.size)
-    for now in range(1, times.size):
-        lasting[now] = 0.7 * lasting[now - 1] + fresh[now]
-    windows = SimpleNamespace(times=np.column_stack((times, times + 0.5)))
-    made = take_own_past([SimpleNamespace(windows=windows)], np.column_stack([lasting] * 3))  # type: ignore[list-item]
-    assert np.corrcoef(made[2:, 0], fresh[2:])[0, 1] > 0.99
-    assert not made[:2].any()
 
 
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
@@ -504,20 +376,3 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())
         assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())
-
-
-def test_a_value_of_which_only_one_limit_is_known_is_undetermined() -> None:
-    limit = find_effect("body_speed_limit")().parameter("limit")
-    for effect, half, is_open in (
-        (find_effect("body_speed_limit")(limit=2.0), 1.0, False),
-        (find_effect("body_speed_limit")(limit=2.0), 2.0 - 0.5 * limit.bounds[0], True),
-        # A lag of zero is no lag, and no limit is above its largest value: both are neutral.
-        (find_effect("drive_lag")(tau=0.2), 0.3, False),
-        (find_effect("body_speed_limit")(limit=limit.bounds[1] - 2.0), 3.0, False),
-    ):
-        (name, value), (parameter,) = next(iter(effect.values.items())), effect.parameters
-        free = Free(effect.id, name, None, parameter.bounds, 0.01)
-        items = (Estimate(free, value, half, half / 2.0, at_bound=False, observable=True),)
-        (one,) = list_values(effect, Estimates(items, np.eye(1), 9)).values()
-        assert one.is_undetermined == is_open
-        assert str(one).endswith("(undetermined)") == is_open

@@ -9,8 +9,6 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.acceptance import find_exceeded, find_implausible, is_nameable
-from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.estimates import format_parameters
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 
@@ -91,17 +89,6 @@ def test_what_no_vehicle_does_is_said() -> None:
     assert find_implausible(find_effect("effective_track")(k=1.8)) is None
     assert find_implausible(find_effect("yaw_drift")(c=0.5)) is not None
     assert find_implausible(find_effect("yaw_drift")(c=0.1)) is None
-
-
-def test_a_number_that_the_runs_leave_open_says_so_on_screen_and_in_json() -> None:
-    known, left_open = Value(2.1, 1.9, 2.3, "s"), Value(2.1, math.nan, math.nan, "s")
-    assert str(known) == "2.10 s [1.90, 2.30]"
-    assert str(left_open) == "2.1 s (undetermined)"
-    assert [one.to_json()["undetermined"] for one in (known, left_open)] == [False, True]
-    assert Value(3.0, 2.0, 3.0, "s", at_bound=True).to_json()["undetermined"] is True
-    row = {"value": 2.1, "low": None, "high": None, "unit": "s", "fitted": True}
-    assert format_parameters({"drive_lag.tau": row})[0].endswith("undetermined")
-    assert "undetermined" not in format_parameters({"drive_lag.tau": {**row, "fitted": False}})[0]
 
 
 @pytest.mark.parametrize("name", ["wheel_speed_limit", "wheel_speed_scaling"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.estimation.acceptance import Improvement
-from pipeline.estimation.additions import explain_errors, explain_refusal, format_refusals
+from pipeline.estimation.additions import explain_errors, explain_refusal
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 
@@ -69,12 +69,3 @@ def test_errors_that_rise_or_do_not_fall_speak_against_an_addition(
     errors: dict[str, float], reason: str | None
 ) -> None:
     assert explain_errors(BELOW, errors, CLEAR) == reason
-
-
-def test_refusals_are_said_in_one_clause() -> None:
-    one = "with these values it acts as drive_lag"
-    assert format_refusals({"side_lag": one}) == f"side_lag is not supported by the data ({one})"
-    assert format_refusals({"side_lag": one, "turn_lag": one}).startswith(
-        "side_lag, turn_lag are not supported by the data"
-    )
-    assert format_refusals({"side_lag": one, "turn_lag": "no"}).endswith(f"(side_lag: {one}; turn_lag: no)")

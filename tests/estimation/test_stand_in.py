@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from pipeline.estimation import diagnose_runs
-from pipeline.estimation.acceptance import find_beyond, is_nameable
 from pipeline.estimation.diagnosis import Named, Value
 from pipeline.estimation.diagnosis_lines import describe
-from pipeline.estimation.estimates import find_doubt, format_stand_in
+from pipeline.estimation.estimates import find_doubt
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
-from pipeline.models import find_effect
-from pipeline.models.parameter import Conditions, Largest
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -32,9 +27,6 @@ from pipeline.simulate import (
 
 if TYPE_CHECKING:
     from pathlib import Path
-
-
-_CONDITIONS = Conditions(Largest(1.0, 1.0, 8.0, 3.0, np.linspace(0.0, 120.0, 11)))
 
 
 def test_a_lag_that_halves_the_error_is_named_though_it_is_longer_than_any_that_was_seen(
@@ -62,30 +54,6 @@ def test_a_lag_that_halves_the_error_is_named_though_it_is_longer_than_any_that_
     text = " ".join(describe(diagnosis, everything=True).split())
     assert f"tau = {lag.parameters['tau'].value:.3g} s is outside the observed range (0 to 3 s" in text
     assert run.to_json()["effects"][0]["tentative"]  # type: ignore[index]
-
-
-def test_a_number_beyond_what_was_seen_is_one_that_the_recordings_determine() -> None:
-    slow = find_effect("turn_lag")(tau_mean=0.4, tau_diff=3.7)
-    assert find_beyond(slow) == (
-        "tau_diff = 3.7 s is outside the observed range (0 to 3 s, wider than the 0.1 to 1.6 s of Husky "
-        "and Warthog)"
-    )
-    assert not is_nameable(slow, _CONDITIONS)
-    assert is_nameable(slow, _CONDITIONS, as_if=True)
-    # At the end of its bounds a number only stopped.
-    assert find_beyond(slow.change(tau_diff=10.0)) is None
-    assert not is_nameable(slow.change(tau_diff=10.0), _CONDITIONS, as_if=True)
-    assert find_beyond(slow.change(tau_diff=1.2)) is None
-
-
-def test_a_number_that_the_last_fit_moves_beyond_what_was_seen_is_kept_where_it_halves_the_loss() -> None:
-    numbers = {"tau": Value(3.4, 3.0, 3.8, "s")}
-    weak = Named("drive_lag", numbers, 0.9, (), (), corrected=False, path="wheels", selected=1.0, motion="")
-    assert not format_stand_in(weak)
-    assert "outside the observed range" in str(find_doubt(weak, {}))
-    strong = replace(weak, gain=1.1)
-    assert format_stand_in(strong).startswith("tau = 3.4 s")
-    assert find_doubt(strong, {}) is None
 
 
 def test_an_interval_that_includes_no_effect_in_every_run_is_reason_not_to_name_it() -> None:

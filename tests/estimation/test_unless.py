@@ -17,16 +17,13 @@ from pipeline.estimation import (
     load_recording,
 )
 from pipeline.estimation.acceptance import LEAST_GAIN, Improvement, NotSignificant
-from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import find_unless
 from pipeline.estimation.ladder import judge_model, note_fit
 from pipeline.export import export_model
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.next_drive import ask, study
 from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect, read_model, write_model
-from pipeline.plan import Limits
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 
 if TYPE_CHECKING:
@@ -120,21 +117,6 @@ def test_evidence_and_gain_are_required_alike() -> None:
         assert improvement.is_significant == (reached >= 1.0)
 
 
-def test_what_sampled_wheels_make_of_nothing_is_no_name(diagnosis: Diagnosis) -> None:
-    """A limit of 130 rad/s^2 ends at 320 under the weights of its own residuals: no wheel is late by that."""
-    assert "acceleration_limit" not in {effect.id for effect in diagnosis.runs[0].effects}
-
-
-def test_it_is_said_alike_on_the_screen_in_json_and_in_the_report(diagnosis: Diagnosis, folder: Path) -> None:
-    skid = next(effect for effect in diagnosis.runs[0].effects if effect.id == "lateral_skid")
-    (sentence,) = (one.sentence for one in skid.unless)
-    (run,) = diagnosis.to_json()
-    assert sentence in str(run["effects"])
-    assert sentence in describe(diagnosis, everything=True)
-    page = next((folder / "out").rglob("report.html")).read_text(encoding="utf-8")
-    assert sentence[1:] in page
-
-
 def test_the_written_model_says_it_until_the_effect_is_in(
     diagnosis: Diagnosis, recorded: tuple[Vehicle, Recording], tmp_path: Path
 ) -> None:
@@ -160,13 +142,6 @@ def test_the_written_model_says_it_until_the_effect_is_in(
     again = note_fit(file, judge_model(problem, file.model))
     assert [row[:2] for row in again.unless] == [(label, other)]
     assert note_fit(replace(file, model=both), judge_model(problem, both)).unless == []
-
-
-def test_a_plan_asks_whether_it_acts(recorded: tuple[Vehicle, Recording]) -> None:
-    vehicle, recording = recorded
-    studied = study([recording], vehicle)
-    asked = ask(studied.knowledge, ["undecided"], Limits(2.0, 1.0, 1.0, 2.0), 60.0, studied.diagnosis)
-    assert "whether body_inertia acts" in {question.text for question in asked}
 
 
 @pytest.mark.long

@@ -14,9 +14,8 @@ from comparison_store import Run, write_run
 
 from pipeline.cli import main
 from pipeline.fleet.rank_tests import LEVEL
-from pipeline.fleet.trend import Trend, follow_quantities, format_quiet
-from pipeline.job import JobError
-from pipeline.job.over_runs import check_limits, follow_trend, write_trend
+from pipeline.fleet.trend import Trend, follow_quantities
+from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
 from pipeline.store.names import read_day
 
@@ -139,36 +138,6 @@ def test_changes_not_worth_a_name_raise_no_alert(store: Store) -> None:
     assert not found.alerts
 
 
-def test_where_all_stands_still_nothing_moved(store: Store) -> None:
-    drive_a_season(store, [1.8] * 8)
-    found = follow(store)
-    assert not found.alerts
-    assert format_quiet(found.series, found.parameters) == "no change exceeds the threshold"
-    assert "No change exceeds the threshold" in write_trend(store, found).read_text(encoding="utf-8")
-
-
-def test_four_runs_tell_a_large_change_and_three_say_what_they_lack(store: Store) -> None:
-    drive_a_season(store, [1.8, 1.802, 1.801])
-    found = follow(store)
-    assert not found.alerts
-    assert any(
-        "too few runs to detect a change of slip, 9 are needed: warthog-2" in note for note in found.notes
-    )
-    lack = "1 more run on a terrain driven before needed"
-    assert any(lack in note and "effective_track.k" in note for note in found.notes)
-    write_run(
-        store,
-        Run(
-            name="fourth", dataset="warthog-2_gravel", vehicle="warthog-2", seconds=30.0,
-            start_ns=stamp_of(FIRST + timedelta(days=9)), estimates=[("effective_track", "k", 2.3, 0.004)],
-        ),
-    )  # fmt: skip
-    (alert,) = follow(store).alerts
-    assert alert.text.startswith(
-        "effective_track.k of warthog-2 1.8 -> 2.3 since 2026-04-29 (3 runs before, 1 since"
-    )
-
-
 @pytest.mark.parametrize(("runs", "steps"), [(8, 0), (9, 1)])
 def test_a_step_of_slip_takes_runs_of_which_an_order_is_rare_enough(runs: int, steps: int) -> None:
     """Low values first or high ones first are 2 of all orders; half of the level is for all series."""
@@ -180,22 +149,6 @@ def test_a_step_of_slip_takes_runs_of_which_an_order_is_rare_enough(runs: int, s
     names = ["order", "group", "quantity", "unit", "day", "run", "value"]
     (found,) = follow_quantities(pl.DataFrame(rows, schema=names, orient="row"))
     assert len(found.steps) == steps
-
-
-def test_where_no_group_has_enough_runs_nothing_is_said_to_stand_still(
-    store: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drive_a_season(store, [1.8])
-    with pytest.raises(SystemExit) as ended:
-        main(["fleet", "trend", str(store.root), "--by", "vehicle"])
-    assert ended.value.code == 0
-    said = "no test is possible: a change of slip needs 9 runs of a group (the largest has 1)"
-    spoken = capsys.readouterr().out
-    assert spoken.startswith(said)
-    assert "no change exceeds" not in spoken
-    page = (store.root / "trend.html").read_text(encoding="utf-8")
-    assert said[1:] in page
-    assert "Nothing moved" not in page
 
 
 def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
@@ -228,107 +181,6 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
     assert text in [alert.text for alert in found.alerts]
 
 
-@pytest.mark.parametrize(
-    ("asked", "told"),
-    [
-        (["--limit", "median_modulus=inf"], "'median_modulus=inf' is not a limit"),
-        (["--limit", "warnings=nan"], "'warnings=nan' is not a limit"),
-        (["--threshold", "inf"], "inf is not a threshold"),
-    ],
-)
-def test_limits_that_are_not_finite_are_one_line(
-    store: Store, asked: list[str], told: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drive_a_season(store, [1.8])
-    with pytest.raises(SystemExit) as ended:
-        main(["fleet", "trend", str(store.root), *asked])
-    assert ended.value.code == 1
-    assert told in capsys.readouterr().err
-
-
-def test_limits_that_no_run_has_yet_are_said_first(store: Store) -> None:
-    drive_a_season(store, [1.8, 1.8])
-    limits = {"warnings": 0.0, "effective_track.k": 1.7, "wheel_radius.k": 1.0, "finding time_jump": 1.0}
-    check_limits(limits)
-    found = follow(store, limits=limits)
-    assert {alert.quantity for alert in found.alerts} == {"warnings", "effective_track.k"}
-    assert "effective_track.k of warthog-2 is 1.8 in run_01, above the limit of 1.7" in [
-        alert.text for alert in found.alerts
-    ]
-    assert found.notes[:2] == tuple(
-        f"the limit on {name} is not checked: no run has this quantity"
-        for name in ("wheel_radius.k", "finding time_jump")
-    )
-
-
-@pytest.mark.parametrize(
-    ("limit", "hint"),
-    [
-        ("median_modulos=1", "Did you mean median_modulus"),
-        ("effective_track.q=1", "Did you mean effective_track.k"),
-        ("beauty=1", "There are median_modulus, "),
-    ],
-)
-def test_a_limit_on_no_quantity_is_an_error(
-    store: Store, limit: str, hint: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    drive_a_season(store, [1.8])
-    with pytest.raises(SystemExit) as ended:
-        main(["fleet", "trend", str(store.root), "--limit", limit])
-    assert ended.value.code == 1
-    told = capsys.readouterr()
-    assert "nothing" not in told.out
-    assert f"{limit.split('=', maxsplit=1)[0]!r} in --limit is not a quantity" in told.err
-    assert hint in " ".join(told.err.split())
-    assert not (store.root / "trend.html").exists()
-
-
-def test_an_undetermined_number_is_named_with_its_run(store: Store) -> None:
-    drive_a_season(store, [1.8, 1.81, 1.8, 1.81])
-    write_run(
-        store,
-        Run(
-            name="gentle", dataset="warthog-2_gravel", vehicle="warthog-2", seconds=30.0,
-            start_ns=stamp_of(FIRST + timedelta(days=9)), estimates=[("effective_track", "k", 1.8, 4e5)],
-        ),
-    )  # fmt: skip
-    found = follow(store)
-    (track,) = found.parameters
-    assert track.shown_latest == "1.8 (undetermined)"
-    assert "effective_track.k of warthog-2, left out where a run does not determine it: gentle" in found.notes
-    assert "Not drawn, undetermined: gentle." in write_trend(store, found).read_text(encoding="utf-8")
-
-
-def test_a_ground_has_one_mark_and_a_wide_interval_sets_no_axis(store: Store) -> None:
-    ends = [
-        ("asphalt", 1.5),
-        ("gravel", 1.6),
-        ("sand", 1.7),
-        ("asphalt", 1.51),
-        ("gravel", 1.61),
-        ("sand", 1.69),
-    ]
-    for i, (terrain, track) in enumerate(ends):
-        error = 0.3 if i == 2 else 0.004
-        estimates = [("effective_track", "k", track, error)]
-        estimates += [("lateral_skid", "c", 0.1, 0.01)] if terrain != "asphalt" else []
-        start = stamp_of(FIRST + timedelta(days=i))
-        write_run(
-            store, Run(name=f"r{i}", terrain=terrain, seconds=30.0, start_ns=start, estimates=estimates)
-        )
-    page = write_trend(store, follow(store)).read_text(encoding="utf-8")
-    data = json.loads(re.search('id="page-data">(.*?)</script>', page)[1])  # type: ignore[index]
-    drawn = {name: json.dumps(spec) for name, spec in data["figures"].items() if "parameter" in name}
-    track, skid = drawn["parameter_0_0"], drawn["parameter_0_1"]
-    for spec, shown in ((track, ["asphalt", "gravel", "sand"]), (skid, ["gravel", "sand"])):
-        assert '"scale": {"domain": ["asphalt", "gravel", "sand"]}' in spec
-        assert f'"values": {json.dumps(shown)}' in spec
-    low, high = json.loads(re.search(r'"domain": (\[[^]]*\]), "zero": false', track)[1])  # type: ignore[index]
-    assert 1.4 < low < 1.5
-    assert 1.7 < high < 1.8
-    assert "Intervals that are longer than the axis are cut." in page
-
-
 def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
     for name in ("ice_2024_7_30", "gravel_2023_12_12", "asphalt"):
         write_run(store, Run(name=name, seconds=30.0))
@@ -342,12 +194,6 @@ def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
         "left out, because no date is known: asphalt",
     )
     assert "same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
-
-
-def test_runs_without_a_date_are_left_out_and_said(store: Store) -> None:
-    write_run(store, Run(name="undated", start_ns=0))
-    with pytest.raises(JobError, match="no run with a date; left out, because no date is known: undated"):
-        follow(store)
 
 
 @pytest.mark.parametrize(

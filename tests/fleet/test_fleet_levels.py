@@ -14,10 +14,10 @@ from comparison_store import Run, write_run
 
 from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
 from pipeline.cli import main
-from pipeline.fleet.forecast import FleetModel, FleetNumber, fit_fleet
+from pipeline.fleet.forecast import FleetNumber, fit_fleet
 from pipeline.job.compare import Question, compare_results
-from pipeline.job.over_runs import follow_trend, update_trend
-from pipeline.job.prediction import fit_results, summarize_fleet
+from pipeline.job.over_runs import follow_trend
+from pipeline.job.prediction import fit_results
 from pipeline.models import find_effect
 from pipeline.models.parameter import Level
 from pipeline.store import Store
@@ -75,17 +75,6 @@ def test_wheels_that_are_small_are_so_on_every_ground() -> None:
     assert number.fit.interval is not None
     assert number.fit.interval.low < 0.9 < number.fit.interval.high
     assert "3 terrains not shown to differ by more than runs do" in number.because
-
-
-def test_ends_of_an_interval_stay_within_what_the_number_can_be() -> None:
-    fleet = fit_fleet(draw({"asphalt": 0.0, "ice": 0.9}, effect="drive_lag", parameter="tau"))
-    (number,) = fleet.numbers
-    assert number.fit.interval is not None
-    assert number.fit.interval.low < 0.0
-    (row,) = json.loads(json.dumps(summarize_fleet(fleet)))["parameters"]
-    assert row["low"] == 0.0
-    assert row["value"] < row["high"] <= number.fit.interval.high
-    assert all(mean["low"] >= 0.0 for mean in row["terrains"].values())
 
 
 def test_wheels_that_slip_on_ice_are_not_small() -> None:
@@ -239,14 +228,6 @@ def test_simulated_runs_enter_no_fleet_and_no_trend_of_recordings(results: Store
     assert not any("made" in key for key in trend.keys)
 
 
-def test_runs_on_unknown_ground_and_numbers_at_a_bound_are_left_out_and_said() -> None:
-    model = fit_fleet(pl.concat([draw(ALIKE), draw({"unknown": 0.1}), draw({"mud": 5.0}, at_bound=True)]))
-    (number,) = model.numbers
-    assert set(number.fit.groups) == set(ALIKE)
-    assert any("terrain unknown: warthog_unknown_0" in note for note in model.notes)
-    assert any("at a bound" in note and "wheel_radius" in note for note in model.notes)
-
-
 def test_of_two_inputs_the_command_counts_once() -> None:
     both = [draw(ALIKE), draw(ALIKE, input="command", value=0.8)]
     number = fit_one(pl.concat(both))
@@ -281,63 +262,6 @@ def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, 
         main(list(arguments))
     told = capsys.readouterr()
     return int(ended.value.code or 0), told.out, told.err
-
-
-def test_the_longest_label_stands_apart_from_its_value(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store = Store(tmp_path / "results")
-    limit = [("turn_acceleration_limit", "limit", 2.0, 0.1)]
-    for name in ("monday", "tuesday"):
-        write_run(store, Run(name=name, terrain="ice", seconds=6.0, estimates=limit))
-    assert "turn_acceleration_limit.limit  2," in run_slip(capsys, "fleet", "fit", str(store.root))[1]
-
-
-def test_what_is_fitted_is_written_and_shown_again(
-    results: Store, capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, out, _ = run_slip(capsys, "fleet", "fit", str(results.root), "--json")
-    fitted = json.loads(out)
-    assert code == 0
-    (number,) = fitted["parameters"]
-    assert (number["effect"], number["parameter"], number["level"]) == ("wheel_radius", "k", "terrain")
-    assert number["terrains"]["ice"]["runs"] == 3
-    assert number["terrains"]["ice"]["low"] < number["terrains"]["ice"]["value"]
-    assert number["spread_terrain"] > number["spread_run"]
-    (resolved,) = fitted["resolved"]
-    assert resolved["candidates"] == ["wheel_radius", "longitudinal_slip"]
-    assert resolved["answer"] == "longitudinal_slip"
-    assert "ice" in resolved["because"]
-    assert set(fitted["runs"]) == {"warthog"}
-
-    table = pl.read_parquet(results.root / "fleet.parquet")
-    assert table.filter(pl.col("terrain") == "*")["value"].item() == pytest.approx(number["value"])
-    assert table.height == 1 + len(ICE_AND_OTHERS)
-
-    shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
-    assert shown["parameters"] == fitted["parameters"]
-    text = run_slip(capsys, "fleet", "show", str(results.root))[1]
-    assert "warthog: 9 runs" in text
-    assert "longitudinal_slip" in text
-    assert (
-        text.splitlines()[-1] == fitted["summary"] == "1 parameter in 9 runs of 1 vehicle: 1 of the terrain."
-    )
-    page = (results.root / "fleet.html").read_text(encoding="utf-8")
-    for word in (
-        "Longitudinal slip",
-        "wheel_radius.k",
-        number["because"].split(" (")[0],
-        "ice",
-        'href="index.html"',
-    ):
-        assert word in page
-    assert 'href="fleet.html"' in (results.root / "index.html").read_text(encoding="utf-8")
-
-
-def test_a_fleet_that_is_out_of_date_says_so(results: Store, capsys: pytest.CaptureFixture[str]) -> None:
-    run_slip(capsys, "fleet", "fit", str(results.root))
-    write_run(results, Run(name="new", seconds=6.0, estimates=[("wheel_radius", "k", 1.0, ERROR)]))
-    assert "1 results have changed since" in run_slip(capsys, "fleet", "show", str(results.root))[1]
 
 
 def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
@@ -377,15 +301,6 @@ def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
         assert refresh_pools(results)
 
 
-def test_a_trend_that_cannot_be_made_is_not_passed_over(
-    results: Store, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    run_slip(capsys, "fleet", "trend", str(results.root), "--quiet")
-    monkeypatch.setattr("pipeline.job.over_runs.follow_parameters", lambda *_, **__: {}["gone"])
-    with pytest.raises(KeyError, match="gone"):
-        update_trend(results)
-
-
 def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
     results: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -414,25 +329,3 @@ def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
     assert "above the limit of 1.5" in published["trend.html"]
     linked = set(re.findall(r'href="(\w+\.html)"', published["index.html"]))
     assert {"fleet.html", "map.html", "trend.html"} <= linked <= set(published)
-
-
-def test_without_a_fleet_or_estimates_one_line_says_what_to_do(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    store = Store(tmp_path / "results")
-    write_run(store, Run(name="plain", seconds=6.0))
-    code, _, error = run_slip(capsys, "fleet", "fit", str(store.root))
-    assert code == 1
-    assert "no run has estimates" in error
-    assert error.count("\n") == 1
-    code, _, error = run_slip(capsys, "fleet", "show", str(store.root))
-    assert code == 1
-    assert "slip fleet fit" in error
-    (store.root / "fleet.json").write_text("{", encoding="utf-8")
-    code, _, error = run_slip(capsys, "fleet", "show", str(store.root))
-    assert code == 1
-    assert "cannot be read" in error
-
-
-def test_a_model_of_no_run_is_empty() -> None:
-    assert fit_fleet(draw(ALIKE).clear()) == FleetModel((), {}, ())

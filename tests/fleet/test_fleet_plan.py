@@ -93,19 +93,3 @@ def test_what_the_fleet_knows_adds_to_what_a_run_says(tmp_path: Path) -> None:
     assert np.linalg.inv(alone.information)[0, 0] ** 0.5 > 0.02
     assert np.linalg.inv(tied.information)[0, 0] ** 0.5 < 0.02
     assert tied.values[0] == pytest.approx(1.5, abs=0.04)
-
-
-def test_results_that_know_nothing_of_the_vehicle_are_one_clear_error(
-    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    for vehicle, known, words in (
-        ("husky_a200", results, "no run of husky_a200 on a known terrain has estimates"),
-        ("warthog", tmp_path, "no run has estimates"),
-    ):
-        told = ["plan", "--vehicle", vehicle, "--terrain", "ice", "--known", str(known)]
-        with pytest.raises(SystemExit, match="1"):
-            main([*told, "--out", str(tmp_path / "plan")])
-        error = capsys.readouterr().err
-        assert words in error
-        assert error.count("slip:") == 1
-    assert not (tmp_path / "plan").exists()

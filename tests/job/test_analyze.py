@@ -6,22 +6,16 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
 import pytest
-from msgspec import structs
 
-from pipeline.cli.screen import format_run
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log, update_datasets
-from pipeline.logs import LogData
-from pipeline.simulate import Recording, make_scenario, simulate_case, simulate_run, write_log
-from pipeline.sources import Sources, message_types
+from pipeline.simulate import simulate_case
 from pipeline.stages import StageError
-from pipeline.stages.extract import Extracted, extract_tables
 from pipeline.store import Store
 
 STAGES = ("extract", "align", "velocity", "slip", "aggregate")
@@ -145,21 +139,6 @@ def test_force_computes_again_and_gives_the_same(log: Path, out: Path) -> None:
         assert second.manifest.tables[table].sha256 == entry.sha256, table
 
 
-def test_results_know_what_was_known_of_the_types_in_the_log(
-    log: Path, out: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    analyze(log, out)
-    kinds, pairs = message_types.read_tables()
-    odometry = kinds["nav_msgs/Odometry"]
-    assert odometry.pose is not None
-    # The messages have a frame, so that this one is not used: the numbers stay the same.
-    changed = structs.replace(odometry, pose=structs.replace(odometry.pose, fixed="odd"))
-    for name, computed in (("odd_msgs/Odometry", ()), ("nav_msgs/Odometry", STAGES)):
-        tables = {**kinds, name: changed}, pairs
-        monkeypatch.setattr(message_types, "read_tables", lambda tables=tables: tables)
-        assert analyze(log, out).computed == computed, name
-
-
 def test_equal_content_is_one_run(log: Path, out: Path, tmp_path: Path) -> None:
     first = analyze(log, out)
     copy = tmp_path / "elsewhere" / "copy.mcap"
@@ -258,16 +237,6 @@ def test_slip_can_be_told_relative_to_a_model(out: Path, tmp_path: Path) -> None
     assert without.manifest.read("slip")["model_x"].null_count() == table.height
 
 
-def test_a_model_that_is_missing_or_of_another_kind_is_refused(log: Path, out: Path, tmp_path: Path) -> None:
-    with pytest.raises(SlipError, match="cannot be read"):
-        analyze(log, out, model=tmp_path / "none.toml")
-    car = tmp_path / "car.toml"
-    car.write_text('format = 1\n[vehicle]\npreset = "ackermann_car"\n')
-    with pytest.raises(SlipError, match="kind 'ackermann'"):
-        analyze(log, out, model=car)
-    assert Store(out).runs() == ()
-
-
 def test_a_split_recording_is_read_once(log: Path, out: Path, tmp_path: Path) -> None:
     recording = tmp_path / "split"
     recording.mkdir()
@@ -284,28 +253,6 @@ def test_a_split_recording_is_read_once(log: Path, out: Path, tmp_path: Path) ->
     assert second.manifest == first.manifest
 
 
-def test_a_copy_says_whose_results_it_shares(log: Path, out: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy.mcap"
-    shutil.copy(log, copy)
-    first = analyze(copy, out)
-    assert first.twin == ""
-    second = analyze(log, out)
-    assert (second.computed, second.twin) == ((), str(copy))
-    assert second.manifest.run == first.manifest.run
-    text = format_run(second.summary, unchanged=True, twin=second.twin)
-    assert f"same      content as {copy}" in text
-
-
-def test_a_log_that_was_moved_is_no_copy(log: Path, out: Path, tmp_path: Path) -> None:
-    before, after = tmp_path / "before.mcap", tmp_path / "after.mcap"
-    shutil.copy(log, before)
-    first = analyze(before, out)
-    before.rename(after)
-    second = analyze(after, out)
-    assert (second.computed, second.twin) == ((), "")
-    assert second.manifest.run == first.manifest.run
-
-
 def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(log: Path, out: Path) -> None:
     path = analyze(log, out).manifest.path("summary.json")
     whole = path.read_bytes()
@@ -317,20 +264,3 @@ def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(
             analyze(log, out)
         assert caught.value.code == "file_damaged"
     assert analyze(log, out, force=True).summary["run"]
-
-
-def test_a_log_whose_poses_are_compared_is_extracted_once(
-    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    extracted: list[str] = []
-
-    def count(data: LogData, sources: Sources, *rest: object, **more: object) -> Extracted:
-        extracted.append(str(sources.pose))
-        return extract_tables(data, sources, *rest, **more)  # type: ignore[arg-type]
-
-    for module in ("pipeline.stages.pose_choice", "pipeline.job.log_choice", "pipeline.job.work"):
-        monkeypatch.setattr(f"{module}.extract_tables", count)
-    scenario = replace(make_scenario("husky_tile", duration_s=20.0), recording=Recording("tf"))
-    write_log(simulate_run(scenario), tmp_path / "run.mcap")
-    assert analyze(tmp_path / "run.mcap", out).manifest.tables["poses"].rows
-    assert len(extracted) == len(set(extracted)) > 0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +11,6 @@ from xml.etree import ElementTree as ET
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.estimation.diagnosis_lines import format_lines
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job import JobError
 from pipeline.job.check import (
@@ -20,7 +18,6 @@ from pipeline.job.check import (
     KEPT,
     UNDETERMINED,
     Check,
-    Limits,
     check_as_json,
     compare,
     keep_baseline,
@@ -137,15 +134,6 @@ def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) 
         assert row[1].endswith("too few runs to detect a factor of two") == (outcome == "not shown")
 
 
-def test_what_a_model_states_without_an_interval_beside_others_is_not_compared(model: ModelFile) -> None:
-    stated = replace(model, intervals={"drive_lag.tau": (0.28, 0.32)})
-    run = drive(USUAL, 50)[:1]
-    for file, unknown in ((model, []), (stated, ["effective_track.k"])):
-        found = compare(replace(read_under(file, {BEFORE: (), AFTER: run}), kind="model"))
-        assert [name for name in found.list_status("unknown") if not name.startswith("error")] == unknown
-        assert "is not detectable with this run" in format_verdict(found)
-
-
 def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     found = compare(replace(late, before=late.before[:1], after=late.after[:1]))
 
@@ -155,17 +143,6 @@ def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     assert verdict.startswith("No conclusion: the recordings differ in drive lag")
     assert "at the default spread between runs" in verdict
     assert "more run" in verdict
-
-
-def test_a_simulation_is_told_what_it_lacks(model: ModelFile, late: Sides) -> None:
-    plain = read_under(model, {BEFORE: (), AFTER: drive({}, 50)}).after
-    before = tuple(replace(one, numbers=replace(one.numbers, side=BEFORE)) for one in plain)
-
-    found = compare(replace(late, before=before[:1], after=late.after[:1]), simulated=True)
-
-    verdict = format_verdict(found)
-    assert verdict.startswith("The simulation lacks drive lag of 0.4")
-    assert "its effective track is 1, the robot's 1." in verdict
 
 
 def test_an_error_that_no_number_explains_is_a_finding_of_its_own(windy: Sides) -> None:
@@ -208,52 +185,6 @@ def test_a_limit_within_the_interval_cannot_be_told(late: Sides, tmp_path: Path)
 
     assert found.code == UNDETERMINED
     assert "cannot be judged from these runs" in format_verdict(found)
-
-
-def test_slip_on_a_ground_is_limited_and_its_growth(late: Sides, tmp_path: Path) -> None:
-    sides = replace(
-        late,
-        before=tuple(replace(one, slip=(math.log(0.2), 0.05)) for one in late.before),
-        after=tuple(replace(one, slip=(math.log(0.6), 0.05)) for one in late.after),
-    )
-
-    broken = judge(tmp_path, sides, "[slip]\ngrass = {max = 0.5, change = 0.5}")
-
-    assert [one.outcome for one in broken.limits] == ["broken", "broken"]
-    assert judge(tmp_path, sides, "[slip]\ngrass = {max = 0.8}").code == KEPT
-
-
-def test_a_limit_on_a_misspelt_ground_says_that_no_run_has_it(late: Sides, tmp_path: Path) -> None:
-    (judged,) = judge(tmp_path, late, "[slip]\ngras = {max = 9.0}").limits
-    assert judged.outcome == "undetermined"
-    assert judged.measured == "no run is on gras. Did you mean grass? The runs are on grass"
-    elsewhere = replace(late, after=tuple(replace(one, terrain="ice") for one in late.after))
-    (judged,) = judge(tmp_path, elsewhere, "[slip]\ngrass = {max = 9.0}").limits
-    assert judged.measured == "no run AFTER on grass"
-
-
-@pytest.mark.parametrize(
-    ("text", "complaint"),
-    [
-        ("[parameters]\n", "unknown field `parameters`"),
-        ('[parameter]\n"drive_lag.tau" = {maximum = 1}', "unknown field `maximum`"),
-        ('[parameter]\n"drive_lag.tau" = {}', "no min, max or change"),
-        ('[parameter]\n"drive_lag.tau" = {min = 2, max = 1}', "above its max"),
-        ('[parameter]\n"drive_lag.tau" = {change = -0.1}', "not positive"),
-        ("[error]\nposition = {max = nan}", "nan"),
-        ("", "sets no limit"),
-        ("[error\n", "line 1"),
-    ],
-)
-def test_wrong_limits_are_refused_with_what_is_wrong(tmp_path: Path, text: str, complaint: str) -> None:
-    path = tmp_path / "check.toml"
-    path.write_text(text, encoding="utf-8")
-
-    with pytest.raises(JobError) as raised:
-        read_limits(path)
-
-    assert raised.value.code == "bad_limits"
-    assert complaint in str(raised.value)
 
 
 def test_a_limit_of_an_unknown_number_names_those_that_there_are(late: Sides, tmp_path: Path) -> None:
@@ -352,13 +283,6 @@ def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides)
     assert "\x1b" not in markdown
 
 
-def test_limits_decide_what_fails_in_a_build(late: Sides, tmp_path: Path) -> None:
-    found = judge(tmp_path, late, '[parameter]\n"drive_lag.tau" = {max = 0.6}')
-    suite = read_suite(found)
-
-    assert suite.get("failures") == "0"
-
-
 def test_models_of_both_sides_are_united() -> None:
     vehicle = vehicle_of("husky_a200")
     one = Model(vehicle, (make("drive_lag", tau=0.2), make("lateral_skid", c=0.1)))
@@ -370,41 +294,3 @@ def test_models_of_both_sides_are_united() -> None:
     # What acts from a moment of one recording on says nothing of another.
     assert set(found) == {"drive_lag", "lateral_skid"}
     assert found["drive_lag"].values["tau"] == pytest.approx(0.4)
-
-
-def test_an_effect_that_contains_another_stands_beside_it_only_where_a_model_has_both() -> None:
-    vehicle = vehicle_of("husky_a200")
-    track, droop = make("effective_track", k=1.6), make("turn_droop", threshold=3.0, gain=0.5)
-
-    both = unite_effects([Model(vehicle, (track, droop))], [Model(vehicle, (track,))])
-    apart = unite_effects([Model(vehicle, (track,))], [Model(vehicle, (droop,))])
-
-    assert {effect.id for effect in both} >= {"effective_track", "turn_droop"}
-    assert "effective_track" not in {effect.id for effect in apart}
-
-
-def test_a_radius_is_free_beside_a_track_so_that_tyres_are_not_taken_for_ground() -> None:
-    vehicle = vehicle_of("husky_a200")
-    track, tyres = (
-        {"effective_track": {"k": 1.6}},
-        {"effective_track": {"k": 1.6}, "wheel_radius": {"k": 0.92}},
-    )
-    effects = unite_effects([Model(vehicle, (make("effective_track", k=1.6),))], [])
-
-    sides = read_under(
-        ModelFile(Model(vehicle, effects)), {BEFORE: drive(track, 60), AFTER: drive(tyres, 70)}
-    )
-    found = compare(sides)
-
-    named = [name for name in found.list_status("changed") if not name.startswith("error.")]
-    assert named == ["wheel_radius.k"]
-
-
-def test_limits_are_empty_without_a_file() -> None:
-    assert Limits() == Limits(parameter={}, slip={})
-
-
-def test_a_wide_label_keeps_a_space_to_its_text(late: Sides, tmp_path: Path) -> None:
-    found = judge(tmp_path, late, "[slip]\nice = {max = 0.5}")
-
-    assert any(line.startswith("undetermined slip.ice") for line in format_lines(list_lines(found)))

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.estimation.commanded import measure_commanded_turn
-from pipeline.estimation.verdict import format_verdict as format_diagnosis
 from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -19,15 +16,12 @@ from pipeline.job.check import (
     BROKEN,
     Check,
     check_as_json,
-    check_runs,
     compare,
-    find_usual_spread,
-    keep_baseline,
 )
-from pipeline.job.check_sides import Sides, read_baseline, read_under
+from pipeline.job.check_sides import Sides, read_under
 from pipeline.job.check_text import format_verdict, list_lines
 from pipeline.job.run_results import load_vehicle
-from pipeline.job.stored_fits import COMMANDED, COMMANDED_TURN, MULTIPLIER
+from pipeline.job.stored_fits import COMMANDED, MULTIPLIER
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
@@ -35,7 +29,6 @@ from pipeline.report.motion_view import load_motion_run
 from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import find_preset
 from pipeline.stages.align import measure_body_multiplier
-from pipeline.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -123,43 +116,6 @@ def test_without_a_body_command_nothing_is_said_of_it(sides: Sides) -> None:
     assert not {*COMMANDED} & {*check.changes}
 
 
-def test_a_baseline_of_before_the_commanded_rate_stays_readable(found: Check, tmp_path: Path) -> None:
-    path = tmp_path / "robot.json"
-    # A check that is broken writes a baseline where there is none.
-    keep_baseline(found, path)
-    whole = read_baseline(path)
-    content = json.loads(path.read_text(encoding="utf-8"))
-    content["numbers"] = content["numbers"][: -len(COMMANDED)]
-    for run in content["runs"]:
-        run["values"] = run["values"][: -len(COMMANDED)]
-        run["covariance"] = [row[: -len(COMMANDED)] for row in run["covariance"][: -len(COMMANDED)]]
-    path.write_text(json.dumps(content), encoding="utf-8")
-
-    (old,), (new,) = read_baseline(path).readings, whole.readings
-
-    place = whole.names.index(COMMANDED_TURN)
-    assert np.isnan(old.numbers.values[place:]).all()
-    assert np.isfinite(new.numbers.values[place:]).all()
-    np.testing.assert_array_equal(old.numbers.values[:place], new.numbers.values[:place])
-
-
-def test_the_verdict_on_one_run_says_what_it_does_of_the_command() -> None:
-    ladder = [
-        {"effects": names, "t_mrmse_m": size, "r_mrmse_rad": size}
-        for names, size in (([], 0.3), (["effective_track"], 0.01))
-    ]
-    clause = "turns at 56 % of the ideal rate"
-    diagnosis = {"ladder": ladder, "findings": [], "effects": [{"id": "effective_track", "clause": clause}]}
-    turn = {"share": 1.04, "low": 1.03, "high": 1.05, "controller_multiplier": 1.875}
-
-    verdict = format_diagnosis({**diagnosis, "commanded_turn": turn})
-
-    assert "It turns at 104 % of the commanded rate: its controller's multiplier is 1.88." in verdict
-    # The ideal rate is the commanded one where the controller changes nothing.
-    for other in (None, {**turn, "controller_multiplier": 1.0}, {**turn, "controller_multiplier": -1.0}):
-        assert "commanded rate" not in format_diagnosis({**diagnosis, "commanded_turn": other})
-
-
 @pytest.mark.parametrize("expected", [1.5, None], ids=["obeyed", "another"])
 def test_wheels_have_a_multiplier_only_of_a_body_command_that_they_obey(expected: float | None) -> None:
     vehicle = find_preset("husky_a200")
@@ -183,32 +139,3 @@ def test_wheels_have_a_multiplier_only_of_a_body_command_that_they_obey(expected
 
     assert found == (None if expected is None else pytest.approx(expected, rel=1e-6))
     assert measure_body_multiplier(commands.drop("body_w"), vehicle) is None
-
-
-def test_a_run_without_a_body_command_has_no_share(sides: Sides) -> None:
-    fitted = sides.before[0].fitted
-    assert fitted is not None
-    run = fitted.problem.runs[0]
-    assert measure_commanded_turn(run, sides.model.model.vehicle) is not None
-    bare = replace(run, alignment=replace(run.alignment, body_multiplier=None))
-    assert measure_commanded_turn(bare, sides.model.model.vehicle) is None
-
-
-def test_other_runs_of_the_results_tell_how_much_runs_differ(tmp_path: Path) -> None:
-    runs = [drive(tmp_path, "beside", 1.0, seed)[1] for seed in (11, 12, 13, 14)]
-    store = Store(tmp_path / "results")
-    manifests = {one.run: one for one in store.survey().manifests}
-    vehicle = load_vehicle(manifests[runs[0].name])
-    model = Model(vehicle, tuple(find_effect(name)().change(**values) for name, values in EFFECTS.items()))
-
-    check = check_runs(ModelFile(model), [manifests[runs[0].name]], store)
-
-    (there,) = check.sides.others.values()
-    assert sorted(one.numbers.run for one in there) == sorted(run.name for run in runs[1:])
-    change = check.changes["drive_lag.tau"]
-    # Three runs of one terrain; the model beside the run is a side of its own.
-    assert change.freedom == 2
-    assert change.spread < 0.5 * find_usual_spread(check.sides.labels[0].parameter)
-    assert dict(list_lines(check))["others"].startswith("3: ")
-    assert "and 3 others of the vehicle" in format_verdict(check)
-    assert len(cast("list[str]", check_as_json(check, list_lines(check))["others"])) == 3

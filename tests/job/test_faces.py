@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import json
-from pathlib import Path
 
 import pytest
 from verbs import run_verb
@@ -12,8 +11,7 @@ from verbs import run_verb
 import pipeline as slip
 from pipeline.cli.screen import format_run
 from pipeline.estimation.diagnosis_lines import format_stored
-from pipeline.estimation.verdict import format_verdict, rank_effects
-from pipeline.report.scene import RunReport
+from pipeline.estimation.verdict import format_verdict
 from pipeline.simulate import simulate_case
 from pipeline.web.stored_runs import summarize_run as describe_in_workbench
 
@@ -49,57 +47,3 @@ def test_every_face_shows_the_same_verdict(run: slip.Run) -> None:
     assert run.report is not None
     for page in (run.report, results / "index.html"):
         assert f">{html.escape(verdict)}</p>" in page.read_text()
-
-
-def test_effects_stand_in_one_order_on_every_face(run: slip.Run) -> None:
-    stored = json.loads(run.manifest.path("diagnosis.json").read_text())
-    effects = {effect["id"]: effect for effect in stored["effects"]}
-    ids = [*rank_effects(stored["ladder"])]
-    assert ids == [*effects] == ["effective_track", "drive_lag"]
-    assert [step["effects"] for step in stored["ladder"][:2]] == [[], ids[:1]]
-    screen, page = format_stored(stored), RunReport(run.summary, diagnosis=stored)
-    assert [entry["id"] for entry in page.effects[0]] == ids
-    for shown in (
-        [run.verdict.index(effects[name]["clause"]) for name in ids],
-        [screen.index(f" {name}  ") for name in ids],
-    ):
-        assert shown == sorted(shown)
-
-
-def test_the_short_screen_has_one_slip_and_one_interval_a_number(run: slip.Run) -> None:
-    short = format_run(run.summary, unchanged=False)
-    whole = format_run(run.summary, unchanged=False, everything=True)
-    labels = [line.split()[0] for line in short.splitlines()[2:] if not line.startswith(" ")]
-    assert labels == ["slip", "effects", "remaining", "next", "report"]
-    # The verdict comes before any slip, and that is defined once.
-    assert short.count("m/s from") == 2
-    assert "window norm" not in short
-    assert "expected range between runs" not in short
-    for word in (
-        "window norm",
-        "expected range between runs",
-        "\nwhere ",
-        "\nbudget ",
-        "\nlimits ",
-        "\ntopics ",
-    ):
-        assert word in whole
-    assert set(short.splitlines()) < set(whole.splitlines())
-
-
-def test_a_vehicle_that_stands_is_refused_in_the_first_line(tmp_path: Path) -> None:
-    log = simulate_case(
-        None, {"wheel_radius": 0.0}, out=tmp_path / "field" / "run.mcap", duration_s=40.0, vehicle="husky"
-    )
-    for more in ((), ("--no-diagnosis",)):
-        done = run_verb("analyze", log, "--out", tmp_path / "results", "--no-report", *more)
-        first, head, *rest = done.stdout.splitlines()
-        assert first.startswith("The vehicle does not move: ")
-        assert first.endswith(" No effect can be estimated.")
-        assert head.startswith("field/run ")
-        # The poses' noise is no distance, and the verdict is as grave as the report says.
-        assert head.endswith("40 s    log complete, 1 error")
-        # No number that means nothing, and nothing twice.
-        assert not any(line.startswith(("slip ", "effects")) for line in rest)
-        assert done.stdout.lower().count("does not move") == 1
-        assert f"next      slip inspect {log}" in rest

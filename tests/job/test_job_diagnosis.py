@@ -10,7 +10,6 @@ import pytest
 
 from pipeline.job import Options, run_results
 from pipeline.job.analyze import Outcome, analyze_log
-from pipeline.models import find_effect
 from pipeline.simulate import simulate_case
 
 
@@ -50,43 +49,6 @@ def test_the_ladder_and_the_diagnosis_are_kept(wide: tuple[Outcome, Path, Path])
     assert rungs["r_mrmse"][1] < 0.3 * rungs["r_mrmse"][0]
 
 
-def test_the_budget_and_the_estimates_are_those_of_the_diagnosis(wide: tuple[Outcome, Path, Path]) -> None:
-    outcome, _, _ = wide
-    diagnosis = outcome.summary["diagnosis"]
-    budget = outcome.manifest.read("budget")
-    for told in diagnosis["budget"]:
-        own = budget.filter(pl.col("input") == told["input"], pl.col("quantity") == told["quantity"])
-        assert own["share"].sum() == pytest.approx(1.0, abs=1e-4)
-        assert own["mean_square"].sum() == pytest.approx(told["total"], rel=1e-4)
-        assert own.filter(pl.col("kind") == "effect")["name"].to_list() == [
-            share["effect"] for share in told["shares"]
-        ]
-    ideal = diagnosis["ladder"][0]
-    (position,) = [
-        told["total"]
-        for told in diagnosis["budget"]
-        if (told["input"], told["quantity"]) == (diagnosis["input"], "position")
-    ]
-    assert position == pytest.approx(ideal["t_mrmse_m"] ** 2, rel=1e-4)
-    (line,) = [text for label, text in diagnosis["lines"] if label == "budget"]
-    assert "effective_track" in line
-
-    estimates = outcome.manifest.read("estimates")
-    named = estimates.filter("named", pl.col("input") == diagnosis["input"])
-    assert named["effect"].to_list() == ["effective_track"]
-    assert named["value"].item() == pytest.approx(
-        diagnosis["effects"][0]["parameters"]["k"]["value"], rel=1e-5
-    )
-    quiet = estimates.filter(~pl.col("named"))
-    neutral = {name: find_effect(name)().parameters[0].neutral for name in quiet["effect"].unique().to_list()}
-    off = quiet.with_columns(
-        pl.col("effect").replace_strict(neutral, return_dtype=pl.Float64).alias("neutral")
-    )
-    z = (off["value"] - off["neutral"]) / off["standard_error"]
-    assert quiet.height > 5
-    assert z.abs().median() < 2.0
-
-
 def test_a_diagnosis_is_not_made_twice(wide: tuple[Outcome, Path, Path]) -> None:
     outcome, log, out = wide
 
@@ -105,15 +67,6 @@ def test_a_log_too_short_to_diagnose_has_its_slip(tmp_path: Path) -> None:
     diagnosis = outcome.summary["diagnosis"]
     assert diagnosis["effects"] == []
     assert diagnosis["findings"]
-
-
-def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
-    log = simulate_case("husky_in_the_air", out=tmp_path / "air.mcap", duration_s=60.0)
-    diagnosis = analyze(log, tmp_path / "out").summary["diagnosis"]
-
-    assert diagnosis["effects"] == []
-    assert diagnosis["undecided"] == []
-    assert "not_moving" in [finding["id"] for finding in diagnosis["findings"]]
 
 
 def test_a_new_effect_asks_for_a_new_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import polars as pl
-import pyarrow.parquet as pq
 import pytest
 from verbs import run_verb
 
@@ -132,20 +131,6 @@ def test_without_a_diagnosis_there_is_no_model(
     assert without.summary["by_input"]["command"]["median_residual_modulus"] is None
 
 
-def test_lengths_of_the_ideal_model_stand_in_the_file(known: Outcome) -> None:
-    metadata = pq.read_schema(known.manifest.path("slip")).metadata
-    facts = {key.decode(): value.decode() for key, value in metadata.items()}
-    vehicle = known.manifest.part("vehicle")
-    assert facts.pop("contract") == "slip"
-    assert int(facts.pop("contract_version")) >= 3
-    assert {name: float(value) for name, value in facts.items()} == {
-        "length_scale_m": 1.0,
-        "wheel_radius_m": vehicle["wheel_radius_m"],
-        "track_width_m": vehicle["track_width_m"],
-        "wheelbase_m": vehicle["wheelbase_m"],
-    }
-
-
 def test_a_diagnosis_of_stored_results_fills_them(known: Outcome, log: Path, tmp_path: Path) -> None:
     plain = analyze(log, tmp_path, diagnosis=False, report=True)
     told = run_verb("diagnose", plain.manifest.run, "--results", tmp_path, "--json")
@@ -161,19 +146,3 @@ def test_a_diagnosis_of_stored_results_fills_them(known: Outcome, log: Path, tmp
     again = run_verb("diagnose", plain.manifest.run, "--results", tmp_path, "--json")
     assert json.loads(again.stdout) == json.loads(told.stdout)
     assert Store(tmp_path).manifest(plain.manifest.run) == filled
-
-
-def test_a_named_model_stays(known: Outcome, log: Path, tmp_path: Path) -> None:
-    model = tmp_path / "track.toml"
-    model.write_text(
-        'format = 1\n[vehicle]\npreset = "husky_a200"\n\n[[effect]]\nid = "effective_track"\n'
-        'k = { value = 3.0, unit = "1" }\n'
-    )
-    named = analyze(log, tmp_path, model=model).manifest.read("slip")
-    assert named["model_w"].to_list() != known.manifest.read("slip")["model_w"].to_list()
-    plain = analyze(log, tmp_path, model=model, diagnosis=False).manifest
-    assert plain.read("slip").equals(named)
-    assert run_verb("diagnose", plain.run, "--results", tmp_path).returncode == 0
-    kept = Store(tmp_path).manifest(plain.run)
-    assert kept is not None
-    assert kept.read("slip").equals(named)

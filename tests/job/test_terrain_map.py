@@ -12,9 +12,9 @@ import polars as pl
 import pytest
 from verbs import run_verb
 
-from pipeline.job import JobError, Options
+from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.terrain_map import Beside, describe_terrain, draw_up_terrain, locate_on_earth, read_beside
+from pipeline.job.terrain_map import Beside, draw_up_terrain, locate_on_earth, read_beside
 from pipeline.simulate import (
     PLATFORMS,
     VEHICLES,
@@ -150,24 +150,6 @@ def test_hills_lean_the_vehicle_and_flat_poses_say_nothing_of_it(tmp_path: Path)
     assert np.median(cells["lean"].to_numpy()) == pytest.approx(0.1, abs=0.01)
 
 
-def test_what_is_no_cell_is_refused(earth: Path) -> None:
-    with pytest.raises(JobError, match=r"a cell of 0\.01 m is not possible"):
-        draw_up_terrain(Store(earth / "results"), cell_m=0.01)
-    assert "Add --terrain" in run_verb("fleet", "map", "--cell", 3, "--results", earth / "results").stderr
-
-
-def test_an_option_of_the_other_map_is_refused(tmp_path: Path) -> None:
-    for option, value in {
-        "--figures": "svg",
-        "--show": "energy",
-        "--shared": "x",
-        "--deployments": "x",
-    }.items():
-        shown = run_verb("fleet", "map", "--terrain", option, value, "--results", tmp_path)
-        assert f"{option} is of the map of deployments" in shown.stderr
-        assert shown.returncode == 1
-
-
 def test_a_run_too_fast_for_the_cells_is_named_and_alone_is_one_line(tmp_path: Path) -> None:
     results = tmp_path / "results"
     fast = record(tmp_path / "fast.mcap", vehicle=VEHICLES["warthog"], program=Program("circle"))
@@ -222,18 +204,6 @@ def test_poses_that_are_not_known_do_not_place_a_run(gone: slice) -> None:
     else:
         assert not isinstance(found, str)
         assert found.distance_m < 1e-3
-
-
-def test_places_come_back_from_the_plane() -> None:
-    position = np.random.default_rng(0).uniform(-20_000.0, 20_000.0, (50, 2))
-    latitude, longitude = from_local_plane(position, (46.78, -71.27))
-    both = [np.concatenate(([origin], values)) for origin, values in ((46.78, latitude), (-71.27, longitude))]
-    assert to_local_plane(*both, np.zeros(51))[1:, :2] == pytest.approx(position, abs=1e-3)
-
-
-def test_json_has_no_number_that_is_none(earth: Path) -> None:
-    text = json.dumps(describe_terrain(draw_up_terrain(Store(earth / "results"))), allow_nan=False)
-    assert json.loads(text)["cell_m"] == 2.0
 
 
 def test_compacted_ground_forgets_with_a_new_drive() -> None:

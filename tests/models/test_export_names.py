@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 from dataclasses import replace
@@ -181,17 +180,6 @@ def test_nothing_is_written_of_an_absurd_model(tmp_path: Path) -> None:
         assert not out.exists()
 
 
-def test_dates_and_odd_numbers_of_a_fit_are_json() -> None:
-    values = "a = 2026-01-02\nb = 2026-01-02T03:04:05Z\nc = 03:04:05\nd = [nan, inf, { e = 2026-01-02 }]\n"
-    file = parse_model(f'[vehicle]\npreset = "husky_a200"\n[fit]\n{values}', Path("m.toml"))
-    assert json.loads(export_model(file, "json"))["fit"] == {
-        "a": "2026-01-02",
-        "b": "2026-01-02T03:04:05+00:00",
-        "c": "03:04:05",
-        "d": [None, None, {"e": "2026-01-02"}],
-    }
-
-
 def write_own(folder: Path, text: str) -> Path:
     path = folder / "vesc.yaml"
     path.write_text(f"speed_to_erpm_gain: 5000.0\n{text}\n", encoding="utf-8")
@@ -214,20 +202,3 @@ def test_a_robots_own_file_is_read_whatever_else_stands_in_it(tmp_path: Path, te
     found = read_current(write_own(tmp_path, text), "vesc")
     assert found["speed_to_erpm_gain"] == 5000.0
     assert export_model(make(vehicle=CAR), "vesc", GAINS | found)
-
-
-@pytest.mark.parametrize(
-    "text", ["a: &a {b: *a, c: [*a]}", "{a: " * 3000, "a: " + "[" * 3000, "a: 1\n--- b", "\x00", "- 1", "1"]
-)
-def test_a_file_that_is_no_yaml_is_refused_in_one_line(tmp_path: Path, text: str) -> None:
-    with pytest.raises(MotionError) as caught:
-        read_current(write_own(tmp_path, text), "vesc")
-    assert caught.value.code == "parameters_unreadable"
-    assert "\n" not in str(caught.value)
-
-
-def test_other_parameters_of_a_robot_may_be_any_number(tmp_path: Path) -> None:
-    path = tmp_path / "rover.params"
-    rows = ("RO_MAX_THR_SPEED\t2.5\t9", "CAL_ACC0_ID\t2147483647\t6", "RA_OTHER\tnan\t9")
-    path.write_text("".join(f"1\t1\t{row}\n" for row in rows), encoding="utf-8")
-    assert export_model(make(find_effect("wheel_radius")(k=0.97)), "px4", read_current(path, "px4"))

@@ -9,7 +9,6 @@ from motion_runs import align, extract, make_scenario, simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.parts import WheelPart
-from pipeline.estimation.problem import average_sustained, measure_exceeded
 from pipeline.models import Place, find_effect, list_effects
 from pipeline.models.parameter import OVERSHOOT
 from pipeline.run import load_run
@@ -27,17 +26,6 @@ def test_a_limit_is_searched_above_what_wheels_exceed() -> None:
     assert number.bounds[0] == pytest.approx(problem.exceeded["wheel"] / OVERSHOOT)
     (lag,) = part.list_free(problem.start_state([find_effect("drive_lag")(tau=0.3)]))
     assert lag.bounds[0] == 0.0
-
-
-def test_of_several_runs_the_fastest_counts() -> None:
-    slow, fast = (simulate({"wheel_speed_limit": limit}, duration_s=40.0) for limit in (3.0, 4.0))
-    assert measure_exceeded([fast, slow], HUSKY)["wheel"] == pytest.approx(4.0, rel=0.03)
-
-
-def test_four_wheels_are_said_to_exceed_no_more_than_their_sides_prove() -> None:
-    """A limit of 10 rad/s was refused: wheels made of the sides and the sideways speed reached 14."""
-    run = simulate({"wheel_speed_limit": 10.0}, vehicle=VEHICLES["youbot"], duration_s=60.0)
-    assert 5.0 < measure_exceeded([run], vehicle_of("youbot"))["wheel"] <= 10.2
 
 
 @pytest.mark.parametrize(
@@ -83,15 +71,6 @@ def test_after_a_gap_a_car_goes_on_with_the_measured_steering(name: str, values:
     error, size = rates[1][1][after] - expected, np.sqrt(np.mean(expected**2))
     assert np.abs(steering[np.searchsorted(times, end)]) > 0.1
     assert np.sqrt(np.mean(error**2)) < 0.05 * size
-
-
-def test_one_wrong_reading_is_no_speed_that_lasts() -> None:
-    times, signal = np.arange(0.0, 10.0, 0.05), np.full(200, 4.0)
-    signal[100] = 9.0
-    assert average_sustained(times, signal).max() == pytest.approx(4.5)
-    # No stretch is taken across a gap.
-    gap = np.where(times > 5.0, times + 3.0, times)
-    assert average_sustained(gap, signal).size == average_sustained(times, signal).size - 9
 
 
 @pytest.mark.parametrize("name", ["drive_gain", "gain_drift", "difference_gain", "side_gain"])

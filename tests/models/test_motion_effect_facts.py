@@ -9,11 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.models import Effect, catalogue, list_effects
+from pipeline.models import Effect, list_effects
 from pipeline.models.catalogue import find_late_effect, format_effect
 from pipeline.models.effect import Late
 from pipeline.models.parameter import Conditions, Largest, is_of_one_run
-from pipeline.run import MotionError
 
 EFFECTS = list_effects()
 BY_ID = {effect.id: effect for effect in EFFECTS}
@@ -57,20 +56,6 @@ def test_no_generic_file_knows_an_effect() -> None:
         if (name := str(path.relative_to(SOURCES)))
     }
     assert {path: lines for path, lines in knowing.items() if lines} == {}
-
-
-def test_an_effect_that_a_file_knows_is_seen(tmp_path: Path) -> None:
-    file = tmp_path / "knows.py"
-    file.write_text(
-        '"""A lag, as in drive_lag."""\n'
-        "from pipeline.models.effects.turn_lag import TurnLag\n"
-        "SLOW = {'drive_lag', TurnLag.id}\n",
-        encoding="utf-8",
-    )
-    assert list_mentions(file) == [
-        "line 2: imports pipeline.models.effects.turn_lag.TurnLag",
-        "line 3: 'drive_lag'",
-    ]
 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=list(BY_ID))
@@ -131,26 +116,3 @@ def test_parts_that_are_found_together_make_the_whole() -> None:
     joined = whole.join({name: BY_ID[name](**dict([value])) for name, value in values.items()})
     assert joined.searched_as == values.keys()
     assert list(joined.values.values()) == [-0.1, -0.2]
-
-
-def test_of_two_places_of_a_change_only_the_one_that_is_given_counts() -> None:
-    change = next(effect for effect in EFFECTS if any(p.instead_of for p in effect.parameters))
-    instead = next(p for p in change.parameters if p.instead_of)
-    for given, idle in ((instead.name, instead.instead_of), (instead.instead_of, instead.name)):
-        effect = change(**{given: 10.0})
-        assert effect.is_used(effect.parameter(given))
-        assert not effect.is_used(effect.parameter(idle))
-
-
-def test_two_effects_of_one_id_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    class Copy(Effect):
-        id = "drive_lag"
-
-    found = catalogue._effects_of
-    monkeypatch.setattr(
-        catalogue,
-        "_effects_of",
-        lambda module: [Copy] if module.__name__.endswith("turn_lag") else found(module),
-    )
-    with pytest.raises(MotionError, match="have one id, drive_lag"):
-        list_effects.__wrapped__()

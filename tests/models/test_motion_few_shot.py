@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,12 +12,9 @@ from motion_runs import simulate, vehicle_of
 from pipeline.cli import main
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, score
 from pipeline.estimation.across_runs import fit_with_prior, tie_to_prior
-from pipeline.estimation.state import Prior
-from pipeline.job.prediction import weigh_runs
 from pipeline.models import Model, find_effect, read_model
 from pipeline.run import MotionError
 from pipeline.run.windows import cut_run, find_driven
-from pipeline.store import Store
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -52,15 +48,6 @@ def test_a_run_is_cut_by_how_long_it_was_driven(run: MotionRun) -> None:
     assert times[0].max() <= at <= times[1].min()
     with pytest.raises(MotionError, match="not for 500 s"):
         find_driven(run, 500.0)
-
-
-def test_standing_is_not_driving(run: MotionRun) -> None:
-    assert run.commands is not None
-    waits = run.commands.times < run.commands.times[0] + 30.0
-    still = {name: np.where(waits, 0.0, getattr(run.commands, name)) for name in ("left", "right")}
-    commands = type(run.commands)(run.commands.times, still["left"], still["right"], run.commands.steering)
-    waiting = type(run)(**{**vars(run), "commands": commands})
-    assert find_driven(waiting, 5.0) > find_driven(run, 5.0) + 20.0
 
 
 def test_what_is_known_counts_while_little_was_driven_and_the_run_afterwards(run: MotionRun) -> None:
@@ -97,15 +84,6 @@ def test_the_posterior_is_narrower_than_the_prior_and_holds_the_truth(run: Motio
         assert item.low < truth < item.high
 
 
-def test_the_whole_problem_is_as_it_was(run: MotionRun) -> None:
-    problem = problem_of(run)
-    before = fit_model(problem, MODEL, exact=True).model
-    tied = tie_to_prior(problem, MODEL, KNOWN)
-    assert fit_model(problem, MODEL, exact=True).model == before
-    assert not problem.parts[0].prior.numbers
-    assert tied.parts[0].prior.excess >= 1.0
-
-
 def test_with_a_prior_a_few_seconds_predict_the_rest_no_worse() -> None:
     fresh = Model(HUSKY, tuple(find_effect(effect.id)() for effect in MODEL))
     errors = []
@@ -119,20 +97,6 @@ def test_with_a_prior_a_few_seconds_predict_the_rest_no_worse() -> None:
     few, alone, ideal = np.mean(errors, axis=0)
     assert few <= alone
     assert few < 0.2 * ideal
-
-
-def test_a_run_that_is_unlike_the_others_in_one_number_is_held_less_in_all(run: MotionRun) -> None:
-    problem = problem_of(run)
-    prior = Prior(KNOWN, excess=3.0)
-    held = []
-    for k in (1.75, 2.4):
-        state = problem.start_state(MODEL.swap(find_effect("effective_track")().change(k=k)).effects)
-        free = [number for number in state.list_free((), ()) if number.label in KNOWN]
-        held.append(prior.weigh(state, free)[1])
-        for place, number in enumerate(free):
-            costs = [prior.cost(state.set(number, state.get(number) + step), free) for step in (-1e-5, 1e-5)]
-            assert prior.pull(state, free)[place] == pytest.approx((costs[0] - costs[1]) / 4e-5, abs=1e-3)
-    assert held[1] < 0.2 * held[0]
 
 
 def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
@@ -160,78 +124,6 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_deployment_is_predicted_and_written(fleet: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    known = str(fleet / "results")
-    file = fleet / "tile.toml"
-    chosen = ("fleet", "predict", "--vehicle", "husky_a200", "--results", known, "--input", "measured")
-    code, out, _ = run_slip(capsys, *chosen, "--terrain", "tile", "--file", str(file), "--json")
-    told = json.loads(out)
-    assert code == 0
-    (effect,) = told["effects"]
-    k = effect["parameters"]["k"]
-    assert effect["id"] == "effective_track"
-    assert k["low"] < 1.74 < k["value"] < 1.86 < k["high"]
-    assert told["runs_on_terrain"] == len(told["runs_used"]) == 3
-    for key in ("t_mrmse_m", "ideal_t_mrmse_m", "median_modulus"):
-        assert 0.0 < told[key]["low"] < told[key]["value"] < told[key]["high"]
-    assert told["t_mrmse_m"]["value"] < 0.5 * told["ideal_t_mrmse_m"]["value"]
-    written = read_model(file)
-    assert written.model.effect("effective_track").values["k"] == pytest.approx(k["value"], rel=1e-5)
-    assert written.intervals["effective_track.k"] == pytest.approx((k["low"], k["high"]), rel=1e-4)
-
-    elsewhere = json.loads(run_slip(capsys, *chosen, "--terrain", "ice", "--json")[1])
-    other = elsewhere["effects"][0]["parameters"]["k"]
-    assert other["high"] - other["low"] > k["high"] - k["low"]
-    assert (elsewhere["runs_on_terrain"], elsewhere["runs_elsewhere"]) == (0, 3)
-    assert elsewhere["notes"] == [
-        ("no run is on ice: the prediction is for another terrain, from runs on tile. Known: tile")
-    ]
-    assert told["notes"] == []
-    typo = run_slip(capsys, *chosen, "--terrain", "tille")[1].splitlines()
-    assert typo[0] == "husky_a200 on tille: 0 runs there, 3 elsewhere"
-    assert typo[1].startswith("! no run is on tille: the prediction is for another terrain")
-    assert "Did you mean tile?" in typo[1]
-    text = run_slip(capsys, *chosen, "--terrain", "tile")[1]
-    assert "position error over 2 s" in text
-    assert "that of the ideal model" in text
-    assert "husky_a200 on tile: 3 runs there, 0 elsewhere" in text
-    assert "effective_track.k" in text
-
-    code, _, error = run_slip(
-        capsys, "fleet", "predict", "--vehicle", "jackal", "--terrain", "tile", "--results", known
-    )
-    assert (code, error.count("\n")) == (1, 1)
-    assert "husky_a200" in error
-
-
-def test_a_run_with_a_damaged_table_is_left_out_and_named_by_all_of_the_fleet(
-    fleet: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    known = tmp_path / "results"
-    shutil.copytree(fleet / "results", known)
-    damaged = Store(known).manifests()[1]
-    path = damaged.path("poses")
-    path.write_bytes(path.read_bytes()[:1000])
-    why = "the table poses cannot be read: it has changed since it was written"
-    note = f"left out, {why}; analyze the log again with --force: {damaged.run}"
-    there = ("--vehicle", "husky_a200", "--terrain", "tile", "--input", "measured")
-    for words in (("fit",), ("predict", *there), ("trend",)):
-        code, out, error = run_slip(capsys, "fleet", *words, "--results", str(known), "--json")
-        assert (code, error) == (0, "")
-        assert note in json.loads(out)["notes"]
-        assert f"! {note}" in run_slip(capsys, "fleet", *words, "--results", str(known))[1]
-    asked = ("export", damaged.run, "--to", "csv", "--file", str(tmp_path / "csv"))
-    code, out, error = run_slip(capsys, *asked, "--results", str(known))
-    assert (code, out) == (1, "")
-    assert error.endswith(f"/poses.parquet: {why}. Analyze the log again with --force.\n")
-    assert [one.name for one in tmp_path.iterdir()] == ["results"]
-    path.unlink()
-    code, out, error = run_slip(capsys, "fleet", "predict", *there, "--results", str(known), "--json")
-    assert (code, error) == (0, "")
-    gone = "left out, the file poses.parquet of the results is gone; slip results verify"
-    assert [note for note in json.loads(out)["notes"] if note.startswith(gone)]
-
-
 def test_a_few_seconds_are_fitted_with_the_fleet_before(
     fleet: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -249,28 +141,3 @@ def test_a_few_seconds_are_fitted_with_the_fleet_before(
     again = json.loads(run_slip(capsys, "model", "fit", *on, "--first", "6s", "--prior", "fleet")[1])
     assert again["prior"]["effective_track.k"]["value"] != 1.0
     assert again["model"] is None
-
-
-@pytest.mark.parametrize(
-    ("more", "words"),
-    [
-        (("--first", "soon"), "is not a duration"),
-        ((), "no model file was given"),
-        (("--first", "900s", "--prior", "fleet"), "not for 900 s"),
-    ],
-)
-def test_what_cannot_be_fitted_is_said_in_one_line(
-    fleet: Path, capsys: pytest.CaptureFixture[str], more: tuple[str, ...], words: str
-) -> None:
-    on = ("--on", str(fleet / "run_0.mcap"), "--out", str(fleet / "results"), "--quiet")
-    code, _, error = run_slip(capsys, "model", "fit", *on, *more)
-    assert code == 1
-    assert words in error.splitlines()[-1]
-
-
-def test_few_runs_on_a_terrain_leave_it_open_how_it_will_be_driven() -> None:
-    one, five = weigh_runs(np.array([True, False, False])), weigh_runs(np.array([True] * 5 + [False]))
-    assert one.tolist() == pytest.approx([0.5, 0.25, 0.25])
-    assert five.tolist() == pytest.approx([1 / 6] * 6)
-    for alike in (np.ones(4, dtype=bool), np.zeros(4, dtype=bool)):
-        assert weigh_runs(alike).tolist() == [0.25] * 4

@@ -1,10 +1,6 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -52,41 +48,12 @@ def test_a_lag_of_a_step_is_the_exponential_of_the_textbook() -> None:
     assert np.allclose(lagged, np.diff(area) / STEP, atol=1e-12)
 
 
-def test_a_lag_without_time_constant_is_its_input_itself() -> None:
-    signal = np.linspace(0.0, 1.0, 9)
-    assert lag_signal(signal, 0.0, STEP, resets_at([0], 9, [5.0]), np.array([5.0])) is signal
-
-
 def test_a_state_begins_anew_at_a_reset_and_carries_nothing_over() -> None:
     size, tau = 300, 0.5
     signal = np.concatenate((np.full(150, 4.0), np.zeros(150)))
     whole = lag_signal(signal, tau, STEP, resets_at([0, 150], size, [0.0, 1.0]), np.array([0.0, 1.0]))
     second = lag_signal(signal[150:], tau, STEP, resets_at([0], 150, [1.0]), np.array([1.0]))
     assert np.allclose(whole[150:], second, atol=1e-12)
-
-
-def test_an_unknown_state_is_the_input_s_own_value() -> None:
-    signal = np.concatenate((np.full(100, 3.0), np.full(100, -2.0)))
-    unknown = np.array([np.nan, np.nan])
-    lagged = lag_signal(signal, 0.4, STEP, resets_at([0, 100], 200, [np.nan, np.nan]), unknown)
-    assert np.allclose(lagged, signal, atol=1e-12)
-
-
-def test_a_state_that_is_set_later_than_its_reset_begins_with_the_input_until_then() -> None:
-    rng, size, tau, first, at = np.random.default_rng(4), 90, 0.08, np.array([0, 40]), np.array([0, 46])
-    signal = rng.normal(size=size) + 1j * rng.normal(size=size)
-    start = np.array([complex(np.nan, np.nan), 2.0 - 1.0j])
-    number = np.searchsorted(first, np.arange(size), side="right") - 1
-    found = lag_signal(signal, tau, STEP, Resets(number, first, at, np.zeros((2, 1))), start)
-    decay = np.exp(-STEP / tau)
-    share = tau / STEP * (1.0 - decay)
-    for cell in range(size):
-        if cell in (0, 40):
-            value = signal[cell]
-        if cell == 46:
-            value = start[1]
-        assert found[cell] == pytest.approx(signal[cell] + share * (value - signal[cell]), abs=1e-12)
-        value = signal[cell] + decay * (value - signal[cell])
 
 
 def test_what_fades_for_long_ends_at_nothing_and_not_among_the_smallest_numbers() -> None:
@@ -132,29 +99,6 @@ def test_held_commands_keep_their_area_wherever_their_stamps_fall(gaps: list[flo
     assert held.sum() * STEP == pytest.approx(float(np.sum(values * np.diff(inside))), abs=1e-9)
     assert held.min() >= values.min() - 1e-9
     assert held.max() <= values.max() + 1e-9
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_a_ramp_begins_with_the_command_and_not_with_the_cell(seed: int) -> None:
-    """Ramps that began with the cell made limits .5 to 2 % too small, beyond their intervals."""
-    rng = np.random.default_rng(seed)
-    cells, fine, limit = 200, 200, 2.0
-    at = (16.0 * np.arange(12) + rng.uniform(2.0, 15.0, 12)) * STEP
-    held = rng.uniform(-1.0, 1.0, 13)[np.searchsorted(at, (np.arange(cells * fine) + 0.5) * STEP / fine)]
-    most, value, inside = limit * STEP / fine, held[0], np.empty(held.size)
-    for place, target in enumerate(held.tolist()):
-        value += max(-most, min(target - value, most))
-        inside[place] = value
-    means = [one.reshape(cells, fine).mean(axis=1) for one in (held, inside)]
-    limited = limit_rate(means[0], limit, STEP, resets_at([0], cells, [held[0]]), np.array([held[0]]))
-    assert np.abs(limited - means[1]).max() < 0.02 * limit * STEP
-
-
-def test_a_step_within_rounding_of_a_cell_s_begin_is_limited() -> None:
-    """No time remains before it, and nothing divided by nothing is no number."""
-    signal = np.array([-9.0, -9.0, np.nextafter(1.0, 0.0), 1.0, 1.0])
-    limited = limit_rate(signal, 10.0, STEP, resets_at([0], 5, [-9.0]), np.array([-9.0]))
-    assert limited == pytest.approx([-9.0, -9.0, -8.975, -8.925, -8.875])
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -236,24 +180,6 @@ def test_a_lag_within_a_rate_agrees_with_stepping_through_it(
     assert np.allclose(lagged, expected, atol=0.02)
 
 
-def test_a_lag_within_a_rate_is_a_lag_or_a_ramp() -> None:
-    signal = np.repeat(np.random.default_rng(1).uniform(-3.0, 3.0, 30), 25)
-    signal[100:110] += 0.3
-    resets = resets_at([0, 300], signal.size, [0.5, np.nan])
-    start = resets.start[:, 0]
-    plain = lag_signal(signal, 0.3, STEP, resets, start)
-    assert np.array_equal(lag_within(signal, 0.3, math.inf, STEP, resets, start), plain)
-    ramp = limit_rate(signal, 10.0, STEP, resets, start)
-    assert np.allclose(lag_within(signal, 0.0, 10.0, STEP, resets, start), ramp, atol=1e-6)
-
-
-def test_with_equal_time_constants_an_uneven_lag_is_a_lag() -> None:
-    signal = np.repeat(np.random.default_rng(1).uniform(-3.0, 3.0, 30), 25)
-    resets = resets_at([0, 300], signal.size, [0.5, np.nan])
-    plain = lag_signal(signal, 0.3, STEP, resets, resets.start[:, 0])
-    assert np.allclose(lag_unevenly(signal, (0.3, 0.3), STEP, resets, resets.start[:, 0]), plain, atol=1e-9)
-
-
 def test_a_signal_waits_where_its_sign_changes_and_nowhere_else() -> None:
     signal = np.repeat([2.0, 0.0, 1.0, -1.0, 0.0, 3.0, -3.0], 10)
     resets = resets_at([0, 60], signal.size, [np.nan, np.nan])
@@ -271,57 +197,6 @@ def test_play_keeps_what_follows_within_half_of_it() -> None:
     assert np.allclose(follow_with_play(signal, 0.1, resets), [0.0, 0.2, 0.4, 0.4, 0.3, 0.1, -0.9, 1.0])
 
 
-def test_compiled_loops_and_plain_python_give_the_same_numbers() -> None:
-    code = """
-import numpy as np
-from pipeline.models.filters import follow_with_play, lag_signal, lag_unevenly, limit_rate
-from pipeline.run.signals import Resets
-signal = np.repeat(np.random.default_rng(1).normal(size=60), 20)
-none = np.array([np.nan, 0.3])
-resets = Resets(np.repeat([0, 1], 600), np.array([0, 600]), np.array([0, 610]), none[:, None])
-found = [
-    lag_signal(signal, 0.3, 0.02, resets, none),
-    lag_signal(signal + 1j * signal[::-1], 0.3, 0.02, resets, none + 0j).imag,
-    lag_unevenly(signal, (0.4, 0.1), 0.02, resets, none),
-    limit_rate(signal, 3.0, 0.02, resets, none),
-    follow_with_play(signal, 0.2, resets),
-]
-print(np.array(found).tobytes().hex())
-"""
-    compiled, plain = (
-        np.frombuffer(
-            bytes.fromhex(
-                subprocess.run(
-                    [sys.executable, "-c", code],
-                    env={**os.environ, "NUMBA_DISABLE_JIT": switch},
-                    check=True,
-                    capture_output=True,
-                    text=True,
-                ).stdout
-            )
-        )
-        for switch in ("0", "1")
-    )
-    assert compiled.size == 5 * 1200
-    assert np.allclose(compiled, plain, rtol=1e-13, atol=1e-13)
-
-
-def test_loops_are_compiled_where_nothing_can_be_kept(tmp_path: Path) -> None:
-    """An installation and a home that nobody can write to: compiled for this process alone."""
-    code = """
-import numpy as np
-from pipeline.models.filters import follow_with_play
-from pipeline.run.signals import Resets
-resets = Resets(np.zeros(2, dtype=int), np.zeros(1, dtype=int), np.zeros(1, dtype=int), np.zeros((1, 1)))
-print(follow_with_play(np.array([0.0, 1.0]), 0.25, resets)[1])
-"""
-    nowhere = {**os.environ, "NUMBA_CACHE_DIR": "/proc/nothing"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], cwd=tmp_path, env=nowhere, check=True, capture_output=True, text=True
-    )
-    assert done.stdout.strip() == "0.75"
-
-
 @pytest.mark.parametrize("damping", [0.2, 0.9999999, 1.0, 1.4])
 def test_a_swing_is_the_step_response_of_the_textbook(damping: float) -> None:
     size, tau = 400, 0.1
@@ -334,11 +209,6 @@ def test_a_swing_is_the_step_response_of_the_textbook(damping: float) -> None:
     ) / (poles[0] - poles[1])
     assert np.allclose(swung, np.diff(edges + moving.real) / STEP, atol=1e-6)
     assert (swung.max() > 1.001) == (damping < 0.9)
-
-
-def test_a_swing_without_a_time_constant_is_its_input_itself() -> None:
-    signal = np.linspace(0.0, 1.0, 9)
-    assert swing_signal(signal, 0.0, 0.3, STEP, resets_at([0], 9, [5.0]), np.array([5.0])) is signal
 
 
 @pytest.mark.parametrize("speed", [3.0, -3.0])

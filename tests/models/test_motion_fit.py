@@ -1,13 +1,11 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
 from motion_runs import WANDERING, simulate, vehicle_of
 
-from pipeline.core.arrays import count_freedom
 from pipeline.estimation import (
     Comparison,
     Input,
@@ -20,15 +18,12 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
-from pipeline.estimation.acceptance import find_idle
-from pipeline.estimation.comparison import HorizonErrors
 from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
 from pipeline.estimation.ladder import judge_model, judge_whole
 from pipeline.models import Model, Timing, find_effect
-from pipeline.run import MotionError
 from pipeline.run.heading import HeadingSource
-from pipeline.simulate import VEHICLES, Disturbance, Encoders, Imu, PoseSensor, Program
+from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Program
 
 HUSKY = vehicle_of("husky_a200")
 SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}
@@ -134,27 +129,6 @@ def test_without_a_gyro_the_poses_own_heading_serves() -> None:
     assert not Problem([with_gyro], HUSKY, Input.COMMAND, heading=HeadingSource.POSE).comparisons[0].has_gyro
 
 
-def test_an_effect_that_leaves_no_trace_says_so() -> None:
-    run = simulate({})
-    problem = Problem([run], HUSKY, Input.COMMAND)
-    fitted = fit_model(problem, model_of("slope_drift"))
-    item = estimate_intervals(problem, fitted).find("slope_drift.k")
-    assert not item.observable or item.half > 0.5
-
-
-def test_a_run_without_encoders_cannot_be_fed_with_them() -> None:
-    run = simulate({}, encoders=None)
-    with pytest.raises(MotionError) as caught:
-        Problem([run], HUSKY, Input.MEASURED)
-    assert caught.value.code == "no_measured"
-
-
-def test_a_run_that_is_too_short_says_how_much_is_needed() -> None:
-    run = simulate({}, duration_s=4.0)
-    with pytest.raises(MotionError, match="are needed"):
-        Problem([run], HUSKY, Input.COMMAND)
-
-
 @pytest.mark.parametrize("source", list(Input))
 def test_training_windows_keep_their_distance_from_tested_ones(source: Input) -> None:
     run = simulate(SKID)
@@ -191,47 +165,6 @@ def test_a_useless_effect_is_the_last_rung_and_is_said_not_to_lower_the_error_on
         assert dict(effect.values) == pytest.approx(
             dict(alone.model.effect(effect.id).values), rel=1e-3, abs=1e-5
         )
-
-
-def test_of_effects_that_act_alike_alone_the_one_that_does_more_is_the_lower_rung() -> None:
-    """Both change how far it turns by a share: the first on the path is not the first step for that."""
-    truth = {"difference_gain": 1.05, "effective_track": 1.8}
-    problem = Problem([simulate(truth)], HUSKY, Input.COMMAND)
-    ladder = climb(problem, model_of(*truth))
-    assert [step.effects for step in ladder.steps][1] == ("effective_track",)
-
-
-def test_the_next_rung_is_the_effect_that_lowers_the_error_over_2_s_most() -> None:
-    """A lag comes first on the path and raises the likelihood more; how far it turns decides after 2 s."""
-    truth = {"drive_lag": 0.3, "effective_track": 1.8}
-    problem = Problem([simulate(truth)], HUSKY, Input.COMMAND)
-    ladder = climb(problem, model_of(*truth))
-    assert [step.effects for step in ladder.steps][1] == ("effective_track",)
-
-
-def test_without_predictions_the_velocities_errors_order_the_rungs(monkeypatch: pytest.MonkeyPatch) -> None:
-    predict = Comparison.find_horizon_errors
-
-    def predict_nothing(self: Comparison, *args: Any, **named: Any) -> HorizonErrors:  # noqa: ANN401 - its own
-        nothing = np.full(predict(self, *args, **named).position.size, np.nan)
-        return HorizonErrors(nothing, nothing, nothing)
-
-    monkeypatch.setattr(Comparison, "find_horizon_errors", predict_nothing)
-    truth = {"drive_lag": 0.3, "effective_track": 1.8}
-    ladder = climb(Problem([simulate(truth)], HUSKY, Input.COMMAND), model_of("side_gain", *truth))
-    assert ladder.idle == ("side_gain",)
-    assert set(ladder.steps[2].effects) == set(truth)
-
-
-@pytest.mark.parametrize("others", [(), ("deadband",)])
-def test_of_effects_that_replace_each_other_one_serves_predictions(others: tuple[str, ...]) -> None:
-    problem = Problem([simulate({"drive_lag": 0.4, "effective_track": 1.8})], HUSKY, Input.COMMAND)
-    names = ("drive_lag", "side_lag", *others, "effective_track")
-    duties = dict.fromkeys(names, (Input.COMMAND,))
-    idle = find_idle(model_of(*names), {Input.COMMAND: problem}, duties, set(names) - {"effective_track"})
-    assert "effective_track" not in idle
-    assert len({"drive_lag", "side_lag"} & set(idle)) == 1
-    assert ("deadband" in idle) == bool(others)
 
 
 def test_every_rung_is_what_its_effects_are_as_a_model() -> None:
@@ -340,32 +273,6 @@ def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_no
     assert slips[1] > 0.1
     outside = predict_at(true, run, Input.COMMAND, np.array([-5.0, 1e6]))
     assert np.isnan(outside).all()
-
-
-def test_information_in_two_blocks_of_ten_is_that_of_two() -> None:
-    """Student's t knows what the blocks say of a number, not how many there are."""
-    alike = np.ones((10, 1, 1))
-    two = np.where(np.arange(10)[:, None, None] < 2, 1.0, 1e-3)
-    for normals, low, high in ((alike, 8.99, 9.01), (two, 1.0, 1.5)):
-        (freedom,) = count_freedom(normals, normals.sum(axis=0) - normals)
-        assert low <= freedom <= high
-
-
-def test_a_clock_of_the_encoders_widens_a_lag_by_what_they_share_alone() -> None:
-    """Encoders at 20 Hz may be 14 ms off: a delay is known no better, a lag is, for it has another shape."""
-    late_by = {}
-    for late in (0.0, 0.02):
-        run = simulate({"drive_lag": 0.4}, imu=None, encoders=Encoders(delay_s=late))
-        problem = Problem([run], HUSKY, Input.COMMAND)
-        lag = estimate_intervals(problem, fit_model(problem, model_of("drive_lag"), exact=True)).items[0]
-        assert lag.low <= 0.4 <= lag.high
-        late_by[late] = lag.half / 0.4
-    assert late_by[0.0] < 0.025
-    assert 0.03 < late_by[0.02] < 0.08
-    problem = Problem([simulate({"transport_delay": 0.2}, imu=None)], HUSKY, Input.COMMAND)
-    (delay,) = estimate_intervals(problem, fit_model(problem, model_of("transport_delay"), exact=True)).items
-    assert delay.low <= 0.2 <= delay.high
-    assert delay.half > 0.01
 
 
 def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import process_time
 
 import numpy as np
 import polars as pl
@@ -157,23 +156,6 @@ def test_a_base_that_stops_by_itself_does_not_keep_its_command(lasts_s: float, *
     assert bool(_report_expired(rims)) is is_kept
 
 
-def test_a_pause_of_the_recorder_is_no_incident() -> None:
-    """Nothing is recorded from while the vehicle drives until it stands: nobody saw it stop."""
-    program = Program("stop_and_go")
-    tables = extract(simulate_run(make_scenario(TRUTH, seed=3, duration_s=120.0, program=program)), HUSKY)
-    times, asked = tables["commands"]["t"].to_numpy(), tables["commands"]["left"].to_numpy()
-    live = np.abs(asked) > 0.5 * np.abs(asked).max()
-    start = next(t for t in times[live] if t > 20.0 and live[(times > t - 1.0) & (times <= t)].all())
-    end = next(t for t in times if t > start + 8.0 and not asked[(times > t - 2.0) & (times <= t)].any())
-    gone = pl.col("t").is_between(start, end, closed="right")
-    paused = {name: table.filter(~gone) if "t" in table.columns else table for name, table in tables.items()}
-    paused["commands"] = paused["commands"].filter((pl.col("t") <= start) | (pl.col("t") > end + 0.3))
-    later = (pl.col("t") > start).cast(pl.Int32)
-    paused["poses"] = paused["poses"].with_columns(segment=pl.col("segment") + later)
-    findings = align_tables(paused, HUSKY, hold_s=None, body_commanded=False, where="simulated").findings
-    assert not [one for one in findings if one.id in INCIDENTS]
-
-
 @pytest.mark.long
 def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
     missed, more = [], 0
@@ -204,11 +186,6 @@ def test_what_a_vehicle_always_does_is_no_incident(effects: dict[str, object]) -
     for seed, program in enumerate(("drive_steps", "stop_and_go", "smooth")):
         made = simulate_run(make_scenario(effects, seed=seed, duration_s=180.0, program=Program(program)))
         assert find(made) == []
-
-
-def test_a_vehicle_that_never_moves_has_no_incident_but_the_checks() -> None:
-    made = simulate_run(make_scenario({}, incidents=(Incident("emergency_stop", 0.0, 200.0),)))
-    assert find(made) == []
 
 
 def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
@@ -279,28 +256,6 @@ def test_recordings_have_less_than_one_false_alarm_an_hour(shared_logs: Path, tm
             if count != KNOWN.get((log.stem, kind), 0):
                 false.append((log.stem, kind, count))
     assert len(false) < seconds / 3600.0, false
-
-
-def test_thousands_of_incidents_take_seconds() -> None:
-    """Ten hours at 20 Hz, every fourth second another contradiction: what is compared does not grow."""
-    times = np.arange(0.0, 36_000.0, 0.05)
-    turn = (times % 8.0 < 4.0).astype(float)
-    body = np.where(times % 16.0 < 8.0, turn, 0.0)
-    still = np.zeros(times.size)
-    velocity = np.column_stack((turn, still, still))
-    known = np.ones(times.size, dtype=bool)
-    inputs = {
-        "command": Ideal(np.roll(velocity, 40, axis=0), ~known, known),
-        "measured": Ideal(velocity, ~known, known),
-    }
-    tables = {
-        "poses": pl.DataFrame({"t": times, "held": times % 16.0 > 9.0}),
-        "commands": pl.DataFrame({"t": times[::100], "active": known[::100]}),
-    }
-    velocities = pl.DataFrame({"t": times, "v_x": body, "v_y": still, "v_w": still})
-    begin = process_time()
-    find_incidents(velocities, tables, inputs, HUSKY, 0.5)
-    assert process_time() - begin < 10.0
 
 
 @pytest.mark.parametrize(("motion", "kinds"), [("sways", ["stuck"]), ("slides", [])])

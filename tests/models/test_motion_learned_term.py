@@ -13,7 +13,6 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-import pipeline as slip
 from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
 from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
 from pipeline.estimation.ladder import judge_model
@@ -21,22 +20,17 @@ from pipeline.estimation.learned_step import (
     ResidualData,
     add_term,
     check_bands,
-    explain_no_help,
-    judge_with_term,
     learn_beyond,
     learn_fold,
     learn_where_it_helps,
     leave_grounds_out,
     make_learned_step,
     regress,
-    regress_where_it_helps,
 )
-from pipeline.estimation.rivals import judge_rival
 from pipeline.export import export_model
-from pipeline.models import Model, ModelFile, Timing, find_effect, format_model, list_effects
+from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
 from pipeline.models.learned_term import INPUTS, Bands, InputProbe, LearnedInput, ResidualTerm
 from pipeline.models.model_file import parse_model
-from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
@@ -49,7 +43,6 @@ HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")
 TRACK = {"effective_track": {"k": 1.8}}
 SLOWED = {**TRACK, "turning_resistance": {"k": 0.25}}
-POISON = ResidualTerm([LearnedInput("v_x", 1.0, -9.0, 9.0, (5.0, 5.0, 5.0))])
 
 
 def make_problem(truth: object, **more: object) -> Problem:
@@ -108,35 +101,6 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     assert told["kept"] is False
     assert told["reason"] == "the remaining error is at the noise floor"
     assert told["term"] is None
-
-
-def test_an_error_that_rises_or_a_gain_within_chance_speaks_against_it(problem: Problem) -> None:
-    _, held = fit_track(problem)
-    stretches = np.repeat(np.arange(20), -(-held.position[0].size // 20))[: held.position[0].size]
-    better = replace(held, position=tuple(0.8 * one for one in held.position))
-    assert explain_no_help(held, better, stretches) == ""
-    assert explain_no_help(held, held, stretches) == "no error over 2 s falls by more than 1 %"
-    worse = replace(better, yaw=tuple(1.1 * one for one in held.yaw))
-    assert explain_no_help(held, worse, stretches) == "heading error rises by 10 %"
-    once = np.where(stretches == 7, 0.1, 1.0)
-    lucky = replace(held, position=tuple(one * once for one in held.position))
-    assert explain_no_help(held, lucky, stretches) == "the reduction is not significant"
-
-
-def test_what_was_learned_of_all_stretches_is_learned_anew_without_those_that_are_tested(
-    problem: Problem,
-) -> None:
-    fitted, _ = fit_track(problem)
-    honest = hold_out(problem, fitted, learn_fold(problem)).pooled
-    assert hold_out(problem, add_term(fitted, POISON)).pooled.t_mrmse_m > 2.0 * honest.t_mrmse_m
-    model = fitted.model + POISON
-    rival = judge_with_term(problem, "mine", model)
-    assert rival.read("t_mrmse_m") == pytest.approx(honest.t_mrmse_m, rel=1e-3)
-    assert rival.read("r_mrmse_rad") == pytest.approx(honest.r_mrmse_rad, rel=1e-3)
-    assert rival.numbers is not None
-    assert rival.numbers > 1
-    plain = judge_with_term(problem, "mine", fitted.model)
-    assert plain.held_out.pooled == judge_rival(problem, "mine", fitted.model).held_out.pooled
 
 
 def test_a_fold_is_learned_without_its_stretches(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -198,35 +162,6 @@ def test_the_regression_shrinks_noise_and_finds_what_is_there() -> None:
     assert np.linalg.norm(noise) < 0.5 * np.linalg.norm(plain)
 
 
-def test_inputs_that_are_all_zero_teach_nothing() -> None:
-    assert regress(np.zeros((20, 2)), np.ones(20)).tolist() == [0.0, 0.0]
-
-
-def test_one_stretch_alone_teaches_nothing_as_nothing_is_left_to_test_it() -> None:
-    inputs = np.linspace(-1.0, 1.0, 40)[:, None]
-    target = 0.5 * inputs[:, 0]
-    assert regress_where_it_helps(inputs, target, np.zeros(40, dtype=np.int64)).tolist() == [0.0]
-    (found,) = regress_where_it_helps(inputs, target, np.arange(40) % 2)
-    assert found == pytest.approx(0.5, rel=0.05)
-
-
-@pytest.mark.parametrize("size", [1, 3, 21])
-def test_nineteen_stretches_are_enough_for_a_band_however_many_errors_they_have(size: int) -> None:
-    errors = np.arange(19.0 * size)
-    number = np.repeat(np.arange(19), size)
-    bands = make_bands([Ratios("tile", errors, errors, number, number)], "of this run only")
-    assert bands is not None
-    assert bands.position == errors[-1]
-    rest = number < 18
-    few = Ratios("tile", errors[rest], errors[rest], number[rest], number[rest])
-    assert make_bands([few], "of this run only") is None
-
-
-def test_no_effect_of_the_catalogue_is_called_so() -> None:
-    assert "learned_term" not in {effect.id for effect in list_effects()}
-    assert isinstance(find_effect("learned_term")(), ResidualTerm)
-
-
 def make_term() -> ResidualTerm:
     inputs = [
         LearnedInput(name, 0.5 + number, -1.5, 1.5, (number / 64.0, -0.02, 0.03))
@@ -249,36 +184,6 @@ def test_a_model_file_holds_it_and_gives_it_back() -> None:
     assert format_model(ModelFile(model - "learned_term")) == format_model(
         replace(back, model=back.model - "learned_term")
     )
-
-
-ROW = '[[learned.input]]\nname = "v_x"\nscale = 1.0\nlow = -1.0\nhigh = 1.0\nadds = [0.0, 0.0, 0.1]\n'
-
-
-@pytest.mark.parametrize(
-    ("text", "what"),
-    [
-        (ROW.replace("v_x", "speed"), "'speed' cannot be an input"),
-        (ROW.replace("scale = 1.0", "scale = 0.0"), "needs a scale above 0"),
-        (ROW.replace("low = -1.0", "low = 2.0"), "a low that is not above its high"),
-        (ROW.replace("low = -1.0", "low = -inf"), "not a finite number"),
-        (ROW.replace("0.1]", "'a']"), "not a finite number"),
-        (ROW.replace("[0.0, 0.0, 0.1]", "[0.1]"), "not three numbers"),
-        (ROW + ROW, "each once"),
-        ("[learned]\nsecret = 1\n", "nothing else"),
-        ("[learned]\nbands = { position = 1.0 }\n", "bands of [learned] are"),
-        ("learned = 3\n", "nothing else"),
-        (ROW.replace('"v_x"', '["v_x"]'), "cannot be an input"),
-        (ROW + 'unit = "km/h"\n', "the unit of 'v_x' is m/s, not 'km/h'"),
-        ('[learned]\nbands = { position = -1.0, heading = 1.0, of = "runs" }\n', "below 0"),
-    ],
-)
-def test_a_wrong_table_is_refused_with_its_line(text: str, what: str) -> None:
-    head, tail = ("", text) if not text.startswith("learned") else (text, "")
-    with pytest.raises(MotionError) as caught:
-        parse_model(f'{head}[vehicle]\npreset = "husky_a200"\n{tail}', HERE)
-    assert caught.value.code == "learned_invalid"
-    assert what in caught.value.what
-    assert caught.value.where.startswith("model.toml:")
 
 
 def test_the_exported_function_adds_what_the_model_adds(problem: Problem) -> None:
@@ -320,17 +225,6 @@ def make_ratios(sizes: Sequence[float], group: str, *, seed: int = 0) -> Ratios:
     return Ratios(group, errors, 2.0 * errors, number // 5, number)
 
 
-def test_every_ground_counts_the_same_in_a_band() -> None:
-    long, short = make_ratios([1.0] * 2000, "tile"), make_ratios([4.0] * 150, "ice", seed=1)
-    bands = make_bands([long, short], "of 2 grounds")
-    assert bands is not None
-    assert bands.heading == pytest.approx(2.0 * bands.position)
-    held = [float(np.mean(one.position <= bands.position)) for one in (long, short)]
-    assert held[0] > 0.99
-    assert sum(held) / 2.0 == pytest.approx(0.95, abs=0.005)
-    assert make_bands([make_ratios([1.0] * 50, "tile")], "of this run only") is None, "ten stretches"
-
-
 @pytest.mark.parametrize("size", [0.3, 1.0, 3.0])
 def test_a_band_that_follows_holds_95_of_100_on_a_ground_it_does_not_know(size: float) -> None:
     bands = make_bands([make_ratios([1.0] * 500, "tile")], "")
@@ -339,14 +233,6 @@ def test_a_band_that_follows_holds_95_of_100_on_a_ground_it_does_not_know(size: 
     for one in found.values():
         assert 0.93 <= one.followed <= 0.97
         assert (0.93 <= one.as_it_is <= 0.97) == (size == 1.0)
-
-
-def test_a_band_that_follows_knows_nothing_of_the_prediction_that_it_judges() -> None:
-    bands = Bands(1.0, 1.0, "")
-    quiet = make_ratios([1e-3] * 30, "ice")
-    jump = replace(quiet, position=np.where(quiet.number == 29, 0.9, quiet.position))
-    shares = [measure_coverage(bands, [one])["position"].followed for one in (quiet, jump)]
-    assert shares == [1.0, pytest.approx(29.0 / 30.0)]
 
 
 @pytest.fixture(scope="module")
@@ -436,25 +322,3 @@ def test_the_verbs_add_show_and_drop_it(log: Path, tmp_path: Path) -> None:
     assert json.loads(again.stdout)["ladder"][-1]["effects"][-1] == "learned_term"
     assert run_verb("model", "drop", model, "learned_term", *on, "--quiet").returncode == 0
     assert "learned" not in model.read_text("utf-8")
-
-
-def test_it_is_refused_on_a_complete_model_which_stays_as_it_was(log: Path, tmp_path: Path) -> None:
-    model, on = tmp_path / "m.toml", ("--on", log, "--results", tmp_path / "results")
-    done = run_verb("diagnose", log, "--results", tmp_path / "results", "--apply", model, "--all")
-    assert done.returncode == 0, done.stderr
-    assert "learned   a learned term does not help: " in done.stdout
-    before = model.read_text("utf-8")
-    refused = run_verb("model", "add", model, "learned_term", *on)
-    assert refused.returncode == 1
-    assert "learned_term is not supported by the data (" in refused.stderr
-    assert model.read_text("utf-8") == before
-
-
-def test_python_adds_it_as_it_adds_an_effect(log: Path, tmp_path: Path) -> None:
-    run = slip.analyze(log, results=tmp_path / "results", report=False, diagnosis=False)
-    fit = (slip.Model("husky_a200") + "effective_track" + "learned_term").fit(run)
-    assert fit.ladder["added"].to_list()[-1] == "learned_term"
-    term = fit.model.file.model.effect("learned_term")
-    assert isinstance(term, ResidualTerm)
-    assert term.inputs
-    assert "learned_term" not in (fit.model - "learned_term").file.model

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import json
 import math
 from typing import TYPE_CHECKING
 
@@ -12,10 +11,8 @@ from verbs import run_verb
 
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, Timing, read_model
-from pipeline.models.literature import MODELS, find_model, list_models
-from pipeline.run import MotionError
+from pipeline.models.literature import MODELS, find_model
 from pipeline.simulate import VEHICLES, Program
-from pipeline.sources import Vehicle
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -60,10 +57,6 @@ def test_every_model_has_formula_source_and_numbers(model: object) -> None:
     assert len(found.source.split(",")) >= 2
     assert found.link == "" or found.link.startswith(("doi:10.", "arXiv:"))
     assert bool(found.effects or found.terms) == (found.count_numbers() > 0)
-
-
-def test_no_model_has_another_one_s_name() -> None:
-    assert len({model.name for model in MODELS}) == len(MODELS)
 
 
 @pytest.mark.parametrize("model", MODELS, ids=lambda model: model.name)
@@ -247,38 +240,3 @@ def test_a_fit_of_a_car_s_model_returns_the_truth(name: str, truth: dict[str, di
     for effect, numbers in truth.items():
         for number, value in numbers.items():
             assert fitted.effect(effect).values[number] == pytest.approx(value, rel=0.1), effect
-
-
-def test_models_are_listed_by_kind_of_vehicle() -> None:
-    def names(vehicle: Vehicle) -> set[str]:
-        return {model.name for model in list_models(vehicle)}
-
-    car, skid = names(vehicle_of("f1tenth")), names(HUSKY)
-    assert car == {"ideal", "bicycle_understeer", "kinematic_bicycle_with_lags"}
-    assert car & skid == {"ideal"}
-    assert "friction_based" in skid
-
-
-def test_what_cannot_be_made_says_why_and_what_can() -> None:
-    with pytest.raises(MotionError) as caught:
-        find_model("bicycle_understeer").make(HUSKY)
-    assert caught.value.code == "wrong_vehicle"
-    assert "icr_asymmetric" in caught.value.hint
-
-
-def test_the_verb_lists_models_and_shows_one() -> None:
-    listed = run_verb("model", "literature").stdout
-    assert all(model.name in listed for model in MODELS)
-    page = run_verb("model", "literature", "icr_asymmetric").stdout
-    assert "doi:10.1109/IROS.2007.4399139" in page
-    assert "numbers   5" in page
-    assert "needs     four wheels" in run_verb("model", "literature", "friction_based").stdout
-    shown = json.loads(run_verb("model", "literature", "roc", "--json").stdout)
-    assert shown["numbers"] == 2
-    assert json.loads(run_verb("model", "literature", "friction_based", "--json").stdout)["numbers"] == 1
-    wrong = run_verb("model", "literature", "rok")
-    assert wrong.returncode == 1
-    assert wrong.stderr == (
-        "slip: rok: no model of the literature is called 'rok'. Did you mean roc? "
-        "`slip model literature` lists them all.\n"
-    )

@@ -30,51 +30,6 @@ class Tilt(LinearEffect):
 '''
 
 
-@pytest.mark.parametrize(
-    ("text", "line", "says"),
-    [
-        (HEAD + '[[effect]]\nid = "effective_track"\nk = 25.0\n', 6, "outside of 0.2 to 10"),
-        (HEAD + '[[effect]]\nid = "effective_track"\nq = 2.0\n', 6, "no parameter 'q'"),
-        (HEAD + '[[effect]]\nid = "effective_track"\nk = "wide"\n', 6, "is not a parameter"),
-        (
-            HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.7, low = 1.9, high = 1.6 }\n',
-            6,
-            "low = 1.9 of effective_track.k is above its high = 1.6",
-        ),
-        (
-            HEAD + '[[effect]]\nid = "effective_track"\nk = { value = 1.5, unit = "m" }\n',
-            6,
-            "is in 1, not in m",
-        ),
-        (HEAD + '[[effect]]\nid = "effective_track"\nk = { value = "a" }\n', 6, "is not a number"),
-        (HEAD + '[[effect]]\nid = "effective_truck"\n', 5, "no effect is called"),
-        (HEAD + '[[effect]]\nid = "understeer"\n', 5, "ackermann vehicles only"),
-        (HEAD + '[[effect]]\nid = "lateral_skid"\n[[effect]]\nid = "lateral_skid"\n', 7, "twice"),
-        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * sin(yawn)"\nk = { unit = "m/s" }\n', 6, "'yawn'"),
-        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * sin(yaw)"\nk = { unit = "m" }\n', 6, "not in m/s"),
-        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "furlong" }\n', 6, "not a unit"),
-        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { unit = "1", bounds = [2, 1] }\n', 7, "bounds"),
-        (HEAD + '[[effect]]\nid = "w"\nv_y = "k * v0"\nk = { value = 3, bounds = [-1, 1] }\n', 7, "outside"),
-        (HEAD + '[[effect]]\nid = "drive_lag"\nv_x = "k * v0"\nk = 0.1\n', 5, "of the catalogue is called"),
-        (HEAD + "[[effect]]\nk = 1.0\n", 4, "needs an id"),
-        (HEAD + "[effect]\n", 4, "[[effect]]"),
-        (HEAD + "[[effect]\n", 4, "not a valid TOML"),
-        ('format = 7\n[vehicle]\npreset = "husky_a200"\n', 1, "format 7"),
-        ("colour = 1\n" + HEAD, 1, "unknown key"),
-        ('[vehicle]\npreset = "nope"\n', 2, "no vehicle preset is called 'nope'. Write one of: "),
-        ("[vehicle]\nwheel_radius_m = -1\n", 1, "not valid"),
-        ("format = 1\n", 1, "no vehicle"),
-        ('effects = ["nowhere.py"]\n' + HEAD, 1, "no such file of effects"),
-    ],
-)
-def test_a_malformed_file_is_one_clear_line_that_names_its_line(text: str, line: int, says: str) -> None:
-    with pytest.raises(MotionError) as caught:
-        parse_model(text, HERE)
-    assert caught.value.where == f"model.toml:{line}"
-    assert says in str(caught.value)
-    assert "\n" not in str(caught.value)
-
-
 def test_every_effect_survives_a_round_trip() -> None:
     for kind, preset in (("differential", "husky_a200"), ("ackermann", "ackermann_car")):
         effects = [

@@ -13,7 +13,6 @@ from verbs import run_verb
 from pipeline.models import read_model
 from pipeline.models.catalogue import run_effects
 from pipeline.models.effect import Effect
-from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 
 PAGES = sorted((Path(__file__).parents[2] / "docs" / "pages").rglob("*.md"))
@@ -46,51 +45,11 @@ def test_the_template_runs_as_it_stands_by_the_commands_that_it_prints(place: Pa
     assert read_model(place / "robot.toml").model.ids == ("side_wind",)
 
 
-@pytest.mark.parametrize(
-    ("name", "words"),
-    [
-        ("wind.toml", "side_wind.py"),
-        ("Side Wind.py", "side_wind.py"),
-        ("drive_lag.py", "an effect is called so already"),
-        ("there.py", "--force"),
-    ],
-)
-def test_a_file_that_cannot_hold_an_effect_is_refused_in_one_line(place: Path, name: str, words: str) -> None:
-    (place / "there.py").write_text("mine")
-    done = run_verb("model", "new-effect", name)
-    assert done.returncode == 1
-    (line,) = done.stderr.splitlines()
-    assert words in line
-    assert [path.name for path in place.iterdir()] == ["there.py"]
-    assert (place / "there.py").read_text() == "mine"
-
-
 def test_a_model_is_not_made_with_python_that_is_not_beside_it(place: Path) -> None:
     done = run_verb("model", "new", "robot.toml", "--vehicle", "husky_a200", "--own", "wind.py")
     assert done.returncode == 1
     assert "there is no such file of effects" in done.stderr
     assert list(place.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("text", "line", "what", "hint"),
-    [
-        ('effects = ["mine.py"]\n', 3, "inside a table", "first line"),
-        ('[fit]\ninput = "command"\neffects = ["mine.py"]\n', 5, "inside a table", "first line"),
-        ('note = "mine"\n', 3, "unknown key 'note' in [vehicle]", "first line"),
-        ("colour = 1\n", 3, "unknown key 'colour' in [vehicle]", "wheel_radius_m"),
-    ],
-)
-def test_a_key_in_the_wrong_table_is_named_with_its_line(
-    place: Path, text: str, line: int, what: str, hint: str
-) -> None:
-    path = place / "robot.toml"
-    path.write_text(f'[vehicle]\npreset = "husky_a200"\n{text}', encoding="utf-8")
-    with pytest.raises(MotionError) as caught:
-        read_model(path)
-    assert caught.value.where == f"{path}:{line}"
-    assert what in caught.value.what
-    assert hint in caught.value.hint
 
 
 @pytest.mark.parametrize(("page", "block"), CODE, ids=[page for page, _ in CODE])

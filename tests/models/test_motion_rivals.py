@@ -1,21 +1,15 @@
 from __future__ import annotations
 
 import json
-import math
-import sys
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-import pipeline as slip
-from pipeline.core import SlipError
 from pipeline.estimation import Comparison, Errors, HeldOut, Input, Problem, fit_model, hold_out
-from pipeline.estimation.parts import WheelPart
 from pipeline.estimation.rivals import (
     Contest,
     Lesson,
@@ -26,10 +20,8 @@ from pipeline.estimation.rivals import (
     judge_rival,
     list_learners,
     make_features,
-    score_learned,
 )
-from pipeline.estimation.state import NO_PRIOR, Prior, State
-from pipeline.models import Model, Timing, find_effect
+from pipeline.models import Model
 from pipeline.models.literature import find_model
 from pipeline.simulate import simulate_case
 
@@ -96,17 +88,6 @@ def test_the_interval_of_a_difference_holds_the_truth_in_95_of_100_draws() -> No
     assert 0.91 <= held / 400 <= 0.98
 
 
-def test_predictions_that_only_one_model_made_are_left_out() -> None:
-    stretches = np.repeat(np.arange(10), 10)
-    one, other = np.full(100, 0.2), np.full(100, 0.2)
-    one[:30] = math.nan
-    other[:30] = 5.0
-    assert compare_errors(one, other, stretches).value == 0.0
-    nothing = compare_errors(np.full(100, math.nan), other, stretches)
-    assert math.isnan(nothing.value)
-    assert nothing.is_chance
-
-
 def test_what_chance_put_behind_the_best_is_marked_and_no_more() -> None:
     generator = np.random.default_rng(7)
     stretches = np.repeat(np.arange(40), 10)
@@ -159,17 +140,6 @@ def test_a_fold_is_learned_without_its_stretches(problem: Problem) -> None:
         assert not (rows & fold.test).any()
 
 
-def test_what_was_learned_on_one_run_carries_over_to_another(problem: Problem) -> None:
-    other = Problem([simulate(TRUTH, seed=2, duration_s=90.0)], HUSKY, Input.MEASURED)
-    lesson = Lesson(problem, list_learners()[0])
-    state = fit_model(problem, Model(HUSKY), exact=True).state
-    learned = lesson.learn(state, np.ones(problem.whole.run.size, dtype=bool))
-    there = fit_model(other, Model(HUSKY), exact=True)
-    carried = score_learned(other, there.state, learned).pooled
-    ideal = hold_out(other, there).pooled
-    assert carried.r_mrmse_rad < 0.3 * ideal.r_mrmse_rad
-
-
 def test_features_know_nothing_of_what_comes_later(problem: Problem) -> None:
     run, moment = problem.runs[0], problem.runs[0].start_s + 60.0
     assert run.wheels is not None
@@ -181,57 +151,6 @@ def test_features_know_nothing_of_what_comes_later(problem: Problem) -> None:
     before = problem.comparisons[0].grid.times < moment - 0.5
     np.testing.assert_allclose(features[before], changed[before], atol=1e-9)
     assert not np.allclose(features[~before], changed[~before])
-
-
-def test_what_a_restart_puts_right_is_not_learned_a_second_time() -> None:
-    run = simulate({**TRUTH, "body_inertia": {"tau": 0.6}}, duration_s=60.0)
-    problem = Problem([run], HUSKY, Input.COMMAND)
-    comparison = problem.comparisons[0]
-    _, within = Lesson(problem, list_learners()[0]).windows
-    track = (find_effect("effective_track")().change(k=1.8),)
-    # The lag of the wheels is missing: only the body's own state is known where a prediction begins.
-    body = (*track, find_effect("body_inertia")().change(tau=0.6))
-    for effects, is_same in ((track, True), (body, False)):
-        free = comparison.find_residuals(effects, Timing())[within]
-        restarted = comparison.find_residuals(effects, Timing(), restarted=True)[within]
-        assert np.array_equal(free, restarted) == is_same
-    assert np.square(restarted).mean() < np.square(free).mean()
-    # A part gives the same residuals as its comparison, for a clock that is not moved, too.
-    part, state = problem.whole, problem.start_state(body)
-    assert np.square(part.restarted.find_residuals(state)).sum() < np.square(part.find_residuals(state)).sum()
-    for one in (part, part.restarted):
-        np.testing.assert_array_equal(one.shift_clock(state, 0, 0.0), one.find_run_residuals(state, 0))
-
-
-def test_wheels_begin_with_what_they_did_whenever_it_was_reported() -> None:
-    run = simulate({"drive_lag": {"tau": 0.4}}, duration_s=90.0)
-    assert run.wheels is not None
-    losses = {}
-    for late in (0.0, 0.1):
-        wheels = replace(run.wheels, times=run.wheels.times + late)
-        problem = Problem([replace(run, wheels=wheels)], HUSKY, Input.COMMAND)
-        part = problem.parts[-1]
-        assert isinstance(part, WheelPart)
-        for tau in (0.35, 0.4, 0.45):
-            state = State((find_effect("drive_lag")().change(tau=tau),), (Timing(late),))
-            losses[late, tau] = float(np.square(part.restarted.find_residuals(state)).mean())
-    assert losses[0.1, 0.4] < 0.2 * min(losses[0.1, 0.35], losses[0.1, 0.45])
-    assert losses[0.1, 0.4] == pytest.approx(losses[0.0, 0.4], rel=0.5, abs=1e-6)
-
-
-def test_a_part_that_is_restarted_has_the_prior_of_its_own() -> None:
-    part = Problem([simulate(TRUTH, duration_s=40.0)], HUSKY, Input.COMMAND).whole
-    assert part.restarted.prior is NO_PRIOR
-    part.prior = Prior({"effective_track.k": (1.5, 0.1)})
-    assert part.restarted.prior is part.prior
-
-
-def test_without_the_extra_one_line_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "sklearn.ensemble", None)
-    with pytest.raises(SlipError) as caught:
-        list_learners()
-    assert caught.value.code == "learn_needed"
-    assert "pip install 'slip-pipeline[learn]'" in str(caught.value)
 
 
 def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Path, tmp_path: Path) -> None:
@@ -261,32 +180,3 @@ def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Pat
     assert "icr_asymmetric" in shown
     assert "* smallest; = not significantly larger" in shown
     assert "has the smallest error of heading" in shown
-
-
-def test_of_a_vehicle_that_the_literature_does_not_describe_it_is_said(tmp_path: Path) -> None:
-    log = simulate_case(None, out=tmp_path / "youbot.mcap", vehicle="youbot", duration_s=40.0)
-    on = ("--on", log, "--results", tmp_path / "results")
-    done = run_verb("model", "compare", "--against", "literature", *on)
-    assert done.returncode == 0, done.stderr
-    assert "no model of the literature but the ideal one describes a mecanum vehicle" in done.stderr
-
-
-def test_two_models_or_others_to_compare_with_are_asked_for(log: Path) -> None:
-    done = run_verb("model", "compare", "--on", log)
-    assert done.returncode == 1
-    said = "two model files are compared. Give two, or compare with others: --against literature."
-    assert done.stderr == f"slip: slip model compare: {said}\n"
-
-
-def test_python_gives_the_same_table(log: Path, tmp_path: Path) -> None:
-    run = slip.analyze(log, results=tmp_path / "results", report=False, diagnosis=False)
-    mine = slip.Model("husky_a200") + find_effect("effective_track")() + "drive_lag"
-    found = run.compare_models({"mine": mine})
-    assert found.columns == [
-        "model", "numbers", "t_mrmse_m", "r_mrmse_rad", "t_is_best", "r_is_best", "fit_s",
-    ]  # fmt: skip
-    assert found.filter(pl.col("model") == "mine")["t_is_best"].item()
-    assert not found.filter(pl.col("model") == "ideal")["t_is_best"].item()
-    assert found["numbers"].to_list()[:2] == [2, 0]
-    with pytest.raises(slip.SlipError, match="ideal is the name of a model that yours is compared with"):
-        run.compare_models({"ideal": mine})

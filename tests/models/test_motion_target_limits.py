@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from exported_files import CAR, FIT, make, predict, take
+from exported_files import FIT, make, predict, take
 from motion_runs import vehicle_of
 
 from pipeline.export import export_model
@@ -71,13 +71,3 @@ def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
     control = take("ros2_control", file)
     asked = control["angular.z.max_velocity"] * control["wheel_separation_multiplier"]
     assert asked == pytest.approx(1.0, rel=1e-4)
-
-
-def test_a_car_with_a_longer_wheelbase_reaches_less_than_its_limit() -> None:
-    longer = (find_effect("effective_wheelbase")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
-    assert take("nav2", make(*longer, vehicle=CAR))["FollowPath.wz_max"] == 0.5
-
-
-def test_of_two_limits_the_smaller_one_holds() -> None:
-    limits = (find_effect("body_speed_limit")(limit=0.5), find_effect("wheel_speed_limit")(limit=99.0))
-    assert take("nav2", make(*limits))["FollowPath.vx_max"] == 0.5

@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-import json
-import math
-import re
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -14,8 +11,6 @@ from pipeline.estimation import Input, Problem, carry_over, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
-from pipeline.models.formula import FormulaEffect, make_parameter
-from pipeline.run import MotionError
 from pipeline.simulate import VEHICLES, Disturbance, Program
 
 if TYPE_CHECKING:
@@ -85,15 +80,6 @@ def test_the_exported_function_moves_like_the_model_with_every_effect(kind: str)
         assert np.sqrt(np.mean((seen - getattr(expected, channel)) ** 2)) < size * max(typical, 0.1), channel
 
 
-def test_formulas_are_exported_and_other_python_is_refused() -> None:
-    wind = FormulaEffect("wind", {"v_y": "k * sin(yaw)"}, (make_parameter("k", "m/s", (-1.0, 1.0)),), k=0.2)
-    rows = run_exported(Model(HUSKY, (wind,)), [(0.0, 2.0, 2.0)], 1.0, pose=(0.0, 0.0, math.pi / 2))  # type: ignore[arg-type]
-    assert rows[-1, 5] == pytest.approx(0.2)
-    rate = FormulaEffect("rate", {"v_y": "k * v0_rate"}, (make_parameter("k", "s", (-1.0, 1.0)),))
-    with pytest.raises(MotionError, match="rate of a signal"):
-        export_model(ModelFile(Model(HUSKY, (rate,))), "python")
-
-
 def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> None:
     effects = (
         find_effect("effective_track")(k=1.9),
@@ -110,22 +96,3 @@ def test_controllers_get_the_parameters_they_have_and_are_told_of_the_rest() -> 
     # Commands of 1 rad/s, beyond which they were clipped, turned the body by .95 / 1.9 of that.
     assert parameters["angular"]["z"] == {"max_velocity": 0.5, "min_velocity": -0.5}
     assert "#   lateral_skid.c = 0.1 s" in text.splitlines()
-
-
-def test_controllers_get_doubles_where_they_declare_doubles() -> None:
-    """ROS 2 refuses `1` for a parameter declared as a double, and reads `1e-05` as a text."""
-    limits = (find_effect("body_speed_limit")(limit=2.0), find_effect("transport_delay")(d=1e-5))
-    text = export_model(ModelFile(Model(HUSKY, limits)), "nav2")
-    values = [line.split(": ")[1] for line in text.splitlines() if re.fullmatch(r" +\w+: .+", line)]
-    assert values == ["1.0e-05", "1.0e-05", "2.0", "-2.0", "2.0", "-2.0"]
-
-
-def test_json_holds_no_number_that_json_does_not_know() -> None:
-    file = ModelFile(Model(HUSKY, (find_effect("body_speed_limit")(), find_effect("turn_droop")())))
-    content = json.loads(export_model(file, "json"))
-    assert content["effects"][0]["parameters"]["limit"] == {
-        "value": None,
-        "low": None,
-        "high": None,
-        "unit": "m/s",
-    }

@@ -13,7 +13,7 @@ import pytest
 from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.models import format_model, read_model, write_model
+from pipeline.models import read_model, write_model
 from pipeline.models.catalogue import distrust, list_trusted, trust
 from pipeline.models.model_file import list_code, parse_model
 from pipeline.run import MotionError
@@ -182,38 +182,6 @@ def test_a_relative_configuration_folder_counts_for_nothing(
     assert list_trusted() == {}
 
 
-def test_names_in_the_list_cannot_add_a_line() -> None:
-    trust({"a" * 64: "x\n" + "b" * 64 + "  y"})
-    assert set(list_trusted()) == {"a" * 64}
-
-
-def test_every_verb_says_what_it_leaves_out(model: Path, slip: Callable[..., tuple[int, str, str]]) -> None:
-    code, printed, said = slip("model", "show", model, "--json")
-    assert code == 0
-    assert "own.py" in said
-    assert "tilt" in json.loads(printed)["warnings"][0]
-    code, _, said = slip("model", "fit", model, "--on", "nowhere.mcap")
-    assert code == 1
-    assert "tilt would be lost" in said
-    assert len(said.splitlines()) == 1, "one thing is wrong, and is said once"
-    assert "own.py" in slip("model", "export", model, "--to", "python")[2]
-    assert not has_run(model)
-
-
-def test_trust_is_said_once_listed_and_taken_back(
-    model: Path, slip: Callable[..., tuple[int, str, str]]
-) -> None:
-    (code,) = list_code(model)
-    assert code in slip("model", "trust", model)[1]
-    assert not has_run(model)
-    assert code in slip("model", "trusted")[1]
-    assert "tilt" in slip("model", "show", model)[1]
-    assert code in slip("model", "untrust", code[:12])[1]
-    assert "no Python is trusted" in slip("model", "trusted")[1]
-    assert "tilt" in slip("model", "show", model, "--trust-code")[1]
-    assert code in slip("model", "trusted")[1]
-
-
 def test_a_model_out_of_a_results_folder_runs_nothing_in_the_workbench_and_says_so(model: Path) -> None:
     file = SessionFile(model.parent, "run")
     file.model_path.parent.mkdir(parents=True)
@@ -242,9 +210,3 @@ def test_an_analysis_says_what_it_leaves_out_and_is_made_again_when_it_is_truste
     after = analyze_log(log, options)
     assert after.computed
     assert "model_code_left_out" not in {row["id"] for row in after.summary["findings"]}
-
-
-def test_own_effects_can_be_written_again(model: Path) -> None:
-    trust(list_code(model))
-    file = read_model(model)
-    assert parse_model(format_model(file), model).model.ids == ("effective_track", "tilt")

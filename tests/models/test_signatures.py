@@ -10,7 +10,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem, State
-from pipeline.estimation.effect_signature import SINCE_STEP, Signature, find_signatures
+from pipeline.estimation.effect_signature import Signature, find_signatures
 from pipeline.models import Effect, Timing, find_effect
 from pipeline.models.effect import Parameter
 from pipeline.models.formula import FormulaEffect
@@ -45,10 +45,6 @@ def sign(name: str, effect: Effect | None = None) -> Signature:
     return found
 
 
-def slope_of(found: Signature) -> float:
-    return float(found.value @ found.before / (found.value @ found.value))
-
-
 @pytest.mark.parametrize("name", TRUE)
 def test_points_lie_on_the_curve_before_and_on_zero_after(name: str) -> None:
     found = sign(name)
@@ -59,42 +55,6 @@ def test_points_lie_on_the_curve_before_and_on_zero_after(name: str) -> None:
     assert np.abs(found.before - found.curve).max() < 0.06 * size
     assert np.abs(found.after).max() < 0.06 * size
     assert np.mean(np.abs(found.after) <= found.after_error + 0.01 * size) > 0.8, "intervals hold zero"
-
-
-def test_a_wider_track_is_a_line_over_the_commanded_yaw_rate() -> None:
-    found = sign("effective_track")
-    assert (found.channel, found.variable) == ("w", "f_w")
-    assert slope_of(found) == pytest.approx(1.0 / 1.6 - 1.0, abs=0.01)
-
-
-def test_a_lag_fades_after_a_step_with_its_time_constant() -> None:
-    found = sign("drive_lag")
-    assert (found.channel, found.variable) == ("x", SINCE_STEP)
-    early = found.before < -0.03
-    rate = np.polyfit(found.value[early], np.log(-found.before[early]), 1)[0]
-    assert -1.0 / rate == pytest.approx(0.5, abs=0.08)
-
-
-def test_skid_is_a_line_over_speed_times_yaw_rate() -> None:
-    found = sign("lateral_skid")
-    assert (found.channel, found.variable) == ("y", "f_x_f_w")
-    assert slope_of(found) == pytest.approx(-0.2, abs=0.01)
-
-
-def test_sliding_downhill_grows_with_pitch() -> None:
-    found = sign("slope_drift")
-    assert (found.channel, found.variable) == ("x", "pitch")
-    assert slope_of(found) == pytest.approx(0.7, abs=0.06), "it stands still for a part of the time"
-
-
-def test_a_limit_does_nothing_below_itself() -> None:
-    found = sign("body_turn_limit")
-    assert (found.channel, found.variable) == ("w", "f_w")
-    below = np.abs(found.value) < 0.4
-    assert np.abs(found.before[below]).max() < 0.02
-    beyond = np.abs(found.value) > 0.7
-    lost = np.sign(found.value) * 0.5 - found.value
-    assert found.before[beyond] == pytest.approx(lost[beyond], abs=0.03)
 
 
 def test_an_effect_that_nobody_knows_has_its_signature_for_free() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import cast
@@ -63,90 +62,6 @@ def test_without_ground_resistance_and_bound_it_is_a_lag_of_the_rotating_parts()
     tau = 0.7 * 0.7 / 1.7
     for channel, signal in zip(found, (speed, turn), strict=True):
         assert np.allclose(channel, lag_signal(signal, tau, STEP, resets, np.zeros(1)), atol=3e-3)
-
-
-def test_straight_ahead_on_firm_ground_the_body_makes_it_slower() -> None:
-    speed = np.ones(400)
-    found, turned = drive(speed, np.zeros(400), tau=0.5, scrub=20.0)
-    expected = lag_signal(speed, 0.5, STEP, make_context(400).spans, np.zeros(1))
-    assert np.allclose(found, expected, atol=0.02)
-    assert np.abs(turned).max() < 1e-12
-
-
-def test_its_force_is_bounded() -> None:
-    speed = np.full(300, 2.0)
-    found, _ = drive(speed, np.zeros(300), tau=0.2, bound=0.3, scrub=20.0)
-    assert np.diff(found)[20:50] == pytest.approx(0.3 / 0.2 * STEP, rel=0.02)
-
-
-def test_the_weaker_motor_is_slower_where_its_force_is_the_largest() -> None:
-    """As with a tenth less voltage; below its bound it follows as the other one does."""
-    numbers = {"tau": 0.2, "bound": 0.3, "no_load": 3.0}
-    wheels = Wheels(*np.full((2, 2000), 9.0 / RADIUS), np.zeros(2000))
-    weaker = find_effect("motor_imbalance")(e=0.2 / 1.9).drive_wheels(wheels, make_context(2000))
-    driven = find_effect("wheel_servo")(**numbers).drive_wheels(weaker, make_context(2000))
-    assert driven.left[-1] == pytest.approx(0.9 * driven.right[-1], rel=0.01)
-    gentle = replace(weaker, left=weaker.left / 90.0, right=weaker.right / 90.0)
-    driven = find_effect("wheel_servo")(**numbers).drive_wheels(gentle, make_context(2000))
-    assert np.allclose(driven.left, driven.right, rtol=1e-9)
-
-
-def test_at_the_no_load_speed_no_force_is_left() -> None:
-    """Free of resistance it is approached as by a motor with a time constant of no_load tau / bound."""
-    found, _ = drive(np.full(2000, 9.0), np.zeros(2000), tau=0.2, bound=0.3, no_load=3.0, scrub=20.0)
-    expected = lag_signal(np.full(2000, 3.0), 2.0, STEP, make_context(2000).spans, np.zeros(1))
-    assert np.allclose(found, expected, atol=0.02)
-
-
-def test_a_force_that_falls_with_speed_holds_turns_back_more_than_driving_straight() -> None:
-    numbers = {"tau": 0.2, "reset": 0.3, "bound": 1.0, "no_load": 2.0, "scrub": 1.0, "creep": 0.07}
-    rest, rim = np.zeros(1000), np.full(1000, 1.6)
-    straight, turning = drive(rim, rest, **numbers)[0][-1], drive(rest, rim * 2.0 / WIDTH, **numbers)[1][-1]
-    assert straight == pytest.approx(1.6, rel=0.02)
-    assert 0.5 * WIDTH * turning < 0.9 * straight
-
-
-def test_it_falls_short_by_the_rolling_resistance_until_the_integral_part_makes_up_for_it() -> None:
-    speed, turn = np.full(2000, 1.0), np.zeros(2000)
-    assert drive(speed, turn, tau=0.2, drag=0.1, scrub=5.0)[0][-1] == pytest.approx(0.9, abs=2e-3)
-    assert drive(speed, turn, tau=0.2, drag=0.1, reset=0.5, scrub=5.0)[0][-1] == pytest.approx(1.0, abs=2e-3)
-
-
-def test_a_slow_turn_on_the_spot_begins_late_and_a_fast_one_does_not() -> None:
-    rest = np.zeros(500)
-    slow, fast = (
-        drive(rest, np.full(500, rate), tau=0.2, reset=0.3, scrub=1.0, creep=0.07)[1] / rate
-        for rate in (0.5, 4.0)
-    )
-    after_1s, after_10s = 50, 499
-    assert slow[after_1s] < 0.2
-    assert fast[after_1s] > 0.5
-    assert slow[after_10s] > 2.0 * slow[after_1s]
-
-
-def test_driving_fast_lowers_the_friction_of_a_turn() -> None:
-    turn = np.full(300, 0.5)
-    numbers = {"tau": 0.2, "scrub": 1.0, "creep": 0.07}
-    rest, driving = (drive(np.full(300, speed), turn, **numbers)[1][-1] for speed in (0.0, 2.0))
-    assert rest < 0.5 * driving
-
-
-def test_without_a_command_the_integral_part_is_cleared() -> None:
-    """A turn after a pause begins as late as the first one; after a turn the other way, too."""
-    numbers = {"tau": 0.2, "reset": 0.3, "scrub": 1.0, "creep": 0.07}
-    turn, pause = np.full(300, 0.8), np.zeros(600)
-    asked = np.concatenate((turn, pause, turn, pause, -turn))
-    turned = drive(np.zeros(asked.size), asked, **numbers)[1].reshape(-1, 300)
-    assert np.allclose(turned[3], turned[0], atol=1e-6)
-    assert np.allclose(turned[6], -turned[0], atol=1e-6)
-
-
-def test_a_force_at_its_bound_holds_the_integral_part() -> None:
-    """Else it winds up while the drive gives all that it can, and the speed overshoots."""
-    speed = np.repeat([2.0, 1.0], 150)
-    found, _ = drive(speed, np.zeros(300), tau=0.2, reset=1.0, bound=0.1, scrub=20.0)
-    assert found[:150].max() < 2.0
-    assert found.max() < 2.0
 
 
 def test_a_prediction_begins_with_the_measured_wheels_and_holds_part_of_their_difference() -> None:

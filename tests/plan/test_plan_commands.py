@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -16,9 +14,6 @@ import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline.cli import main
-from pipeline.cli.conventions import FAILED
-from pipeline.cli.verbs_drives import format_plan
 from pipeline.job import Options
 from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
 from pipeline.job.next_drive import choose_topic
@@ -26,11 +21,7 @@ from pipeline.models import find_effect
 from pipeline.plan import (
     LEAD_S,
     RATE_HZ,
-    TAIL_S,
-    Area,
-    Chooser,
     PlanError,
-    Shape,
     choose_limits,
     is_steered,
     join,
@@ -43,19 +34,13 @@ from pipeline.plan import (
 )
 from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import (
-    LONGEST_S,
-    PROTOCOLS,
     WHEELS,
-    compare_protocols,
-    drive_protocol,
     list_types,
     read_promises,
     write_plan,
 )
-from pipeline.plan.questions import Impossible, ask_presence, explain_open
+from pipeline.plan.questions import ask_presence
 from pipeline.plan.rehearsal import Rehearsal, assume
-from pipeline.report.drive_pages import preview_plan
-from pipeline.run import MotionError
 from pipeline.simulate import find_vehicle, simulate_case
 from pipeline.simulate.programs import read_played
 from pipeline.sources import Vehicle, find_preset, list_presets
@@ -120,21 +105,6 @@ def test_a_plan_begins_gently_and_stays_inside_the_area(plan: Plan) -> None:
     assert plan.area.holds(plan.ways)
     assert len(plan.ways) > len(TURNING)
     assert plan.home_m <= 0.5 * plan.area.width_m
-
-
-def test_a_preview_shows_the_way_with_its_spread_and_the_promises(plan: Plan) -> None:
-    shown = json.loads(json.dumps(preview_plan(plan), allow_nan=False))
-    ways = shown["rows"]["plan_ways"]
-    assert len(set(ways["model"])) > 4
-    assert len(ways["x"]) < 3000
-    assert np.abs(ways["x"]).max() <= 0.5 * plan.area.length_m
-    assert len(shown["promises"]) == len(plan.promises)
-    (answer, *_) = plan.promises
-    assert f"after {answer.decided_after_s:.0f} s: {answer.question}" in shown["promises"][0]
-    # Metres are as long on both axes.
-    equal = shown["figures"]["ways"]["usermeta"]["equal"]
-    assert equal["x"][1] / equal["y"][1] == pytest.approx(plan.area.length_m / plan.area.width_m)
-    assert np.abs(ways["x"]).max() <= equal["x"][1]
 
 
 @pytest.mark.parametrize("hidden", [{"limit": 2.0}, {"limit": 3.27}, {"limit": 5.0}])
@@ -257,52 +227,6 @@ def test_a_plan_goes_where_the_log_was_commanded() -> None:
         assert (topic, type_name) == ("/controller/cmd_vel", "geometry_msgs/msg/Twist")
 
 
-def test_other_protocols_are_timed_for_the_same_questions_within_the_same_limits() -> None:
-    vehicle = _find("husky_a200")
-    knowledge, limits = assume(vehicle), choose_limits(vehicle)
-    questions = ask_presence(knowledge, TURNING, find_largest(knowledge, limits, 60.0))
-    names = ("drive", "straight_and_circle")
-    drive, laps = compare_protocols(knowledge, questions, limits, names)
-    assert (drive.protocol, laps.protocol) == names
-    assert all(10.0 < second < 300.0 for second in drive.seconds)
-    # Once round takes longer than two random steps, and nothing turns before it.
-    assert drive.seconds[0] < laps.seconds[0]
-
-
-@pytest.mark.parametrize("name", PROTOCOLS)
-def test_a_protocol_is_driven_no_longer_than_is_said(name: str) -> None:
-    vehicle = _find("turtlebot4")
-    commands, begins = drive_protocol(name, vehicle, choose_limits(vehicle), 0)
-    assert LONGEST_S - 10.0 < commands.duration_s <= LONGEST_S
-    assert begins[0] == LEAD_S
-    assert begins[-1] < commands.duration_s
-
-
-def test_an_unknown_protocol_is_refused_before_anything_is_worked_out(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setattr("pipeline.plan.plan.make_plan", lambda *_: pytest.fail("the plan was made first"))
-    with pytest.raises(SystemExit) as ended:
-        main(["plan", "--vehicle", "husky_a200", "--compare", "drive,dance", "--out", str(tmp_path / "plan")])
-    assert ended.value.code == FAILED
-    assert "straight_and_circle" in capsys.readouterr().err
-
-
-def test_a_plan_is_written_only_in_a_type_that_carries_its_commands(plan: Plan, tmp_path: Path) -> None:
-    with pytest.raises(PlanError, match="cannot be written as"):
-        write_plan(replace(plan, type_name=list_types(steered=True)[0]), tmp_path / "plan")
-    assert not (tmp_path / "plan").exists()
-
-
-def test_a_plan_that_was_edited_must_still_name_effects_that_there_are(plan: Plan, tmp_path: Path) -> None:
-    file, *_ = write_plan(plan, tmp_path)
-    effect = plan.promises[0].effects[0]
-    assert read_promises(tmp_path).promises[0].effects[0] == effect
-    file.write_text(file.read_text(encoding="utf-8").replace(f'"{effect}"', '"drive_leg"'), encoding="utf-8")
-    with pytest.raises(MotionError, match="no effect is called 'drive_leg'"):
-        read_promises(tmp_path)
-
-
 def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle)
@@ -327,26 +251,6 @@ def _ask_for(effect: str, seconds: float, area: str, speed_mps: float = 1.0) -> 
     return make_plan(knowledge, questions, Request(limits, parse_area(area, vehicle), seconds))
 
 
-@pytest.mark.parametrize(
-    ("effect", "seconds", "area", "reason"),
-    [
-        ("drive_lag", 15.0, "20x10m", r"give --time (\d+)s"),
-        ("drive_lag", 60.0, "3x3m", "give a larger --area"),
-        ("speed_slip", 15.0, "20x10m", r"give a larger --area, and --time (\d+)s"),
-    ],
-    ids=["time", "area", "both"],
-)
-def test_what_a_plan_leaves_open_says_what_decides_it(
-    effect: str, seconds: float, area: str, reason: str
-) -> None:
-    (left,) = _ask_for(effect, seconds, area).impossible
-    asked = re.fullmatch(reason, left.because)
-    assert asked
-    wanted_s = float(asked[1]) if asked.groups() else seconds
-    wanted_area = "80x80m" if "--area" in left.because else area
-    assert [one.question for one in _ask_for(effect, wanted_s, wanted_area).promises] == [left.question]
-
-
 def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reaches() -> None:
     (left,) = _ask_for("speed_slip", 15.0, "20x10m", 0.3).impossible
     # At 0.3 m/s there is little to see: the limit in the way is named, not the room or the time.
@@ -355,89 +259,9 @@ def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reac
     assert re.fullmatch(r"expected t = [1-4]\.\d, required 5", left.reached)
 
 
-class _Promising:
-    """A question that three manoeuvres seem to answer, and that stays open: gains do not add up exactly."""
-
-    question = SimpleNamespace(text="a or b", effects=("a", "b"))
-
-    def answer(self, weight: np.ndarray[Any, Any], reserve: float = 1.0) -> np.ndarray[Any, Any]:
-        return np.minimum(0.5 * np.asarray(weight).sum(axis=-1) / reserve, 1.0)
-
-
-def test_more_time_is_advised_only_where_it_is_more_than_was_given() -> None:
-    still = Shape(np.zeros((1, 2), dtype=np.complex128), np.zeros(1))
-    chooser = Chooser([_Promising()], np.ones(1), [still], Area(20.0, 10.0), 4.0)  # type: ignore[list-item]
-    left = explain_open(Impossible("a or b", ("a", "b"), ""), chooser, [0, 0, 0])
-    (seconds,) = re.findall(r"^give --time (\d+)s$", left.because)
-    assert float(seconds) > LEAD_S + 4.0 + TAIL_S
-
-
-def test_the_next_command_names_the_results_that_the_plan_is_from(plan: Plan) -> None:
-    files = [Path("my plan/plan.toml"), *map(Path, ("plan.csv", "plan.mcap", "plan.html"))]
-    said = format_plan(plan, None, files, " --results season")[-1]
-    assert said == "afterwards   slip plan --check 'my plan/plan.toml' NEW.mcap --results season"
-
-
-def test_a_plan_of_another_vehicle_than_the_log_is_of_is_said_so(
-    plan: Plan, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    write_plan(replace(plan, runs=("season/husky",)), tmp_path / "plan")
-    log = str(Path(__file__).parents[2] / "data_samples" / "warthog_ice.mcap")
-    with pytest.raises(SystemExit) as ended:
-        main(["plan", "--check", str(tmp_path / "plan"), log, "--results", str(tmp_path / "results")])
-    assert ended.value.code == FAILED
-    assert "the plan is for husky_a200, and the log is of warthog" in capsys.readouterr().err
-
-
-def test_without_a_drive_that_and_the_limits_are_said_first(plan: Plan) -> None:
-    unanswered = replace(
-        plan, manoeuvres=(), promises=(), impossible=(Impossible("a or b", ("a", "b"), "too small"),)
-    )
-    first, limits, why = format_plan(unanswered, None, ())
-    assert first.endswith("answers an open question: no file is written")
-    assert limits.startswith("limits  ")
-    steepest = float(np.abs(np.diff(plan.commands.turn)).max()) * RATE_HZ
-    (stated,) = re.findall(r"([\d.]+) rad/s\^2", limits)
-    assert steepest <= 1.001 * float(stated)
-    assert why == "undecided    a or b: too small"
-
-
-def test_what_holds_of_several_open_questions_is_said_once(plan: Plan) -> None:
-    two = ("no drive; turn both ways; drive backward", "no drive; drive backward; turn both ways")
-    questions = (
-        *(Impossible(f"q{i}", (), reason, f"expected t = {i}.0, required 5") for i, reason in enumerate(two)),
-        Impossible("q2", (), "give a larger --area"),
-    )
-    both = "q0 (expected t = 0.0, required 5); q1 (expected t = 1.0, required 5)"
-    assert replace(plan, impossible=questions).list_impossible() == [
-        f"{both}: no drive; turn both ways; drive backward",
-        "q2: give a larger --area",
-    ]
-
-
-def test_an_area_that_holds_no_manoeuvre_is_refused() -> None:
-    vehicle = _find("husky_a200")
-    knowledge, limits = assume(vehicle), choose_limits(vehicle)
-    questions = ask_presence(knowledge, TURNING, find_largest(knowledge, limits, 60.0))
-    with pytest.raises(PlanError, match="no manoeuvre fits"):
-        make_plan(knowledge, questions, Request(limits, parse_area("1.7x1.6m", vehicle), 5.0))
-
-
-@pytest.mark.parametrize("text", ["20", "0x5m", "1x1m", "ax3", "20x10km"])
-def test_a_wrong_area_is_one_clear_error(text: str) -> None:
-    with pytest.raises(PlanError, match="--area"):
-        parse_area(text, _find("husky_a200"))
-
-
 @pytest.mark.parametrize(("text", "seconds"), [("60s", 60.0), ("2min", 120.0), ("45", 45.0)])
 def test_times_are_read(text: str, seconds: float) -> None:
     assert parse_time(text) == seconds
-
-
-@pytest.mark.parametrize("text", ["soon", "3s", "2h"])
-def test_a_wrong_time_is_one_clear_error(text: str) -> None:
-    with pytest.raises(PlanError, match="--time"):
-        parse_time(text)
 
 
 def test_a_vehicle_without_limits_asks_for_them() -> None:

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import json
-import re
 import runpy
 import shutil
 import subprocess
 import sys
-import xml.etree.ElementTree as ET
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -26,14 +24,12 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import load_vehicle
 from pipeline.logs.writer import LogWriter
 from pipeline.models import Model, find_effect
-from pipeline.report import ReportError
 from pipeline.report import viewer_files as derived_module
 from pipeline.report.export_source import ExportSource
 from pipeline.report.viewer_files import (
     write_csv,
     write_derived_log,
     write_foxglove_layout,
-    write_plotjuggler_layout,
 )
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
@@ -135,50 +131,6 @@ def test_predictions_begin_at_the_measured_pose_and_last_two_seconds(derived: Pa
         assert last.header.stamp.sec - first.header.stamp.sec == 2
 
 
-def test_a_finding_stands_where_it_happened(results: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    frame = pl.DataFrame(
-        {
-            "stage": ["checks", "checks"],
-            "id": ["pose_jump", "not_moving"],
-            "severity": ["warning", "error"],
-            "text": ["the pose <b>jumps</b>", "wheels in the air"],
-            "where": ["/odom", ""],
-            "t_start": [12.0, None],
-            "t_end": [13.0, None],
-        },
-        schema_overrides={"t_start": pl.Float64, "t_end": pl.Float64},
-    )
-    frame.write_parquet(manifest.path("findings"))
-    entry = replace(manifest.tables["findings"], rows=frame.height)
-    source = ExportSource(replace(manifest, tables={**manifest.tables, "findings": entry}))
-    found = read_officially(write_derived_log(source, tmp_path / "out.mcap"))
-
-    lines = [(message.name, message.level, message.msg) for _, message in found["/slip/findings"]]  # type: ignore[attr-defined]
-    assert lines == [("not_moving", 40, "wheels in the air"), ("pose_jump", 30, "the pose <b>jumps</b>")]
-    marker = found["/slip/finding_markers"][1][1]
-    place = manifest.read("velocities").filter(pl.col("t") >= 12.0).row(0, named=True)
-    assert marker.text == "pose_jump"  # type: ignore[attr-defined]
-    assert marker.pose.position.x == pytest.approx(place["x"])  # type: ignore[attr-defined]
-
-
-def test_a_recorder_with_a_clock_of_its_own_keeps_it(results: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    late = 3_600_000_000_000
-    poses = manifest.read("poses").with_columns(pl.col("log_time") + late)
-    poses.write_parquet(manifest.path("poses"))
-    source = ExportSource(manifest)
-    assert source.shift_ns == pytest.approx(late, abs=2e8)
-    found = read_officially(write_derived_log(source, tmp_path / "out.mcap"))
-    time, message = found["/slip/velocity/measured"][0]
-    stamp = message.header.stamp  # type: ignore[attr-defined]
-    assert time - (stamp.sec * 10**9 + stamp.nanosec) == source.shift_ns
-
-
 def test_a_long_run_is_exported_in_stretches_that_nobody_sees(
     source: ExportSource, derived: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -217,34 +169,6 @@ def test_a_long_run_is_exported_in_stretches_that_nobody_sees(
     assert apart.max() < 0.05
 
 
-def test_a_table_out_of_order_is_put_in_order(source: ExportSource, results: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    velocities = manifest.read("velocities")
-    velocities.sample(fraction=1.0, shuffle=True, seed=1).write_parquet(manifest.path("velocities"))
-    shuffled = ExportSource(manifest, stretch_rows=100)
-    feed = shuffled.feed("velocities", "stamp", ("stamp", "v_x"))
-    parts = [feed.take(low, high) for low, high in shuffled.stretches]
-    found = pl.concat([part for part in parts if part is not None])
-    assert found.equals(source.manifest.read("velocities").select("stamp", "v_x"))
-
-
-def test_a_stretch_without_a_live_command_is_exported_without_the_model(
-    source: ExportSource, results: Path, tmp_path: Path
-) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    poses = manifest.read("poses")
-    live = poses["t"] > 0.8 * poses["t"].max()
-    poses.with_columns(active=live).write_parquet(manifest.path("poses"))
-    cut = replace(source, manifest=manifest, stretch_rows=100)
-    found = read_officially(write_derived_log(cut, tmp_path / "cut.mcap"))
-    assert len(found["/slip/velocity/measured"]) == manifest.tables["velocities"].rows
-    assert 0 < len(found["/slip/velocity/model"]) < 0.9 * manifest.tables["velocities"].rows
-
-
 def test_a_model_that_cannot_be_run_leaves_no_file(
     source: ExportSource, results: Path, tmp_path: Path
 ) -> None:
@@ -268,22 +192,6 @@ def test_csv_holds_every_row_with_units_in_its_heads(source: ExportSource, tmp_p
     assert slip["g_w [rad/s]"].to_list() == stored["g_w"].to_list()
     assert slip["stamp [ns]"].to_list() == stored["stamp"].to_list()
     assert (tmp_path / "csv" / "findings.csv").read_text().startswith("run,dataset,")
-
-
-def test_layouts_name_only_topics_of_the_derived_log(
-    source: ExportSource, derived: Path, tmp_path: Path
-) -> None:
-    topics = set(read_officially(derived))
-    layout = json.loads(write_foxglove_layout(source, tmp_path / "l.json").read_text())
-    plots = [panel for name, panel in layout["configById"].items() if name.startswith("Plot")]
-    drawn = {line["value"].split(".")[0] for plot in plots for line in plot["paths"]}
-    assert drawn <= topics
-    assert len(drawn) == 7
-    panels = json.dumps(layout["layout"])
-    assert all(name in panels for name in layout["configById"])
-    tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
-    curves = [curve.get("name", "") for curve in tree.iter("curve")]
-    assert {"/".join(curve.split("/")[:-1]).split("/twist")[0] for curve in curves} == drawn
 
 
 def test_the_foxglove_layout_is_of_the_shape_that_its_viewers_save(
@@ -319,31 +227,6 @@ def test_the_foxglove_layout_is_of_the_shape_that_its_viewers_save(
     assert camera["distance"] >= (high - low).max()
 
 
-def test_the_plotjuggler_layout_is_of_the_shape_that_it_loads(source: ExportSource, tmp_path: Path) -> None:
-    tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "l.xml"))  # noqa: S314 - our own file
-    root = tree.getroot()
-    assert root.tag == "root"
-    window = root.find("tabbed_widget")
-    assert window is not None
-    assert window.attrib == {"parent": "main_window", "name": "Main Window"}
-    assert [child.tag for child in window] == ["Tab", "currentTabIndex"]
-    splitter = window.find("Tab/Container/DockSplitter")
-    assert splitter is not None
-    assert splitter.attrib["orientation"] in {"-", "|"}
-    areas = splitter.findall("DockArea")
-    assert len(areas) == int(splitter.attrib["count"]) == len(splitter.attrib["sizes"].split(";"))
-    for area in areas:
-        (plot,) = area
-        assert plot.attrib == {"style": "Lines", "mode": "TimeSeries"}
-        assert all(re.fullmatch("#[0-9a-f]{6}", curve.attrib["color"]) for curve in plot)
-
-
-def test_a_place_that_cannot_be_written_is_named(source: ExportSource, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(ReportError, match="--file"):
-        write_csv(source, tmp_path / "file" / "csv")
-
-
 @pytest.mark.parametrize(
     ("name", "more", "words"),
     [
@@ -364,17 +247,6 @@ def test_the_examples_run(
     monkeypatch.setattr(sys, "argv", [name, *arguments])
     runpy.run_path(str(ROOT / "examples" / name))
     assert words in capsys.readouterr().out
-
-
-def test_a_table_that_is_cut_is_one_clear_error(results: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "results"
-    shutil.copytree(results, folder)
-    (manifest,) = Store(folder).manifests()
-    path = manifest.path("velocities")
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(StoreError, match="cannot be read") as caught:
-        write_csv(ExportSource(manifest), tmp_path / "csv")
-    assert caught.value.code == "table_damaged"
 
 
 MEASURE = """

@@ -3,27 +3,20 @@
 from __future__ import annotations
 
 import os
-import re
 import time
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-import polars as pl
 import pytest
 from report_synthesis import list_places, make_report
 
 from pipeline.report import ReportError, theme
 from pipeline.report.figures import list_figures
-from pipeline.report.figures.slip_figures import list_responses
 from pipeline.report.page import FORMATS, write_figures
 from pipeline.report.scene import Scene
 from pipeline.report.theme import (
     build_spec,
     cache_path,
-    find_range,
     load_bundle,
-    round_up,
-    usual_ends,
     warm_bundle,
 )
 
@@ -78,15 +71,6 @@ def test_the_map_has_equal_scales(report: RunReport) -> None:
     assert scales[0] == pytest.approx(scales[1], rel=0.01), "height is a whole number of pixels"
 
 
-def test_every_colour_of_a_figure_has_a_twin_for_dark_screens(report: RunReport) -> None:
-    for figure in list_figures():
-        drawing = figure.draw(Scene(report))
-        assert drawing is not None
-        used = set(re.findall(r"#[0-9a-fA-F]{6}", str(build_spec(drawing))))
-        assert used
-        assert used <= set(theme.DARK_TWINS), figure.id
-
-
 def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:
     def luminance(colour: str) -> float:
         parts = [int(colour[i : i + 2], 16) / 255 for i in (1, 3, 5)]
@@ -96,32 +80,6 @@ def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:
     dark = [luminance(theme.DARK_TWINS[colour]) for colour in theme.SLIP_RAMP]
     assert light == sorted(light, reverse=True)
     assert dark == sorted(dark)
-
-
-@pytest.mark.parametrize(
-    ("value", "up"), [(1.53, 1.6), (1.6, 1.6), (0.0234, 0.024), (12.01, 13.0), (99.5, 100.0)]
-)
-def test_scales_end_on_two_digits(value: float, up: float) -> None:
-    assert round_up(value) == pytest.approx(up)
-
-
-def test_lone_peaks_are_cut_from_an_axis_and_told() -> None:
-    wave = np.sin(np.arange(2000) / 50)
-    calm = pl.DataFrame({"t": np.arange(2000) / 20, "value": wave})
-    low, high = usual_ends(calm["value"], exact=False)
-    assert find_range(calm, (low, high)).beyond is None
-    peaked = calm.with_columns(value=pl.when(pl.col("t") == 40.0).then(-31.0).otherwise(pl.col("value")))
-    low, high = usual_ends(peaked["value"], exact=False)
-    shown = find_range(peaked, (low, high))
-    assert shown.beyond == (-31.0, 40.0)
-    assert -2.0 < shown.low < -0.99
-    assert 0.99 < shown.high < 2.0
-
-
-def test_what_was_asked_is_never_cut() -> None:
-    asked = pl.Series([0.0] * 999 + [5.0])
-    assert usual_ends(asked, exact=True) == [0.0, 5.0]
-    assert usual_ends(asked, exact=False) == [0.0, 0.0]
 
 
 @pytest.fixture
@@ -142,15 +100,6 @@ def test_the_bundle_is_the_same_with_and_without_its_cache(cache: Path) -> None:
     assert [path.name for path in cache.parent.iterdir()] == [cache.name], "nothing half written stays"
 
 
-def test_a_cache_that_cannot_be_written_costs_nothing_but_time(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "cache").write_text("a file where a folder should be")
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    warm_bundle()
-    assert "vegaEmbed" in load_bundle()
-
-
 @pytest.mark.long
 def test_warming_fills_the_cache_without_waiting(cache: Path) -> None:
     start = time.perf_counter()
@@ -161,14 +110,3 @@ def test_warming_fills_the_cache_without_waiting(cache: Path) -> None:
         time.sleep(0.05)
     assert cache.is_file()
     assert os.access(cache, os.R_OK)
-
-
-def test_responses_begin_at_what_was_before_the_step_and_the_command_ends_at_one() -> None:
-    rows = list_responses(Scene(make_report(duration_s=120.0)))
-    assert set(rows) == {"response_x", "response_w"}
-    for frame in rows.values():
-        command = frame.filter(pl.col("series") == "command")
-        assert command.filter(pl.col("t") < -0.01)["value"].abs().max() == pytest.approx(0.0, abs=1e-9)
-        assert command.filter(pl.col("t") > 0.01)["value"].to_numpy() == pytest.approx(1.0, abs=1e-9)
-        measured = frame.filter(pl.col("series") == "velocity").sort("t")["value"]
-        assert 0.2 < float(measured[-1]) < 1.2

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import polars as pl
 import pytest
-from report_synthesis import make_report
 
-from pipeline.core.untrusted import objects_in
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
-from pipeline.estimation.ladder import format_rises
 from pipeline.estimation.problem import predict_at_from
-from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
-from pipeline.report.figures.model_figures import list_ladder_steps, list_parts
-from pipeline.report.figures.residual_figures import choose_signal, draw_autocorrelation
+from pipeline.models import Model, Timing, find_effect
+from pipeline.report.figures.residual_figures import choose_signal
 from pipeline.report.figures.slip_figures import find_steps
-from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView, read_model_text
-from pipeline.report.scene import RunReport, Scene
+from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, find_preset
@@ -47,15 +40,6 @@ def test_the_signal_is_the_one_that_explains() -> None:
     assert choose_signal(view_of(**signals, ideal_x=noise), "x") == "f_x"
 
 
-def test_a_signal_that_hardly_moves_explains_nothing() -> None:
-    rng = np.random.default_rng(6)
-    lone = np.zeros(400)
-    lone[:3] = 5.0
-    noise = rng.normal(0.0, 1.0, 400)
-    noise[:3] += 40.0
-    assert choose_signal(view_of(a_x=lone, ideal_x=noise, f_x=rng.uniform(-1, 1, 400)), "x") == "f_x"
-
-
 def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> None:
     rng = np.random.default_rng(7)
     t = np.arange(2000) * 0.25
@@ -79,19 +63,6 @@ def test_no_correlation_exceeds_one_where_stretches_differ() -> None:
     assert np.abs(cross_correlate(t, given, -given)[1]).max() <= 1.0 + 1e-9
 
 
-@pytest.mark.parametrize("step", [0.25, 0.15, 0.35])
-def test_the_words_below_the_autocorrelation_say_its_numbers(step: float) -> None:
-    t = np.arange(800) * step
-    view = view_of(**{f"{series}_{one}": np.sin(0.5 * t) for series in ("ideal", "model") for one in "xyw"})
-    view = replace(view, residuals=view.residuals.with_columns(t=pl.Series(t)))
-    drawing = draw_autocorrelation(Scene(RunReport({}, motion=view)))
-    assert drawing is not None
-    rows = drawing.rows["autocorrelation_x"].filter(pl.col("lag") > 0.0, series="ideal")
-    lag, value = min(rows.select("lag", "value").iter_rows(), key=lambda row: abs(row[0] - 1.0))
-    assert f"residuals {lag:.2g} s apart: forward {value:.2f} before, {value:.2f} after" in drawing.words
-    assert value > 0.5
-
-
 def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
     rng = np.random.default_rng(8)
     t = np.arange(2000) * 0.25
@@ -112,44 +83,6 @@ def test_steps_are_those_of_a_command_that_rests_before_and_after() -> None:
     assert high == pytest.approx([1.0, 0.2])
     holed = np.concatenate((t[t < 6.0], t[t >= 7.0]))
     assert find_steps(holed, np.interp(holed, t, asked), smallest=0.15)[0] == pytest.approx([11.0], abs=0.051)
-
-
-def test_the_staircase_names_what_each_rung_adds() -> None:
-    rows = list_ladder_steps(Scene(make_report(duration_s=20.0)))
-    assert rows["ladder"]["step"].to_list() == ["ideal", "+ effective_track", "+ drive_lag"]
-    assert rows["ladder"]["t"].to_list() == [1.06, 0.44, 0.31]
-    assert rows["ladder"]["told"][0] == "1.06 m \u00b7 55\u00b0", "degrees for people"
-    assert rows["ladder_floor"]["t"].to_list() == [0.19]
-    assert rows["ladder_ceiling"]["t"].to_list() == [1.06]
-    assert rows["ladder_ceiling"]["label"].to_list() == ["ceiling 1.06 m"]
-
-
-def test_a_rung_that_raises_an_error_says_so_in_the_words_of_the_verb() -> None:
-    report = make_report(duration_s=20.0)
-    ideal, rung, *_ = objects_in(report.diagnosis, "ladder")
-    risen = {**rung, "t_mrmse_m": 1.59}
-    diagnosis = {**report.diagnosis, "ladder": [ideal, risen]}
-    rows = list_ladder_steps(Scene(RunReport(report.summary, report.tables, diagnosis)))
-    said = format_rises(ideal, risen)
-    assert said == "position error rises by 50 %"
-    assert rows["ladder"]["step"][1] == f"+ effective_track ({said})"
-
-
-def test_the_budget_is_one_bar_from_the_whole_down_to_nothing() -> None:
-    rows = list_parts(Scene(make_report(duration_s=20.0)))
-    assert rows["cause"].to_list() == ["effective_track", "drive_lag", "disturbance", "localization noise"]
-    assert rows["from"].to_list() == pytest.approx([1.0, 0.15, 0.2, 0.05])
-    assert rows["to"].to_list() == pytest.approx([0.15, 0.2, 0.05, 0.0], abs=1e-12)
-    assert rows["high"].to_list() == [*map(pytest.approx, (0.18, 0.23, 0.08)), None]
-
-
-def test_the_model_that_is_drawn_is_the_one_that_was_written() -> None:
-    model = Model(vehicle(), (find_effect("effective_track")(k=1.79),))
-    file = read_model_text({"model": format_model(ModelFile(model))})
-    assert file is not None
-    assert file.model == model
-    for damaged in (None, 7, "", "[[effect", "[[effect]]\nid = 'no_longer_known'"):
-        assert read_model_text({"model": damaged}) is None
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:

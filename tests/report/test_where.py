@@ -3,44 +3,10 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 import pytest
-from report_synthesis import join_commands, make_report
+from report_synthesis import make_report
 
-from pipeline.report.page import list_regions, render_report
+from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport, Scene
-
-
-def test_where_is_what_the_screen_says() -> None:
-    report = make_report(duration_s=20.0)
-    told = [text for region, part in list_regions(report) for text in [f"{region}: {part}"]]
-    assert told == [entry["text"] for entry in report.diagnosis["where"]]  # type: ignore[attr-defined]
-    assert list_regions(RunReport(report.summary, report.tables)) == []
-
-
-def test_a_run_that_means_nothing_is_given_no_advice_on_models() -> None:
-    report = make_report(duration_s=20.0)
-    finding = {
-        "id": "pose_from_wheels",
-        "severity": "error",
-        "text": "the poses follow the wheels",
-        "where": "",
-    }
-    refused = {"effects": [], "ladder": [], "where": report.diagnosis["where"], "findings": [finding]}
-    page = render_report(RunReport({**report.summary, "findings": [finding]}, report.tables, refused))
-    shown = join_commands(page.split("<script", 1)[0])
-    for advice in (
-        "slip compare",
-        "slip serve",
-        "--apply",
-        "slip export",
-        "of the slip from commands arises",
-    ):
-        assert advice not in shown
-    # One reason, first, and slip only for who asks for it.
-    assert shown.index("he poses follow the wheels") < shown.index("This run cannot show slip")
-    assert "median slip" not in shown.split("<summary>Slip as it was computed</summary>")[0]
-    assert "the data of this run do not support a fit" not in shown
-    assert "slip inspect" in shown
-    assert "74 % of the yaw error" not in shown
 
 
 def test_the_worst_stretch_is_where_most_slip_is_and_keeps_every_point() -> None:

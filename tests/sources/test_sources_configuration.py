@@ -120,32 +120,6 @@ def test_merging_is_associative_and_the_empty_layer_changes_nothing(a: dict, b: 
     assert merge([a, {}]) == merge([{}, a]) == a
 
 
-@pytest.mark.parametrize(
-    ("name", "text", "words"),
-    [
-        ("2026/monday/run.toml", "[velocity]\nrate = 20\n", ["run.toml", "rate", "velocity"]),
-        ("2026/monday/run.toml", "[vehicel]\n", ["run.toml", "vehicel"]),
-        ("2026/monday/run.toml", "[velocity]\nrate_hz = -1\n", ["run.toml", "velocity.rate_hz"]),
-        ("2026/monday/run.toml", '[velocity]\nrate_hz = "fast"\n', ["run.toml", "velocity.rate_hz"]),
-        ("2026/monday/run.toml", '[command]\nunit = "mph"\n', ["run.toml", "command.unit", "mph"]),
-        ("2026/monday/run.toml", '[pose]\nframes = ["map"]\n', ["run.toml", "pose.frames"]),
-        ("2026/monday/run.toml", "[run\n", ["run.toml", "line 1"]),
-        ("fleet.toml", '[[match]]\n[match.run]\nterrain = "x"\n', ["fleet.toml", "glob", "1"]),
-        ("fleet.toml", "match = 3\n", ["fleet.toml", "match"]),
-        ("fleet.toml", '[[match]]\nglob = "other"\n[match.runs]\n', ["fleet.toml", "runs"]),
-    ],
-)
-def test_a_mistake_is_one_line_with_its_file_and_its_key(
-    log: Path, write: Write, name: str, text: str, words: list[str]
-) -> None:
-    write(name, text)
-    with pytest.raises(ConfigurationError) as caught:
-        load_configuration(log)
-    said = str(caught.value)
-    assert "\n" not in said
-    assert [word for word in words if word not in said] == []
-
-
 def test_a_missing_file_says_so(log: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigurationError, match="no such configuration file") as caught:
         load_configuration(log, given=tmp_path / "nowhere.toml")
@@ -161,28 +135,3 @@ def test_a_folder_in_place_of_a_file_says_so(log: Path, tmp_path: Path) -> None:
 def test_a_wrong_override_names_the_command_line(log: Path) -> None:
     with pytest.raises(ConfigurationError, match="command line"):
         load_configuration(log, overrides={"velocity": {"yaw": "gyro"}})
-
-
-@pytest.mark.parametrize(
-    ("text", "line", "what", "hint"),
-    [
-        ('[vehicle]\npreset = "huskie"', 2, "'huskie'", "husky_a200, jackal"),
-        ('\n[velocity]\nyaw = "gyro"', 3, "'gyro' in `velocity.yaw`", "Write one of: imu, pose."),
-        ('[run]\nterain = "ice"', 2, "unknown key `terain` in `run`",
-         "The keys there are: dataset, map, terrain."),
-        ('[comand]\ntopic = "/a"', 1, "unknown key `comand`", "command, imu"),
-        ('[[interval]]\nstart_s = 1\n[[interval]]\nend_s = "late"', 4, "interval[1].end_s", "The handbook"),
-        (('[[match]]\nglob = "*"\n[match.command]\nunit = "rpm"\n'
-         '[[match]]\nglob = "b*"\n[match.command]\nunit = "km/h"'), 8, "'km/h'", "m/s, mm/s, rad"),
-    ],
-)  # fmt: skip
-def test_a_wrong_word_is_named_with_its_line_and_the_right_ones(
-    tmp_path: Path, text: str, line: int, what: str, hint: str
-) -> None:
-    fleet = tmp_path / "fleet.toml"
-    fleet.write_text(text)
-    with pytest.raises(ConfigurationError) as caught:
-        load_configuration(tmp_path / "a.mcap")
-    assert caught.value.where == f"{fleet}, line {line}"
-    assert what in caught.value.what
-    assert hint in caught.value.hint

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import tempfile
-import webbrowser
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
@@ -14,12 +12,10 @@ import pytest
 from chrome import LAPTOP, PHONE
 from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_for_trouble
 
-from pipeline.cli.verbs_machine import _open_browser
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import find_peers
 from pipeline.logs.writer import LogWriter
-from pipeline.models import model_file
 from pipeline.report import theme
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -100,53 +96,6 @@ def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
     assert TOKEN not in str(chrome.run("document.cookie + document.documentElement.outerHTML"))
     chrome.run("location.reload()")
     chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
-    look_for_trouble(chrome)
-
-
-@pytest.mark.long
-def test_a_link_in_a_file_opens_the_page_as_well(
-    chrome: Chrome, workbench: Workbench, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    opened: list[str] = []
-    monkeypatch.setattr(webbrowser, "open", opened.append)
-    _open_browser(workbench.address)
-    # Others can read the words of a command: the browser is given a file that only this user can read.
-    (file,) = tmp_path.glob("slip-*.html")
-    assert opened == [file.as_uri()]
-    assert file.stat().st_mode & 0o077 == 0
-    chrome.open(opened[0])
-    chrome.wait(SHOWN)
-    chrome.call("Page.reload")
-    chrome.wait(f"document.readyState === 'complete' && {SHOWN}")
-    look_for_trouble(chrome)
-
-
-@pytest.mark.long
-def test_what_the_loader_of_models_warns_of_is_shown(
-    chrome: Chrome, workbench: Workbench, monkeypatch: pytest.MonkeyPatch, pictures: Path
-) -> None:
-    told = f"evil.py was not run {EVIL}"
-    monkeypatch.setattr(model_file._Reader, "_warn", lambda _reader: (told,))
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    assert chrome.run("document.querySelector('.model .warning').textContent") == told
-    chrome.picture(pictures / "workbench_warning.png")
-    look_for_trouble(chrome)
-
-
-@pytest.mark.long
-def test_an_address_that_changes_in_an_open_tab_is_followed(chrome: Chrome, workbench: Workbench) -> None:
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    panes = "document.querySelectorAll('.pane').length"
-    chrome.run(f"location.hash = 'a={RUN}&b={RUN}'")
-    chrome.wait(f"{panes} === 2 && document.querySelector('[data-slot=b]')?.dataset.drawn")
-    assert chrome.run("document.querySelector('#compare').checked")
-    chrome.run(f"location.hash = 'a={RUN}'")
-    chrome.wait(f"{panes} === 1 && !document.querySelector('#compare').checked")
     look_for_trouble(chrome)
 
 

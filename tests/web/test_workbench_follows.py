@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,11 +13,10 @@ from workbench_server import RUN, Workbench
 from pipeline.estimation import Input
 from pipeline.estimation.problem import predict_at
 from pipeline.job.run_results import load_vehicle
-from pipeline.models import list_effects, read_model
+from pipeline.models import read_model
 from pipeline.report.motion_view import load_motion_run
 from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Store
-from pipeline.web.workbench import Trials
 
 Rows = dict[str, dict[str, list[float | None]]]
 
@@ -69,42 +67,6 @@ def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Work
     assert rows_of(workbench.post("/api/rows", run=RUN))["track"] == rows_of(drawn)["track"]
 
 
-def test_where_is_told_of_the_model_that_stands_there(workbench: Workbench) -> None:
-    workbench.session(RUN)
-    ideal = cast("list[str]", workbench.post("/api/figures", run=RUN)["where"])
-    assert ideal[0].startswith("ideal yaw rate above")
-    workbench.session(RUN, "add", effect="effective_track")
-    after = cast("list[str]", workbench.post("/api/rows", run=RUN)["where"])
-    assert not any(sentence.startswith("turning") for sentence in after)
-
-
-def test_effects_that_do_the_same_are_one_row(workbench: Workbench) -> None:
-    workbench.session(RUN, "try")
-    end = time.monotonic() + 60.0
-    while True:
-        trial = cast("dict[str, Any]", workbench.session(RUN)["trial"])
-        if trial["done"]:
-            break
-        assert time.monotonic() < end
-        time.sleep(0.2)
-    rows = trial["found"]
-    assert [row["left"] for row in rows] == sorted(row["left"] for row in rows)
-    told = [name for row in rows for name in (row["id"], *row["twins"])]
-    assert len(told) == len(set(told))
-    numbers = {effect.id: len(effect.parameters) for effect in list_effects()}
-    for row in rows:
-        assert all(numbers[row["id"]] <= numbers[twin] for twin in row["twins"])
-
-
-def test_a_trial_waits_while_somebody_waits_for_an_answer() -> None:
-    trials = Trials()
-    with trials.waiting():
-        with trials.waiting():
-            assert not trials._idle.is_set()
-        assert not trials._idle.is_set()
-    assert trials._idle.is_set()
-
-
 def test_a_formula_that_the_diagnosis_found_is_added(workbench: Workbench) -> None:
     formula = (
         '[[effect]]\nid = "found_w"\nv_w = "k * w0"\nk = {value = -0.3, unit = "1", bounds = [-0.9, 0.9]}\n'
@@ -115,15 +77,3 @@ def test_a_formula_that_the_diagnosis_found_is_added(workbench: Workbench) -> No
     # The log turns as if its wheels stood 1.6 times as far apart.
     assert added["effects"][0]["parameters"][0]["value"] == pytest.approx(1 / 1.6 - 1.0, rel=0.02)
     assert added["errors"]["r"] < 0.1 * added["ideal"]["r"]
-
-
-def test_a_value_at_its_bound_is_told(workbench: Workbench) -> None:
-    added = cast("dict[str, Any]", workbench.session(RUN, "add", effect="effective_track")["session"])
-    assert added["effects"][0]["parameters"][0]["at_bound"] is False
-    highest = added["effects"][0]["parameters"][0]["to"]
-    far = cast(
-        "dict[str, Any]",
-        workbench.session(RUN, "set", effect="effective_track", parameter="k", value=10.0)["session"],
-    )
-    assert highest < 10.0
-    assert far["effects"][0]["parameters"][0]["at_bound"] is True

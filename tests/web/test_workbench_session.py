@@ -75,54 +75,6 @@ def test_a_value_set_by_hand_is_scored_and_not_fitted(workbench: Workbench) -> N
     assert value(workbench.session(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
 
 
-def test_a_preview_shows_rows_and_keeps_nothing(workbench: Workbench) -> None:
-    added = workbench.session(RUN, "add", effect="effective_track")
-    before = (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes()
-    shown = workbench.session(RUN, "preview", effect="effective_track", parameter="k", value=1.1)
-
-    assert errors(shown)["r"] > errors(added)["r"]
-    assert {"arcs", "model_w", "reach", "residual_w", "ladder"} <= set(cast("Session", shown["rows"]))
-    assert (workbench.results / "workbench/desks/a/field/hidden.json").read_bytes() == before
-
-
-def test_a_locked_value_stays_in_a_fit(workbench: Workbench) -> None:
-    workbench.session(RUN, "add", effect="effective_track")
-    workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.3)
-    workbench.session(RUN, "lock", effect="effective_track", parameter="k")
-    assert value(workbench.session(RUN, "fit")) == 1.3
-    workbench.session(RUN, "lock", effect="effective_track", parameter="k")
-    assert value(workbench.session(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
-
-
-def test_an_effect_switched_off_shows_what_it_carries(workbench: Workbench) -> None:
-    added = workbench.session(RUN, "add", effect="effective_track")
-    off = workbench.session(RUN, "switch", effect="effective_track")
-    assert errors(off)["r"] > 5.0 * errors(added)["r"]
-    assert effects(off)[0]["off"]
-    assert errors(workbench.session(RUN, "switch", effect="effective_track"))["r"] == pytest.approx(
-        errors(added)["r"], rel=0.3
-    )
-
-
-def test_a_learned_term_is_a_step_that_is_switched_off_and_taken_off(workbench: Workbench) -> None:
-    opened = workbench.session(RUN)
-    added = workbench.session(RUN, "add", effect="learned_term")
-    assert errors(added)["r"] < 0.7 * errors(opened)["r"]
-    (card,) = effects(added)
-    assert card["id"] == "learned_term"
-    assert str(card["sentence"]).startswith("Learned term: ")
-
-    off = workbench.session(RUN, "switch", effect="learned_term")
-    assert errors(off)["r"] == pytest.approx(errors(opened)["r"], rel=0.02)
-    workbench.session(RUN, "switch", effect="learned_term")
-    assert effects(workbench.session(RUN, "drop", effect="learned_term")) == []
-
-    # With the hidden effect in the model nothing is left to learn.
-    workbench.session(RUN, "add", effect="effective_track")
-    refused = workbench.refuse("/api/session", run=RUN, action="add", effect="learned_term")
-    assert refused["code"] == "no_help"
-
-
 def test_everything_is_there_again_after_the_server_was_started_anew(results: Path) -> None:
     first = Workbench(results)
     added = first.session(RUN, "add", effect="effective_track")
@@ -141,34 +93,6 @@ def test_a_damaged_session_is_begun_anew(workbench: Workbench, content: bytes) -
     (workbench.results / "workbench/desks/a/field/hidden.json").write_bytes(content)
     assert workbench.refuse("/api/save", run=RUN)["code"] == "no_such_desk"
     assert effects(workbench.session(RUN)) == []
-
-
-def test_two_sessions_of_a_run_do_not_touch_each_other(workbench: Workbench) -> None:
-    workbench.session(RUN, "add", effect="effective_track")
-    other = workbench.session(RUN, "add", effect="wheel_radius", anyway=True, slot="b")
-    assert [effect["id"] for effect in effects(other)] == ["wheel_radius"]
-    assert [effect["id"] for effect in effects(workbench.session(RUN))] == ["effective_track"]
-
-
-def test_a_saved_model_is_a_model_file(workbench: Workbench) -> None:
-    added = workbench.session(RUN, "add", effect="effective_track")
-    saved = workbench.post("/api/save", run=RUN)
-    path = workbench.results / "workbench/models/field/hidden.toml"
-    assert saved["path"] == str(path)
-    assert read_model(path).model.change("effective_track").effect("effective_track").values[
-        "k"
-    ] == pytest.approx(value(added))
-    status, headers, body = workbench.request("GET", "/model.toml?run=field%2Fhidden&slot=a")
-    assert status == 200
-    assert "hidden.toml" in headers["content-disposition"]
-    assert b"effective_track" in body
-    # It says what it was fitted to, and keeps its numbers; values set by hand were fitted to nothing.
-    written = read_model(path)
-    assert [row["run"] for row in written.list_fitted("runs")] == [RUN]
-    assert written.model.effect("effective_track").values["k"] == value(added)
-    workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.2)
-    workbench.post("/api/save", run=RUN)
-    assert read_model(path).list_fitted("runs") == []
 
 
 @pytest.mark.parametrize("folder", ["models", "desks/a", "uploads"])
@@ -209,30 +133,6 @@ def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -
     assert {path: path.read_bytes() for path in home.rglob("*") if path.is_file()} == before
 
 
-def test_a_formula_is_parsed_with_its_units_and_never_run(workbench: Workbench) -> None:
-    typed = {"effect": "my_track", "channel": "v_w", "formula": "c * w0", "parameters": "c [1] -0.9 .. 0.5"}
-    opened = workbench.session(RUN)
-    added = workbench.session(RUN, "formula", **typed)
-    assert errors(added)["r"] < 0.1 * errors(opened)["r"]
-    assert value(added) == pytest.approx(1.0 / TRACK - 1.0, abs=0.01)
-    workbench.session(RUN, "drop", effect="my_track")
-
-    for wrong in (
-        {"formula": "c * v0"},
-        {"formula": "__import__('os').system('true')"},
-        {"formula": "c * w0.__class__"},
-        {"formula": "open * w0"},
-        {"parameters": "c [1]"},
-        {"parameters": "c [1] 2 .. 1"},
-        {"effect": "../x"},
-        {"channel": "v_z"},
-        {"formula": "c * w0 +" + " w0 +" * 200},
-    ):
-        error = workbench.refuse("/api/session", run=RUN, action="formula", **{**typed, **wrong})
-        assert error["hint"]
-    assert effects(workbench.session(RUN)) == []
-
-
 def wait_for_trial(workbench: Workbench) -> dict[str, object]:
     end = time.monotonic() + 60.0
     while True:
@@ -255,22 +155,6 @@ def test_the_evidence_ranks_the_hidden_effect_first_and_offers_nothing_once_it_i
     assert wait_for_trial(workbench)["found"] == []
 
 
-def test_what_a_diagnosis_named_is_shown(workbench: Workbench) -> None:
-    home = workbench.results / "runs/field/hidden"
-    manifest = json.loads((home / "manifest.json").read_text())
-    del manifest["checksum"]
-    named = {
-        "input": "command",
-        "effects": [{"id": "effective_track", "gain": 0.9}],
-        "undecided": [],
-    }
-    (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(named))
-    manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
-    (home / "manifest.json").write_text(json.dumps(manifest))
-    opened = workbench.session(RUN)
-    assert opened["diagnosis"] == named
-
-
 @pytest.mark.long
 def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Workbench) -> None:
     assert workbench.session(RUN)["diagnosis"] is None
@@ -280,18 +164,6 @@ def test_a_diagnosis_that_is_asked_for_is_kept_beside_the_results(workbench: Wor
     assert job["error"] is None
     named = cast("dict[str, list[dict[str, object]]]", workbench.session(RUN)["diagnosis"])
     assert [effect["id"] for effect in named["effects"]] == ["effective_track"]
-
-
-def test_a_plan_that_is_not_there_is_one_clear_error(workbench: Workbench) -> None:
-    assert workbench.session(RUN)["plan"] is None
-    for run, name, code in (
-        (RUN, "plan.mcap", "no_plan"),
-        (RUN, "../../manifest.json", "no_plan"),
-        ("nobody", "plan.mcap", "no_such_run"),
-    ):
-        status, _, body = workbench.request("GET", f"/plan?run={run}&file={name}")
-        assert status >= 400
-        assert json.loads(body)["error"]["code"] == code
 
 
 def test_what_cannot_be_done_is_said_and_changes_nothing(workbench: Workbench) -> None:
@@ -372,46 +244,6 @@ def test_whatever_formula_is_written_the_session_stays_usable(
         assert len(error["message"]) < 1000
     assert shared_workbench.session(RUN)["session"]["effects"] == before["effects"]  # type: ignore[index]
     assert errors(shared_workbench.session(RUN)) == cast("Session", before)["errors"]
-
-
-@pytest.mark.parametrize(
-    "broken",
-    ["not = [toml", '[[effect]]\nid = "magic"\n', "", "x = " + "[" * 5000, "x = " + "9" * 5000, "\u0000"],
-    ids=["no_toml", "unknown_effect", "empty", "deep", "digits", "null"],
-)
-def test_a_step_that_cannot_be_opened_any_more_is_left_out(workbench: Workbench, broken: str) -> None:
-    added = workbench.session(RUN, "add", effect="effective_track")
-    path = workbench.results / "workbench/desks/a/field/hidden.json"
-    kept = json.loads(path.read_text())
-    kept["steps"].append({**kept["steps"][-1], "model": broken, "said": "broken"})
-    kept["at"] = 2
-    path.write_text(json.dumps(kept))
-    assert errors(workbench.session(RUN)) == errors(added)
-    assert effects(workbench.session(RUN, "undo")) == []
-    assert errors(workbench.session(RUN, "redo")) == errors(added)
-
-    # Also where it stands in the way of undo.
-    kept["steps"] = [kept["steps"][0], kept["steps"][2], kept["steps"][1]]
-    path.write_text(json.dumps(kept))
-    assert errors(workbench.session(RUN)) == errors(added)
-    assert effects(workbench.session(RUN, "undo")) == []
-    assert errors(workbench.session(RUN, "redo")) == errors(added)
-
-
-@pytest.mark.parametrize(
-    "content",
-    [
-        "[" * 100_000, '{"run": ' + '{"a":' * 100_000, '{"value": ' + "9" * 350 + "}", '{"run": "\\ud800"}',
-        "", "null", "[]", '"x"', "{", '{"run": "x", "run": 3}', '{"value": NaN}', "\u0000",
-        '{"run": "' + "x" * 90_000 + '"}', '{"run": "\\u0000"}', '{"x": 1}',
-    ],
-    ids=lambda content: content[:20],
-)  # fmt: skip
-def test_a_request_that_cannot_be_read_is_one_sentence(shared_workbench: Workbench, content: str) -> None:
-    for path in ("/api/session", "/api/figures", "/api/rows", "/api/save", "/api/diagnose"):
-        status, _, body = shared_workbench.request("POST", path, content.encode())
-        assert status in {404, 422}, body
-        assert len(json.loads(body)["error"]["message"]) < 1000
 
 
 @pytest.mark.long

@@ -5,7 +5,6 @@ from __future__ import annotations
 import http.client
 import os
 import resource
-import signal
 import socket
 import subprocess
 import sys
@@ -16,9 +15,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 import pytest
-from test_workbench_upload import begin_upload, files_below, wait_for
+from test_workbench_upload import wait_for
 from test_workbench_workers import read_object
-from workbench_server import LIMITS, OPEN_FILES, PATIENCE_S, TOKEN, Workbench
+from workbench_server import LIMITS, OPEN_FILES, TOKEN, Workbench
 
 from pipeline.web import server as serving
 from pipeline.web.server import serve
@@ -279,27 +278,6 @@ def test_when_files_run_out_all_the_same_nothing_is_printed_and_it_goes_on(serve
     assert served.ask() < ANSWERED_S
 
 
-def test_the_server_raises_its_own_limit_of_open_files(tmp_path: Path) -> None:
-    with serve_apart(tmp_path, "-Sn") as served, ExitStack() as held:
-        bearer = {"Authorization": f"Bearer {served.token}"}
-        for _ in range(CROWD):
-            line = http.client.HTTPConnection("127.0.0.1", served.port, timeout=ANSWERED_S)
-            held.callback(line.close)
-            line.connect()
-            line.putrequest("POST", "/api/session")
-            for name, value in {**bearer, "Content-Length": "9", "Expect": "100-continue"}.items():
-                line.putheader(name, value)
-            line.endheaders()
-            # It goes on: its connection belongs to somebody with the token, and there are files for more.
-            assert line.sock.recv(21) == b"HTTP/1.1 100 Continue"
-        assert served.ask() < ANSWERED_S
-        assert served.errors.read_text() == ""
-        # Ended by its user, it gives up what is under way without a word of where it was.
-        served.process.send_signal(signal.SIGINT)
-        served.process.wait(PATIENCE_S)
-        assert "Traceback" not in served.errors.read_text()
-
-
 @pytest.fixture
 def hasty(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Workbench]:
     """A workbench that soon gives up who does not show the token."""
@@ -326,28 +304,6 @@ def test_a_connection_shows_the_token_soon_or_is_closed(hasty: Workbench) -> Non
             time.sleep(0.05)
         wait_for(lambda: not any(is_open(line) for line in lines))
     assert time.monotonic() - started > 0.4
-
-
-def test_uploads_and_downloads_of_somebody_with_the_token_take_their_time(hasty: Workbench) -> None:
-    with begin_upload(hasty, "slow.mcap", 400) as up, ExitStack() as crowd:
-        down = crowd.enter_context(socket.socket())
-        down.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
-        down.connect(("127.0.0.1", hasty.port))
-        down.sendall(b"GET /vega.js HTTP/1.1\r\n" + HOST + f"Authorization: Bearer {TOKEN}\r\n\r\n".encode())
-        whole = len(hasty.request("GET", "/vega.js")[2])
-        for _ in range(serving.MOST_PENDING + 50):
-            crowd.enter_context(socket.create_connection(("127.0.0.1", hasty.port)))
-        for _ in range(3):
-            time.sleep(0.4)
-            up.sendall(b"x" * 100)
-        up.settimeout(10.0)
-        assert up.recv(1000).startswith(b"HTTP/1.1 200 ")
-        received = 0
-        while received < whole:
-            piece = down.recv(1 << 20)
-            assert piece
-            received += len(piece)
-    wait_for(lambda: files_below(hasty.results) == [".lock"])
 
 
 def test_a_connection_that_has_shown_the_token_is_kept_for_the_next_request(hasty: Workbench) -> None:

@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-import numpy as np
 import pytest
 from verbs import run_verb
 from workbench_server import RUN, TRACK
@@ -201,51 +200,3 @@ def test_verb_page_and_json_give_one_reason_against_an_effect(
     added = cast("dict[str, Any]", workbench.session(RUN, "add", effect=effect, anyway=True)["session"])
     assert {one["id"]: one["refused"] for one in added["effects"]} == {effect: reason}
     assert json.loads(run_verb(*add, "--anyway", "--json").stdout)["refused"] == {effect: reason}
-
-
-def list_texts(column: list[str] | dict[str, Any]) -> list[str]:
-    """A column of texts as it is sent: a list, or codes of levels."""
-    return column if isinstance(column, list) else [column["levels"][code] for code in column["codes"]]
-
-
-def test_the_budget_is_of_the_model_on_the_screen(workbench: Workbench) -> None:
-    workbench.session(RUN)
-    assert cast("list[object]", workbench.post("/api/figures", run=RUN, tab="budget")["shown"]) == []
-    workbench.session(RUN, "add", effect="effective_track")
-    drawn = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="budget"))
-    assert list_texts(drawn["rows"]["budget"]["cause"])[0] == "effective_track"
-    # Each share is called by what it is of.
-    assert all(
-        told.startswith("slip ") and ", 2 s error " in told
-        for told in list_texts(drawn["rows"]["budget"]["told"])
-    )
-
-
-def measure_ends(rows: dict[str, Any]) -> float:
-    """Mean square distance of the ends of two-second lines from where the vehicle was then [m^2]."""
-    ends = rows["stretch_errors"]
-    apart = [(np.array(ends[one]) - np.array(ends[other])) ** 2 for one, other in (("x", "x2"), ("y", "y2"))]
-    return float(np.mean(np.sum(apart, axis=0)))
-
-
-def test_the_first_view_shows_one_stretch_the_worst_first(workbench: Workbench) -> None:
-    workbench.session(RUN)
-    assert workbench.refuse("/api/figures", run=RUN, tab="bogus")["code"] == "bad_request"
-    worst = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="first"))
-    assert [figure["id"] for figure in worst["shown"]] == ["paths", "stretch"]
-    span = worst["stretch"]
-    assert span["place"] == 0
-    assert span["to"] - span["from"] == pytest.approx(30.0)
-    errors = []
-    for place in range(span["count"]):
-        drawn = cast("dict[str, Any]", workbench.post("/api/figures", run=RUN, tab="first", stretch=place))
-        errors.append(measure_ends(drawn["rows"]))
-        times = [t for t in drawn["rows"]["stretch_model_w"]["t"] if t is not None]
-        assert drawn["stretch"]["from"] <= min(times) <= max(times) <= drawn["stretch"]["to"]
-    assert errors[0] == max(errors)
-
-    # Two-second lines begin where the vehicle was measured, and with the effect end there, too.
-    before = errors[0]
-    workbench.session(RUN, "add", effect="effective_track")
-    rows = cast("dict[str, Any]", workbench.post("/api/rows", run=RUN)["rows"])
-    assert measure_ends(rows) < 0.1 * before

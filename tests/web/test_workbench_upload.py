@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 from workbench_server import LIMITS, TOKEN, Workbench
 
-from pipeline.batch.batch_check import verify_results
 from pipeline.logs.writer import LogWriter
-from pipeline.store import Store
 from pipeline.web.stored_runs import clean_name
 
 if TYPE_CHECKING:
@@ -76,31 +74,6 @@ def test_a_dropped_log_becomes_a_run(empty: Workbench, hidden_log: Path) -> None
     (run,) = cast("list[dict[str, object]]", empty.get("/api/runs")["runs"])
     assert run["run"] == job["run"]
     assert run["report"]
-
-
-def test_a_log_that_the_workbench_deleted_itself_is_not_gone(empty: Workbench, hidden_log: Path) -> None:
-    empty.request("POST", "/api/upload?name=mine.mcap", hidden_log.read_bytes())
-    empty.wait_for_jobs()
-    assert files_below(empty.results / "workbench" / "uploads") in ([], [".lock"])
-    found = verify_results(Store(empty.results), logs=True, notify=lambda _: None)
-    assert (found.logs, found.gone) == ((), ())
-
-
-def test_a_log_of_an_unknown_vehicle_waits_for_somebody_to_say_it(empty: Workbench, tmp_path: Path) -> None:
-    write_plain(tmp_path / "plain.mcap")
-    empty.request("POST", "/api/upload?name=plain.mcap", (tmp_path / "plain.mcap").read_bytes())
-    (job,) = empty.wait_for_jobs()
-    error = cast("dict[str, str]", job["error"])
-    assert "vehicle" in error["code"]
-    # The page has a list to choose from: options of a command are no help there.
-    assert error["message"].endswith("choose it from the list")
-    assert "--" not in error["message"]
-
-    status, _, _ = empty.request("POST", f"/api/retry?id={job['id']}&vehicle=jackal", b"{}")
-    assert status == 200
-    (job,) = empty.wait_for_jobs()
-    assert job["error"] is None
-    assert job["run"] == "dropped/plain"
 
 
 def test_what_is_no_log_is_said_so_and_can_be_dismissed(empty: Workbench) -> None:
