@@ -11,7 +11,7 @@ from chrome import BROWSER, Browser, Chrome
 from deep_folders import dig  # noqa: F401
 from golden import check_golden  # noqa: F401
 from hypothesis import settings
-from stored import place, stored_run  # noqa: F401
+from stored import diagnosed_results, place, recorded_results, stored_run  # noqa: F401
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

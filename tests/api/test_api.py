@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 import polars as pl
 import pytest
+from verbs import ask_verb
 
 import pipeline as slip
-from pipeline.cli import main
 from pipeline.job.work import COLUMNS
 from pipeline.simulate import simulate_case
 
@@ -34,14 +34,9 @@ def diagnosis(run: slip.Run) -> slip.Diagnosis:
     return run.diagnose()
 
 
-def ask(run: slip.Run, capsys: pytest.CaptureFixture[str], *words: str) -> dict[str, Any]:
+def ask(run: slip.Run, *words: str) -> dict[str, Any]:
     """The JSON object of a verb."""
-    capsys.readouterr()
-    with pytest.raises(SystemExit) as ended:
-        main([*words, "--out", str(find_results(run)), "--json"])
-    assert ended.value.code == 0
-    content: dict[str, Any] = json.loads(capsys.readouterr().out)
-    return content
+    return ask_verb(*words, "--results", find_results(run))
 
 
 def find_results(run: slip.Run) -> Path:
@@ -53,9 +48,10 @@ def as_json(content: object) -> object:
 
 
 def test_a_diagnosis_is_that_of_the_command_line(
-    run: slip.Run, diagnosis: slip.Diagnosis, capsys: pytest.CaptureFixture[str]
+    run: slip.Run,
+    diagnosis: slip.Diagnosis,
 ) -> None:
-    (told,) = ask(run, capsys, "diagnose", run.name)["runs"]
+    (told,) = ask(run, "diagnose", run.name)["runs"]
 
     assert as_json(diagnosis.to_json()) == told
     assert diagnosis.effects["effect"].to_list() == [effect["id"] for effect in told["effects"]]
@@ -79,13 +75,14 @@ def test_what_the_analysis_found_is_not_looked_for_again(
 
 
 def test_a_fit_is_that_of_the_command_line(
-    run: slip.Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    run: slip.Run,
+    tmp_path: Path,
 ) -> None:
     model = slip.Model("husky_a200") + slip.effect(EFFECT)
     path = tmp_path / "husky.toml"
     model.write(path)
     fit = model.fit(run, input="measured")
-    told = ask(run, capsys, "model", "fit", str(path), "--on", run.name, "--input", "measured")
+    told = ask(run, "model", "fit", str(path), "--on", run.name, "--input", "measured")
 
     content = json.loads(json.dumps(fit.to_json()))
     assert content == {key: told[key] for key in content}
@@ -96,7 +93,7 @@ def test_a_fit_is_that_of_the_command_line(
     assert (tmp_path / "again.toml").read_text() == path.read_text()
     assert slip.Model.read(path).export("python").startswith('"""')
 
-    compared = ask(run, capsys, "model", "compare", str(path), str(path), "--on", run.name)["compared"][0]
+    compared = ask(run, "model", "compare", str(path), str(path), "--on", run.name)["compared"][0]
     errors = slip.Model.read(path).errors(run)  # with the six digits of the file, as `compare` reads it
     assert errors["t_mrmse_m"].to_list() == [
         compared[key]["t_mrmse_m"] for key in ("carried", "own_fit", "ideal")

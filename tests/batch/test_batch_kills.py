@@ -24,7 +24,7 @@ from pipeline.store import STEPS, Store
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-FEW_ROUNDS, MANY_ROUNDS = 20, 200
+FEW_ROUNDS, MANY_ROUNDS = 8, 100
 
 
 @pytest.fixture(scope="module")

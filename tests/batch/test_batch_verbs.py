@@ -4,39 +4,34 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pytest
+from verbs import run_slip
 
 from pipeline.batch.season import Line
-from pipeline.cli import main
 from pipeline.cli.screen import LineWatch
 
-
-def slip(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as caught:
-        main([str(argument) for argument in arguments])
-    out, err = capsys.readouterr()
-    return int(caught.value.code or 0), out, err
-
+if TYPE_CHECKING:
+    import pytest
 
 INLINE = ("--executor", "inline", "--settle", "0")
 
 
-def test_batch_names_copies(capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path) -> None:
+def test_batch_names_copies(season: Path, tmp_path: Path) -> None:
     (season / "z.mcap").write_bytes((season / "a.mcap").read_bytes())
-    text = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)[1]
+    text = run_slip("batch", season, "--out", tmp_path / "out", *INLINE)[1]
     assert "copies, counted once" in text
     assert f"{season / 'z.mcap'}\n      the same content as season/a" in text
 
 
 def test_a_name_that_begins_with_a_dash_goes_behind_two(
-    capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (season / "a.mcap").rename(season / "-a.mcap")
     monkeypatch.chdir(season)
-    assert slip(capsys, "batch", "-a.mcap", "--out", tmp_path / "out", *INLINE)[0] == 2
-    assert slip(capsys, "batch", "--out", tmp_path / "out", *INLINE, "--", "-a.mcap")[0] == 0
-    assert "--" in slip(capsys, "batch", "--help")[1].split("dash")[0][-60:]
+    assert run_slip("batch", "-a.mcap", "--out", tmp_path / "out", *INLINE)[0] == 2
+    assert run_slip("batch", "--out", tmp_path / "out", *INLINE, "--", "-a.mcap")[0] == 0
+    assert "--" in run_slip("batch", "--help")[1].split("dash")[0][-60:]
 
 
 def test_estimates_do_without_sizes() -> None:
@@ -48,8 +43,8 @@ def test_estimates_do_without_sizes() -> None:
     assert watch.estimate_rest() == 0.0
 
 
-def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Path, tmp_path: Path) -> None:
-    _, _, err = slip(capsys, "batch", season, "--out", tmp_path / "out", *INLINE)
+def test_progress_has_an_estimate(season: Path, tmp_path: Path) -> None:
+    _, _, err = run_slip("batch", season, "--out", tmp_path / "out", *INLINE)
     lines = err.splitlines()
     assert lines[0].startswith("4 logs to work on")
     assert lines[1].startswith("[1/4] season/")
@@ -57,12 +52,9 @@ def test_progress_has_an_estimate(capsys: pytest.CaptureFixture[str], season: Pa
     assert "left" not in lines[4]
 
 
-def test_schedule_prints_units_of_this_folder(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_schedule_prints_units_of_this_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
-    code, out, _ = slip(
-        capsys,
+    code, out, _ = run_slip(
         "batch",
         "schedule",
         "logs",

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 import shutil
 from pathlib import Path
 
 import pytest
+from verbs import ask_verb, print_verb, run_verb
 
 from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store.checksums import decode_checked, encode_checked
+
+ERRORS = ("t_mrmse_m", "r_mrmse_rad")
 
 
 def slip(*arguments: object) -> int:
@@ -34,33 +37,8 @@ def hash_tree(folder: Path) -> dict[str, str]:
     }
 
 
-@pytest.fixture(scope="module")
-def analyzed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a log, its complete results in `results`, and a model of a Husky."""
-    folder = tmp_path_factory.mktemp("field")
-    simulate_case(
-        "ideal_husky", {"effective_track": {"k": 1.7}}, out=folder / "field" / "wide.mcap", duration_s=40.0
-    )
-    options = Options(out=folder / "results", report=False, diagnosis=True, overrides={
-        "run": {"dataset": "yard"}, "vehicle": {"preset": "husky_a200"},
-    })  # fmt: skip
-    analyze_log(folder / "field" / "wide.mcap", options)
-    assert slip("model", "new", folder / "husky.toml", "--vehicle", "husky_a200", "--quiet") == 0
-    return folder
-
-
-@pytest.fixture
-def place(analyzed: Path, tmp_path: Path) -> Path:
-    """A copy of it, so that what one test breaks, no other sees."""
-    shutil.copytree(analyzed, tmp_path / "copy")
-    return tmp_path / "copy"
-
-
 @pytest.mark.parametrize("name", ["field/wide.mcap", "field/wide"])
-def test_a_fit_leaves_stored_results_byte_for_byte(
-    place: Path, monkeypatch: pytest.MonkeyPatch, name: str
-) -> None:
-    monkeypatch.chdir(place)
+def test_a_fit_leaves_stored_results_byte_for_byte(place: Path, name: str) -> None:
     before = hash_tree(place / "results")
 
     assert slip("model", "add", "husky.toml", "effective_track", "--on", name, "--quiet") == 0
@@ -104,10 +82,10 @@ def test_a_copied_log_is_the_stored_run(place: Path) -> None:
 
 
 def test_a_log_that_is_not_stored_is_storeds_own_vehicle_and_only_once(
-    tmp_path: Path, analyzed: Path
+    tmp_path: Path, stored_run: Path
 ) -> None:
-    log, model = analyzed / "field" / "wide.mcap", tmp_path / "mine.toml"
-    shutil.copyfile(analyzed / "husky.toml", model)
+    log, model = stored_run / "field" / "wide.mcap", tmp_path / "mine.toml"
+    shutil.copyfile(stored_run / "husky.toml", model)
     assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
     first = hash_tree(tmp_path / "fitted")
     assert slip("model", "fit", model, "--on", log, "--out", tmp_path / "fitted", "--quiet") == 0
@@ -142,7 +120,7 @@ def test_the_vehicle_that_is_chosen_is_the_one_that_counts(
         assert slip("model", "show", model) == 0
         assert ("Jackal" if whose == "model" else "Husky") in capsys.readouterr().out
     # The log is a Husky's with a track 1.7 times its own.
-    assert tracks["run"] == pytest.approx(1.7, rel=0.02)
+    assert tracks["run"] == pytest.approx(1.7, rel=0.05)
     assert tracks["model"] != pytest.approx(1.7, rel=0.1)
     assert hash_tree(place / "results") == before
 
@@ -165,8 +143,8 @@ def test_a_diagnosis_with_other_choices_leaves_the_stored_run(
     assert hash_tree(out) == before
 
 
-def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, analyzed: Path) -> None:
-    log = analyzed / "field" / "wide.mcap"
+def test_what_a_diagnosis_stores_does_not_depend_on_its_input(tmp_path: Path, stored_run: Path) -> None:
+    log = stored_run / "field" / "wide.mcap"
     for name in ("command", "measured"):
         assert slip("diagnose", log, "--out", tmp_path / name, "--input", name, "--quiet") == 0
     assert hash_tree(tmp_path / "command" / "runs") == hash_tree(tmp_path / "measured" / "runs")
@@ -184,10 +162,7 @@ def test_a_changed_configuration_is_said_and_the_stored_run_is_read(
     assert hash_tree(place / "results") == before
 
 
-def test_no_verb_that_reads_writes_into_a_stored_run(
-    place: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.chdir(place)
+def test_no_verb_that_reads_writes_into_a_stored_run(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = hash_tree(place / "results" / "runs")
     for verb in (
         ("compare", "results"),
@@ -263,3 +238,23 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
         path.write_text("{")
         assert slip("diagnose", run, "--out", out, "--quiet") == 0
         assert len(searches) == searched + 2
+
+
+def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(place: Path) -> None:
+    """Effects that the vehicle lacks cost something on data that they were not fitted to."""
+    ask_verb("model", "add", "husky.toml", "effective_track", "drive_lag", "--on", "field/wide")
+    useless = ("slope_drift", "lateral_skid", "heading_skew", "turn_lag")
+    before = (place / "husky.toml").read_bytes()
+    refused = run_verb("model", "add", "husky.toml", *useless, "--on", "field/wide", "--quiet")
+    assert (refused.returncode, "are not supported by the data (" in refused.stderr) == (1, True)
+    assert (place / "husky.toml").read_bytes() == before
+    found = ask_verb("model", "add", "husky.toml", *useless, "--on", "field/wide", "--anyway")
+    step = found["step"]
+    assert step["rises"] == [key for key in ERRORS if step[key][1] > 1.001 * step[key][0]]
+    assert step["rises"]
+    assert set(useless) < set(found["ladder"][-1]["effects"]), "the ladder ends at the model itself"
+    for below, rung in itertools.pairwise(found["ladder"]):
+        assert rung.get("rises", []) == [key for key in ERRORS if rung[key] > 1.001 * below[key]]
+    told = print_verb("model", "drop", "husky.toml", "drive_lag", "turn_lag", "--on", "field/wide")
+    assert "  ! position error rises by " in told
+    assert ": changed as requested" in told

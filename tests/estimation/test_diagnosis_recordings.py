@@ -81,11 +81,6 @@ _GRAVEL = ("warthog_gravel_1", "warthog_wheels_gravel_2024_8_6_11h37s32")
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("results")
-
-
-@pytest.fixture(scope="module")
 def known() -> dict[tuple[str, str], RunDiagnosis]:
     return {}
 
@@ -126,8 +121,8 @@ class Asked:
 
 
 @pytest.fixture(scope="module")
-def asked(results: Path, known: dict[tuple[str, str], RunDiagnosis]) -> Asked:
-    return Asked(results, known)
+def asked(recorded_results: Path, known: dict[tuple[str, str], RunDiagnosis]) -> Asked:
+    return Asked(recorded_results, known)
 
 
 def test_every_recording_is_looked_at() -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+import shutil
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -14,9 +15,6 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 RATE = 20.0
 LIMITS = Limits(1.0, 1.0, 0.55)
@@ -98,16 +96,19 @@ def test_without_measured_wheels_or_at_another_rate_there_is_no_published_number
 
 
 @pytest.fixture(scope="module")
-def recorded(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
-    out = tmp_path_factory.mktemp("recorded")
+def recorded(shared_logs: Path, recorded_results: Path, tmp_path_factory: pytest.TempPathFactory) -> Store:
+    """Results of these recordings alone: more of them would be a larger family of tests."""
+    store = Store(tmp_path_factory.mktemp("recorded"))
     for name in (
         *LOGS,
         "warthog_wheels_ice_2024_7_30_16h30s21",
         "warthog_wheels_asphalt",
         "warthog_wheels_gravel_2024_8_6_11h37s32",
     ):
-        analyze_log(shared_logs / f"{name}.mcap", Options(out=out, report=False))
-    return Store(out)
+        options = Options(out=recorded_results, report=False)
+        run = analyze_log(shared_logs / f"{name}.mcap", options).manifest.folder.parent
+        shutil.copytree(run, store.root / run.relative_to(recorded_results), symlinks=True)
+    return store
 
 
 def test_published_medians_come_out(recorded: Store) -> None:

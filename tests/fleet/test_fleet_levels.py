@@ -11,9 +11,9 @@ import numpy as np
 import polars as pl
 import pytest
 from comparison_store import Run, write_run
+from verbs import run_slip
 
 from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
-from pipeline.cli import main
 from pipeline.fleet.forecast import FleetNumber, fit_fleet
 from pipeline.job.compare import Question, compare_results
 from pipeline.job.over_runs import follow_trend
@@ -257,35 +257,28 @@ def results(tmp_path: Path) -> Store:
     return store
 
 
-def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main(list(arguments))
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
-
-
 def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
-    results: Store, capsys: pytest.CaptureFixture[str]
+    results: Store,
 ) -> None:
     refresh_pools(results)
     assert not (results.root / "fleet.json").exists()
-    run_slip(capsys, "fleet", "fit", str(results.root))
+    run_slip("fleet", "fit", str(results.root))
     write_run(
         results, Run(name="new", terrain="mud", seconds=6.0, estimates=[("wheel_radius", "k", 0.9, ERROR)])
     )
     refresh_pools(results)
-    shown = json.loads(run_slip(capsys, "fleet", "show", str(results.root), "--json")[1])
+    shown = json.loads(run_slip("fleet", "show", str(results.root), "--json")[1])
     assert "mud" in shown["parameters"][0]["terrains"]
     assert not any("have changed since" in note for note in shown["notes"])
 
 
 def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
-    results: Store, capsys: pytest.CaptureFixture[str]
+    results: Store,
 ) -> None:
     refresh_pools(results)
     assert not (results.root / "trend.json").exists()
     asked = ("--by", "vehicle", "--limit", "wheel_radius.k=1.5")
-    assert run_slip(capsys, "fleet", "trend", str(results.root), *asked, "--quiet")[0] == 0
+    assert run_slip("fleet", "trend", str(results.root), *asked, "--quiet")[0] == 0
     new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
     write_run(results, replace(new, start_ns=new.start_ns + 10**15))
     refresh_pools(results)
@@ -302,14 +295,15 @@ def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
 
 
 def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(
-    results: Store, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    results: Store,
+    tmp_path: Path,
 ) -> None:
     fsspec = pytest.importorskip("fsspec", reason="the extra s3 is not installed")
     objects = fsspec.filesystem("memory")
     objects.store.clear()
     new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
-    run_slip(capsys, "fleet", "fit", str(results.root))
-    run_slip(capsys, "fleet", "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
+    run_slip("fleet", "fit", str(results.root))
+    run_slip("fleet", "trend", str(results.root), "--by", "vehicle", "--limit", "wheel_radius.k=1.5")
     write_run(results, replace(new, start_ns=new.start_ns + 10**15))
     for path in results.root.rglob("*"):
         if path.is_file() and "latest" not in path.parts and path.name != ".lock":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -80,22 +79,6 @@ def add_topics(drive: Path, kind: str, count: int) -> Path:
                 )
         writer.finish()
     return path
-
-
-def measure(path: Path) -> float:
-    """CPU time to inspect a log [s]."""
-    begin = time.process_time()
-    found = inspect_log(path, OPTIONS)
-    assert len(found.topics) >= FEW
-    return time.process_time() - begin
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_time_grows_with_the_number_of_topics_and_not_with_its_square(drive: Path, kind: str) -> None:
-    few, many = (add_topics(drive, kind, count) for count in (FEW, MANY))
-    measure(few)
-    # Four times as many topics are four times the work; a square would be sixteen times.
-    assert measure(many) < 8.0 * min(measure(few) for _ in range(2)) + 0.5
 
 
 def count_calls(monkeypatch: pytest.MonkeyPatch, room: object, name: str) -> list[object]:

@@ -33,8 +33,7 @@ def every_other(time: Floats) -> Floats:
     return np.where(np.arange(time.size) % 2, np.nan, 0.0)
 
 
-@pytest.mark.parametrize("report", ["velocity", "position"])
-@pytest.mark.parametrize("lose", [fall_silent, every_other])
+@pytest.mark.parametrize(("report", "lose"), [("velocity", fall_silent), ("position", every_other)])
 def test_an_unknown_vehicle_is_fitted_without_readings_that_are_missing(
     lose: Callable[[Floats], Floats], report: str, tmp_path: Path
 ) -> None:

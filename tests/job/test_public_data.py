@@ -70,7 +70,12 @@ def as_bag(log: Path) -> Path:
 @pytest.mark.parametrize(
     ("platform", "effects", "lacks"),
     [
-        ("tartandrive", {"wheel_radius": 0.93}, "throttle and steering as shares"),
+        pytest.param(
+            "tartandrive",
+            {"wheel_radius": 0.93},
+            "throttle and steering as shares",
+            marks=pytest.mark.long,
+        ),
         pytest.param("f1tenth_ros1", {"steering_offset": 0.05}, "", marks=pytest.mark.long),
         ("jackal_ros1", {"effective_track": 1.5}, ""),
     ],

@@ -69,11 +69,10 @@ class Analyzed:
 
 
 @pytest.fixture(scope="module")
-def analyzed(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> list[Analyzed]:
-    out = tmp_path_factory.mktemp("recordings")
+def analyzed(shared_logs: Path, diagnosed_results: Path) -> list[Analyzed]:
     found = []
     for log in sorted(shared_logs.glob("*.mcap")):
-        outcome = analyze_log(log, Options(out=out, diagnosis=True))
+        outcome = analyze_log(log, Options(out=diagnosed_results, diagnosis=True))
         manifest = outcome.manifest
         diagnosis = cast("dict[str, Any] | None", read_diagnosis(manifest)) or {"effects": []}
         assert diagnosis["effects"] or outcome.refusal or not outcome.summary["median_modulus"], log.stem

@@ -36,6 +36,7 @@ def test_the_readme_gives_the_medians(name: str, samples: Path, tmp_path: Path) 
         assert by_input["measured"]["median_window_norm"] == pytest.approx(float(measured_norm), rel=0.01)
 
 
+@pytest.mark.long
 def test_samples_are_small_and_made_by_the_simulator(samples: Path, tmp_path: Path) -> None:
     for made in write_samples(tmp_path):
         decoders = DecoderFactory()

@@ -45,7 +45,6 @@ def judge(halves: tuple[Effects, Effects], seed: int, lengths_s: tuple[float, fl
 @pytest.mark.parametrize(
     ("name", "number", "before", "after", "lengths_s"),
     [
-        ("drive_lag", "tau", 0.1, 0.4, (150.0, 150.0)),
         ("drive_lag", "tau", 0.1, 0.5, (200.0, 40.0)),
         ("effective_track", "k", 1.3, 1.7, (60.0, 180.0)),
         ("wheel_radius", "k", 1.01, 1.04, (150.0, 150.0)),
@@ -84,7 +83,7 @@ def test_what_changes_beside_a_number_is_said() -> None:
     assert "wheel radius" in str(finding["text"])
 
 
-@pytest.mark.parametrize("seed", range(50, 56))
+@pytest.mark.parametrize("seed", range(50, 53))
 def test_nothing_is_found_where_no_number_changes(seed: int) -> None:
     effects = {"drive_lag": {"tau": 0.25}, "effective_track": {"k": 1.4}, "wheel_asymmetry": {"e": 0.03}}
     assert find_change(judge((effects, effects), seed, (120.0, 120.0))) == []

@@ -80,7 +80,7 @@ TARGETS = [
 
 
 @pytest.mark.parametrize(("target", "kind"), TARGETS)
-@settings(max_examples=25)
+@settings(max_examples=8)
 @given(name=NAMES)
 def test_a_name_is_data_in_the_files_of_all_targets(target: str, kind: str, name: str) -> None:
     check_name(target, kind, name)

@@ -202,7 +202,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
         # A force that falls with speed shows on wheels that turn at metres a second.
         more, vehicle = more | {"vehicle": VEHICLES["warthog"]}, "warthog"
     # What only shows where fast turns stand beside slow ones takes longer.
-    duration_s = 240.0 if effect.id in {"speed_track", "understeer"} else 150.0
+    duration_s = 240.0 if effect.id in {"speed_track", "understeer"} else 100.0
     run = simulate(hidden, duration_s=duration_s, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(vehicle), source)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
+from verbs import run_slip
 
 from pipeline.cli import main
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, score
@@ -99,13 +100,6 @@ def test_with_a_prior_a_few_seconds_predict_the_rest_no_worse() -> None:
     assert few < 0.2 * ideal
 
 
-def run_slip(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main(list(arguments))
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
-
-
 @pytest.fixture(scope="module")
 def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with diagnosed results of three runs on tile, and the log of a fourth one."""
@@ -125,11 +119,11 @@ def fleet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_few_seconds_are_fitted_with_the_fleet_before(
-    fleet: Path, capsys: pytest.CaptureFixture[str]
+    fleet: Path,
 ) -> None:
     log, file = fleet / "run_3.mcap", fleet / "few.toml"
     on = ("--on", str(log), "--out", str(fleet / "results"), "--input", "measured", "--json")
-    code, out, error = run_slip(capsys, "model", "fit", str(file), *on, "--first", "6s", "--prior", "fleet")
+    code, out, error = run_slip("model", "fit", str(file), *on, "--first", "6s", "--prior", "fleet")
     assert code == 0, error
     told = json.loads(out)
     k, before = told["parameters"]["effective_track.k"], told["prior"]["effective_track.k"]
@@ -138,6 +132,6 @@ def test_a_few_seconds_are_fitted_with_the_fleet_before(
     written = read_model(file)
     assert (written.fit["first_s"], written.fit["prior"]) == (6.0, "fleet")
     # The run is among the results now; asked again, it is no witness for itself.
-    again = json.loads(run_slip(capsys, "model", "fit", *on, "--first", "6s", "--prior", "fleet")[1])
+    again = json.loads(run_slip("model", "fit", *on, "--first", "6s", "--prior", "fleet")[1])
     assert again["prior"]["effective_track.k"]["value"] != 1.0
     assert again["model"] is None

@@ -67,8 +67,8 @@ BEYOND = {
 
 
 @pytest.fixture(scope="module")
-def recordings(shared_logs: Path, tmp_path_factory: pytest.TempPathFactory) -> Recordings:
-    return Recordings(shared_logs, tmp_path_factory.mktemp("recordings"))
+def recordings(shared_logs: Path, recorded_results: Path) -> Recordings:
+    return Recordings(shared_logs, recorded_results)
 
 
 @pytest.mark.parametrize("case", CASES, ids=lambda case: f"{case.log}-{case.source.value}")

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.cli import main
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import read_model, write_model
@@ -61,18 +60,6 @@ def model(tmp_path: Path) -> Path:
 
 def has_run(model: Path) -> bool:
     return (model.parents[1] / "mark").exists()
-
-
-@pytest.fixture
-def slip(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs a verb; its exit code, what it prints, and what it says."""
-
-    def run(*words: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
-            main([str(word) for word in words])
-        return int(str(ended.value.code)), *capsys.readouterr()
-
-    return run
 
 
 def test_untrusted_python_does_not_run_and_what_it_defines_is_left_out_and_named(model: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
@@ -15,6 +13,7 @@ import pytest
 from motion_runs import simulate
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
+from verbs import run_verb
 
 from pipeline.cli import main
 from pipeline.cli.conventions import FAILED
@@ -174,9 +173,7 @@ def test_promises_are_checked_against_what_came_out() -> None:
 
 
 def _run(*arguments: str | Path, code: int = 0) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "pipeline", *map(str, arguments)], check=False, capture_output=True, text=True
-    )
+    done = run_verb(*arguments)
     assert done.returncode == code, done.stderr
     return done.stdout if code == 0 else done.stderr
 

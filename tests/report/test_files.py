@@ -11,7 +11,7 @@ from report_synthesis import list_places, make_report
 
 from pipeline.report import ReportError, theme
 from pipeline.report.figures import list_figures
-from pipeline.report.page import FORMATS, write_figures
+from pipeline.report.page import write_figures
 from pipeline.report.scene import Scene
 from pipeline.report.theme import (
     build_spec,
@@ -33,7 +33,9 @@ def report() -> RunReport:
     return make_report(duration_s=40.0)
 
 
-@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize(
+    "kind", ["svg", *(pytest.param(kind, marks=pytest.mark.long) for kind in ("pdf", "png"))]
+)
 def test_the_figures_of_the_page_are_written_for_papers(
     report: RunReport, tmp_path: Path, kind: Literal["svg", "pdf", "png"]
 ) -> None:

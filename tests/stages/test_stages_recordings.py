@@ -72,22 +72,21 @@ KNOWN = {
 }
 
 
-@pytest.fixture(scope="session")
-def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("results")
+def summarize(name: str, results: Path) -> dict[str, object]:
+    return dict(analyze_log(LOGS / f"{name}.mcap", Options(out=results, report=False)).summary)
 
 
 @pytest.mark.parametrize("name", KNOWN)
-def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, results: Path) -> None:
+def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, recorded_results: Path) -> None:
     known = KNOWN[name]
-    summary = analyze_log(LOGS / f"{name}.mcap", Options(out=results, report=False)).summary
+    summary = summarize(name, recorded_results)
     by_input = summary["by_input"]
     assert isinstance(by_input, dict)
     measured, command = by_input["measured"], by_input["command"]
     assert isinstance(measured, dict)
     assert isinstance(command, dict)
     # The independent chain puts nothing right. Other sensible smoothing moves these numbers by some 10 %.
-    recorded = Store(results).read(str(summary["run"]), "alignments")
+    recorded = Store(recorded_results).read(str(summary["run"]), "alignments")
     assert recorded["recorded_modulus_measured"][0] == pytest.approx(known.measured, rel=0.15)
     assert recorded["recorded_modulus_command"][0] == pytest.approx(known.command, rel=0.15)
     # Poses and wheels at the moments they belong to, without outliers, show less slip and never more.
@@ -95,7 +94,7 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, res
     assert measured["median_window_norm"] <= 1.15 * known.norm
     if "command_scale" not in known.faults:
         assert command["median_modulus"] <= 1.02 * recorded["recorded_modulus_command"][0]
-    compared = Store(results).read(str(summary["run"]), "slip").filter(pl.col("input") == "command")
+    compared = Store(recorded_results).read(str(summary["run"]), "slip").filter(pl.col("input") == "command")
     assert summary["duration_s"] == pytest.approx(0.05 * compared.filter(~pl.col("suspect")).height, abs=0.06)
     assert (summary["distance_m"] is None) == ("not_moving" in known.faults)
     assert summary["held_poses"] == pytest.approx(known.held, abs=0.015)
@@ -106,9 +105,10 @@ def test_a_recording_gives_its_known_numbers_and_its_known_faults(name: str, res
     assert known.absent & ids == set()
 
 
-def test_a_husky_that_stands_on_a_plank_is_not_moving_and_its_encoders_say_zero(results: Path) -> None:
-    path = LOGS / "husky_wheels_plank_2024_10_24_11h24s5.mcap"
-    summary = analyze_log(path, Options(out=results, report=False)).summary
+def test_a_husky_that_stands_on_a_plank_is_not_moving_and_its_encoders_say_zero(
+    recorded_results: Path,
+) -> None:
+    summary = summarize("husky_wheels_plank_2024_10_24_11h24s5", recorded_results)
     findings = summary["findings"]
     assert isinstance(findings, list)
     ids = {finding["id"] for finding in findings if isinstance(finding, dict)}
@@ -121,8 +121,10 @@ def test_a_husky_that_stands_on_a_plank_is_not_moving_and_its_encoders_say_zero(
     assert measured["median_modulus"] < 0.01
 
 
-def test_snow_commands_are_off_by_the_ratio_of_two_radii(results: Path) -> None:
-    summary = analyze_log(LOGS / "husky_snow_boreal.mcap", Options(out=results, report=False)).summary
+def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path) -> None:
+    summary = analyze_log(
+        LOGS / "husky_snow_boreal.mcap", Options(out=recorded_results, report=False)
+    ).summary
     findings = summary["findings"]
     assert isinstance(findings, list)
     (found,) = [each for each in findings if isinstance(each, dict) and each["id"] == "command_scale"]
