@@ -5,11 +5,11 @@ from __future__ import annotations
 import shutil
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from batch_tools import batch, counts, read_tables
 from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
-from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     import pytest

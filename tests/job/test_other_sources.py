@@ -32,8 +32,9 @@ from pipeline.simulate.platforms import (
 from pipeline.sources import load_configuration
 
 if TYPE_CHECKING:
-    import polars as pl
     from collections.abc import Callable, Mapping
+
+    import polars as pl
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 WHEEL = "{}_wheel_joint"
