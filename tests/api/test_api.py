@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,7 +12,6 @@ import pytest
 from verbs import ask_verb
 
 import pipeline as slip
-from pipeline.job.work import COLUMNS
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
@@ -138,18 +136,6 @@ def test_without_xarray_it_says_what_to_install(run: slip.Run, monkeypatch: pyte
         run.to_xarray()
 
 
-def test_a_figure_is_drawn_in_a_notebook_and_written_without_a_network(
-    diagnosis: slip.Diagnosis, tmp_path: Path
-) -> None:
-    ladder = diagnosis.figures()["ladder"]
-    ladder.save(tmp_path / "new" / "ladder.svg")
-    drawn = (tmp_path / "new" / "ladder.svg").read_text()
-    assert drawn.startswith("<svg")
-    assert drawn == ladder._repr_svg_()
-    with pytest.raises(slip.SlipError, match="Use one of svg, pdf, png"):
-        ladder.save(tmp_path / "ladder.gif")
-
-
 def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
     assert "<b>field" in run.name
     for shown in (
@@ -212,15 +198,6 @@ def test_what_a_model_leaves_out_and_a_log_lost_is_said(run: slip.Run, tmp_path:
     assert "losses" not in repr(run)
 
 
-def test_the_name_alone_loads_nothing_and_verbs_do_without_it() -> None:
-    heavy = "{'numpy', 'polars', 'altair', 'pipeline.api'} & set(sys.modules)"
-    code = f"import sys, pipeline, pipeline.cli as a; a.build_app(); print({heavy}); print(dir(pipeline))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    loaded, names = done.stdout.splitlines()
-    assert loaded == "set()"
-    assert names == repr(sorted(slip.__all__))
-
-
 def test_a_run_has_its_slip_its_length_and_a_figure_of_its_own(run: slip.Run) -> None:
     steps = run.slip.collect()
     assert not steps["suspect"].any()
@@ -231,12 +208,3 @@ def test_a_run_has_its_slip_its_length_and_a_figure_of_its_own(run: slip.Run) ->
     assert run.plot("trajectory").to_dict() == run.figures()["trajectory"].to_dict()
     with pytest.raises(slip.SlipError, match="no figure 'trajectories'"):
         run.plot("trajectories")
-
-
-def test_a_list_of_logs_is_a_list_of_runs(run: slip.Run) -> None:
-    log = str(run.summary["log"]["path"])  # type: ignore[index]
-    (again,) = slip.analyze([log], results=find_results(run), report=False, diagnosis=False)
-    assert again.name == run.name
-    # A diagnosis by the command line may have filled the columns of the model since.
-    ours, theirs = (one.slip.collect().drop(COLUMNS) for one in (again, run))
-    assert ours.equals(theirs)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import damage_season
 import pytest
-from damage_season import KINDS, NO_TEXT, cut_in_future, odd_folders, run_batch
+from damage_season import KINDS, NO_TEXT, cut_in_future, run_batch
 
 from pipeline.batch.recordings import find_recordings
 from pipeline.cli import main
@@ -62,25 +62,6 @@ def test_each_alone_costs_itself_and_nothing_else(capsys: pytest.CaptureFixture[
     assert damage_season.main() == 0, capsys.readouterr().out
 
 
-def test_what_is_left_out_is_named(mess: Path) -> None:
-    with odd_folders():
-        found = find_recordings([str(mess)], settle_s=0.0, patience_s=0.2)
-    said = {each.path.relative_to(mess).parts[0]: each.reason for each in found.skipped}
-    for number, kind in enumerate(KINDS.values()):
-        if "skipped" in kind.state:
-            assert kind.words in said[str(number)]
-
-
-def test_a_glob_looks_as_carefully_as_a_search(mess: Path) -> None:
-    with odd_folders():
-        searched = find_recordings([str(mess)], settle_s=0.0, patience_s=0.2)
-        met = find_recordings([str(mess / "**" / "*.mcap")], settle_s=0.0, patience_s=0.2)
-    assert met.recordings == searched.recordings
-    assert {each.reason for each in met.skipped} >= {
-        each.reason for each in searched.skipped if "answer" in each.reason
-    }
-
-
 def test_looking_for_text_tables_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "dead").mkdir()
     never = threading.Event()
@@ -125,18 +106,6 @@ def test_a_log_of_the_future_is_growing_while_it_grows(season: Path, tmp_path: P
         assert find_recordings([str(log)], settle_s=120.0).growing == (log,)
         Growing.sleep = staticmethod(lambda _seconds: None)  # type: ignore[method-assign, assignment]
         assert find_recordings([str(log)], settle_s=120.0).recordings == (log,)
-
-
-def test_a_log_that_is_being_written_is_named(
-    season: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    KINDS["a cut log"].make(tmp_path, season / "a.mcap")
-    with pytest.raises(SystemExit) as ended:
-        main(["batch", str(tmp_path), "--out", str(tmp_path / "out")])
-    assert ended.value.code == 0
-    spoken = capsys.readouterr().out.splitlines()
-    assert "being written      1" in spoken
-    assert spoken[spoken.index("being written") + 1].strip() == str(tmp_path / "x.mcap")
 
 
 @pytest.fixture

@@ -2,22 +2,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import multiprocessing.spawn
 import shutil
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import pytest
 from batch_tools import batch, counts, read_tables
 from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
 
-from pipeline.batch import BatchError
-from pipeline.batch.batch_work import Settings, Task
-from pipeline.batch.season import open_executor
-from pipeline.job import Options
-from pipeline.store import LogSighting
+if TYPE_CHECKING:
+    import pytest
 
 KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")
 LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
@@ -95,49 +90,3 @@ def test_a_death_is_understood_however_late_its_pool_hears_of_the_task(
     (line,) = (line for line in outcome.lines if line.state == "quarantined")
     assert (Path(line.path).stem, line.code) == ("dies", "worker_died")
     assert "signal 11" in line.reason
-
-
-def test_processes_that_cannot_be_started_cost_no_log(
-    season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(multiprocessing.spawn, "_python_exe", b"/bin/false")
-    with pytest.raises(BatchError) as caught:
-        batch(season, tmp_path / "out", **LIMITS)
-    assert caught.value.code == "no_workers"
-    monkeypatch.undo()
-    assert counts(batch(season, tmp_path / "out")) == {"done": 4}
-
-
-def test_a_worker_that_died_is_known_although_the_next_log_was_offered_to_it(tmp_path: Path) -> None:
-    settings = Settings(jobs=1, timeout_s=60.0, memory_bytes=1 << 40, work=work_poisoned)
-    executor = open_executor("local", settings)
-    try:
-        tasks = [
-            Task(path=tmp_path / f"{name}.mcap", log=unseen(name), basis="", options=Options(out=tmp_path))
-            for name in ("dies", "raises")
-        ]
-        first = executor.submit(tasks[0])
-        error = first.exception(timeout=60.0)
-        assert error is not None
-        second = executor.submit(tasks[1])
-        assert executor.blame(tasks[0], error).code == "worker_died"
-        assert second.result(timeout=60.0).entry.code == "unexpected_error"
-    finally:
-        executor.close()
-
-
-def test_a_process_that_starts_is_not_judged_by_the_memory_of_its_parent(tmp_path: Path) -> None:
-    executor = open_executor("local", Settings(jobs=1, timeout_s=60.0, memory_bytes=1, work=work_poisoned))
-    try:
-        # Any process exceeds this limit, and starts nevertheless.
-        options = Options(out=tmp_path)
-        task = Task(path=tmp_path / "hangs.mcap", log=unseen("hangs"), basis="", options=options)
-        error = executor.submit(task).exception(timeout=60.0)
-        assert isinstance(error, Exception)
-        assert executor.blame(task, error).code == "out_of_memory"
-    finally:
-        executor.close()
-
-
-def unseen(name: str) -> LogSighting:
-    return LogSighting(path=name, size=0, mtime_ns=0, inode=0, seen_ns=0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -143,31 +142,12 @@ def test_logs_of_one_name_get_runs_of_their_own(season: Path, tmp_path: Path) ->
     assert Store(tmp_path / "out").runs() == tuple(sorted(runs))
 
 
-def test_a_moved_season_is_done_already(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    batch(season, out)
-    season.rename(tmp_path / "archive")
-    assert counts(batch(tmp_path / "archive", out)) == {"unchanged": 4}
-    assert len(Store(out).runs()) == 4
-
-
 def test_shards_share_the_logs_and_leave_what_one_machine_would(season: Path, tmp_path: Path) -> None:
     batch(season, tmp_path / "one")
     shards = [batch(season, tmp_path / "many", shard=Shard(number=i, count=3), jobs=1) for i in (1, 2, 3)]
     worked = [line.run for outcome in shards for line in outcome.lines if line.state == "done"]
     assert len(worked) == len(set(worked)) == 4
     assert read_tables(tmp_path / "many") == read_tables(tmp_path / "one")
-
-
-def test_a_fleet_file_from_elsewhere_holds_for_its_globs(season: Path, tmp_path: Path) -> None:
-    fleet = tmp_path / "fleet.toml"
-    fleet.write_text(
-        '[run]\nterrain = "field"\n[[match]]\nglob = "season/d*"\n[match.run]\nterrain = "lake"\n'
-    )
-    request = ask(season, tmp_path / "out")
-    run_batch(replace(request, options=replace(request.options, fleet=fleet)), Watch())
-    runs = Store(tmp_path / "out").scan("runs").select("run", "terrain").collect()
-    assert dict(runs.iter_rows()) == {f"season/{x}": "field" for x in "abc"} | {"season/d": "lake"}
 
 
 def test_old_generations_go_when_the_disk_needs_the_room(season: Path, tmp_path: Path) -> None:
@@ -212,15 +192,3 @@ def test_a_damaged_manifest_is_said_and_costs_one_run(season: Path, tmp_path: Pa
     lines = {Path(line.path).stem: (line.state, line.code) for line in outcome.lines}
     assert lines["a"] == ("failed", "manifest_damaged")
     assert lines["b"] == ("unchanged", "")
-
-
-def test_reports_are_made_on_demand(season: Path, tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    log = season / "a.mcap"
-    batch(log, out)
-    assert not list(out.rglob("report.html"))
-    assert counts(batch(log, out, report=True)) == {"done": 1}
-    assert list(out.rglob("report.html"))
-    assert 'href="runs/season/a/' in (out / "index.html").read_text()
-    assert "report.html" in (out / "index.html").read_text()
-    assert counts(batch(log, out)) == {"unchanged": 1}

@@ -17,13 +17,6 @@ if TYPE_CHECKING:
 INLINE = ("--executor", "inline", "--settle", "0")
 
 
-def test_batch_names_copies(season: Path, tmp_path: Path) -> None:
-    (season / "z.mcap").write_bytes((season / "a.mcap").read_bytes())
-    text = run_slip("batch", season, "--out", tmp_path / "out", *INLINE)[1]
-    assert "copies, counted once" in text
-    assert f"{season / 'z.mcap'}\n      the same content as season/a" in text
-
-
 def test_a_name_that_begins_with_a_dash_goes_behind_two(
     season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -41,15 +34,6 @@ def test_estimates_do_without_sizes() -> None:
     assert 0.0 <= watch.estimate_rest() < 10.0
     watch.notify(Line(path="large", state="done"), 1000)
     assert watch.estimate_rest() == 0.0
-
-
-def test_progress_has_an_estimate(season: Path, tmp_path: Path) -> None:
-    _, _, err = run_slip("batch", season, "--out", tmp_path / "out", *INLINE)
-    lines = err.splitlines()
-    assert lines[0].startswith("4 logs to work on")
-    assert lines[1].startswith("[1/4] season/")
-    assert lines[1].endswith(" left")
-    assert "left" not in lines[4]
 
 
 def test_schedule_prints_units_of_this_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -107,11 +107,3 @@ def test_a_folder_stands_for_its_logs(place: Path) -> None:
     content = json.loads(check(place, "husky.toml", "logs", "--json", code=3))
 
     assert [name.rpartition("/")[2] for name in content["after"]["runs"]] == ["a", "b", "late"]
-
-
-def test_two_formats_are_not_printed_into_each_other(place: Path) -> None:
-    done = run_verb("check", "husky.toml", "logs/b.mcap", "--to", "junit", "--json", cwd=place)
-
-    assert done.returncode == 1
-    (error,) = json.loads(done.stdout)["errors"]
-    assert "--json and --to junit would both be printed" in error["message"]

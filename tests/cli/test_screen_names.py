@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from pipeline.cli import main
 from pipeline.cli.conventions import fold_line, print_error, print_lines, tidy_line
-from pipeline.cli.screen import format_run
 from pipeline.core import SlipError
 
 if TYPE_CHECKING:
@@ -60,45 +59,6 @@ def test_a_log_cannot_write_lines_of_its_own(tmp_path: Path, capsys: pytest.Capt
     assert "\x1b" not in text
     assert "all is well" in text
     assert not any(line.startswith("all is well") for line in text.splitlines())
-
-
-def test_incidents_of_different_kinds_have_rows_of_their_own_and_stand_once() -> None:
-    log = {"losses": [], "duration_s": 90.0}
-    spans = (
-        ("stuck", 10.0, 12.5, "it was stuck"),
-        ("stuck", 20.0, 21.0, "it was stuck"),
-        ("dug", 30.0, 36.0, "it dug"),
-    )
-    findings: list[dict[str, object]] = [
-        {"id": kind, "severity": "warning", "text": text, "t_start": start, "t_end": end}
-        for kind, start, end, text in spans
-    ]
-    own = {"id": "own", "severity": "warning", "text": "of the diagnosis"}
-    notes = [{"id": "note", "severity": "info", "text": f"note {number}"} for number in range(3)]
-    lines = [
-        ["verdict", "good"],
-        ["findings", "it was stuck (2 times)"],
-        ["", "it dug"],
-        ["", "of the diagnosis"],
-    ]
-    told = {"lines": lines, "findings": [*findings, own, *notes]}
-    summary = {
-        "run": "a", "vehicle": "v", "terrain": "t", "log": log, "findings": [*findings, *notes],
-        "diagnosis": told,
-    }  # fmt: skip
-    rows = [
-        "findings  !  2 incidents, the longest from 10.0 to 12.5 s: it was stuck",
-        "          !  from 30.0 to 36.0 s: it dug",
-        "          !  of the diagnosis",
-    ]
-    assert format_run(summary, unchanged=False).splitlines()[1:] == rows
-    whole = format_run(summary, unchanged=False, everything=True).splitlines()
-    at = whole.index(rows[0])
-    assert whole[at:] == [*rows, *(f"             note {number}" for number in range(3))]
-
-    many = [{"id": "w", "severity": "warning", "text": f"warning {number}"} for number in range(8)]
-    text = format_run({**summary, "findings": [*many, *notes], "diagnosis": {}}, unchanged=False)
-    assert "warning 5\n             5 more (--all)\n" in text
 
 
 ROW = "effects   drive_lag           tau = 0.304 s [0.274, 0.333]  0.187 -> 0.133 m, 0.355 -> 0.304 rad"

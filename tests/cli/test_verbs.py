@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.cli import main
 from pipeline.logs.writer import LogWriter
 from pipeline.simulate import simulate_case
 
@@ -79,41 +78,6 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
     (error,) = content["errors"]
     assert error.keys() == {"path", "code", "message", "hint"}
     assert error["code"] == "log_not_found"
-
-
-def test_geometry_may_stand_in_for_a_vehicle(field: Path, tmp_path: Path) -> None:
-    done = run_verb(
-        "analyze", field / "no_vehicle.mcap", "--wheel-radius", 0.1, "--track-width", 0.4,
-        "--out", tmp_path, "--json", "--no-report",
-    )  # fmt: skip
-
-    (run,) = json.loads(done.stdout)["runs"]
-    assert run["vehicle"] == "vehicle"
-    # Hardly anything is commanded in this log.
-    assert done.returncode == 3
-    assert "hardly commanded to move" in run["verdict"]
-
-
-def test_no_file_of_another_kind_is_proposed_for_a_log(tmp_path: Path) -> None:
-    (tmp_path / "husky.png").write_bytes(b"a picture")
-    done = run_verb("analyze", "huskyy.mcap", cwd=tmp_path)
-
-    assert done.returncode == 1
-    assert "Did you mean" not in done.stderr
-
-
-def test_an_interrupt_says_what_became_of_the_results(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("pipeline.models.catalogue.list_effects", interrupt)
-    with pytest.raises(SystemExit) as left:
-        main(["effects"])
-
-    assert left.value.code == 130
-    assert "nothing was left half-written" in capsys.readouterr().err
 
 
 def test_a_stage_alone(field: Path, tmp_path: Path) -> None:

@@ -16,10 +16,6 @@ def test_an_error_says_where_what_and_what_to_do_in_one_line() -> None:
     assert str(error) == "room 3: it is too cold. Close the window."
 
 
-def test_an_error_without_a_place_starts_with_what_is_wrong() -> None:
-    assert str(RoomError("too_cold", "it is too cold", hint="Wait.")) == "it is too cold. Wait."
-
-
 def test_an_error_survives_the_way_between_processes() -> None:
     error = pickle.loads(pickle.dumps(RoomError("too_cold", "cold", where="here", hint="Wait.")))  # noqa: S301
     assert isinstance(error, RoomError)

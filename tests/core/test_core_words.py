@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.core import format_angle, format_length, format_part, format_share
+from pipeline.core import format_part, format_share
 
 PIPELINE = Path(__file__).parents[2] / "pipeline"
 
@@ -38,20 +38,6 @@ def test_a_share_is_percent_with_a_space(share: float, digits: int, text: str) -
 def test_a_part_of_a_whole_is_never_zero_unless_it_is() -> None:
     parts = {0.56: "56 %", 0.004: "0.4 %", -0.02: "-2 %", 3e-6: "< 0.1 %", -1e-4: "< 0.1 %", 0.0: "0 %"}
     assert {part: format_part(part) for part in parts} == parts
-
-
-def test_lengths_and_angles_are_plain_digits_in_the_unit_of_their_size() -> None:
-    lengths = {
-        0.0573: "5.7 cm",
-        0.8: "80 cm",
-        0.9962: "100 cm",
-        1.0604: "1.06 m",
-        1234.4: "1234 m",
-        0.0: "0 cm",
-    }
-    assert {metres: format_length(metres) for metres in lengths} == lengths
-    angles = {1.0: "1 degree", 0.8: "0.8 degrees", 9.96: "10 degrees", 123.4: "123 degrees"}
-    assert {degrees: format_angle(math.radians(degrees)) for degrees in angles} == angles
 
 
 def test_no_module_writes_percent_by_itself() -> None:

@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from moving_picture import MOST_COLOURS, join_frames, read_pixels
+from moving_picture import join_frames
 from pictures import STEPS
 
 FALLING = Path(__file__).parents[2] / "docs" / "pages" / "pictures" / "falling.png"
 SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MOST_BYTES = 300_000
-SEEN = 24
-"""Of 256 shades of a channel: less is not seen on the edge of a letter."""
 
 
 def pack(kind: bytes, data: bytes) -> bytes:
@@ -87,38 +85,6 @@ def test_frames_follow_each_other_and_are_numbered_through() -> None:
     assert [frame[0, 0, 0] for frame in show(joined)] == [10, 20, 30]
     # The first of a circle hides the last; each other one is laid over what is seen.
     assert [data[-1] for kind, data in chunks if kind == b"fcTL"] == [0, 1, 1]
-
-
-def test_frames_of_few_colours_are_shown_as_they_are_and_what_stays_takes_no_room() -> None:
-    rng = np.random.default_rng(1)
-    first = rng.integers(0, 2, (60, 80, 3)) * 255
-    second = first.copy()
-    second[20:30, 30:50] = 128
-    joined = join_frames([draw(frame) for frame in (first, second, second)], 500)
-    for seen, drawn in zip(show(joined), (first, second, second), strict=True):
-        assert np.array_equal(seen, drawn)
-    sizes = [len(data) for kind, data in read(joined) if kind in {b"IDAT", b"fdAT"}]
-    assert sizes[0] > 10 * sizes[1] > 10 * sizes[2]
-
-
-def test_of_many_colours_none_is_shown_as_one_that_looks_different() -> None:
-    """Text of three colours on two grounds, with edges of every shade between."""
-    shades = np.linspace(0.0, 1.0, 200)[:, None]
-    inks, grounds = ((20, 30, 40), (0, 128, 90), (170, 80, 140)), ((255, 255, 255), (240, 242, 245))
-    rows = [shades * ink + (1.0 - shades) * ground for ink in inks for ground in grounds]
-    frame = np.repeat(np.rint(np.stack(rows)).astype(np.uint8), 2, axis=0)
-    assert len(np.unique(frame.reshape(-1, 3), axis=0)) > 3 * MOST_COLOURS
-    joined = join_frames([draw(frame)], 500)
-    (seen,) = show(joined)
-    assert len(dict(read(joined))[b"PLTE"]) <= 3 * 256
-    assert abs(seen.astype(int) - frame).max() < SEEN
-
-
-def test_every_filter_of_a_picture_is_read() -> None:
-    rng = np.random.default_rng(2)
-    pixels = rng.integers(0, 256, (25, 7, 3))
-    for filters in ((0,), (1,), (2,), (3,), (4,), (4, 2, 0, 3, 1)):
-        assert np.array_equal(read_pixels(draw(pixels, filters)), pixels)
 
 
 def test_frames_of_several_sizes_or_of_another_kind_are_refused() -> None:

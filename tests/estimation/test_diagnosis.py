@@ -28,7 +28,7 @@ from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.state import Free
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.models import Model, find_effect, read_model, write_model
+from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
 from pipeline.simulate import (
@@ -155,15 +155,6 @@ def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> 
     assert skidding.runs[0].explained_share > 0.9
 
 
-def test_nothing_is_named_beyond_a_model_that_says_it_all(skidding: Diagnosis, tmp_path: Path) -> None:
-    proposal = skidding.runs[0].proposal
-    assert proposal is not None
-    scenario = replace(_SCENE, effects={"effective_track": 1.8, "drive_lag": 0.4}, seed=8)
-    (run,) = _diagnose(scenario, tmp_path, model=proposal.model).runs
-    assert run.effects == ()
-    assert run.unexplained is None
-
-
 def test_an_early_clock_is_found_corrected_and_not_lost(tmp_path: Path) -> None:
     (run,) = _diagnose(replace(_SCENE, effects={"clock_offset": -0.15}), tmp_path).runs
     assert [effect.id for effect in run.effects] == ["clock_offset"]
@@ -211,20 +202,6 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     assert held in run.proposal.model.ids
     assert [line.split()[0] for line in lines if line.endswith("(in the model)")] == [held]
     assert any(line.startswith("to separate them: ") for line in lines)
-
-
-def test_runs_on_unlike_ground_are_not_judged_as_one_in_silence(tmp_path: Path) -> None:
-    taken = []
-    for number, terrain in enumerate(("tile", "snow")):
-        scenario = replace(_SCENE, seed=number, duration_s=60.0, recording=Recorded(terrain=terrain))
-        (tmp_path / terrain).mkdir()
-        taken.append(_record(scenario, tmp_path / terrain))
-    (first, vehicle), (second, _) = taken
-    together = diagnose_runs([first, second], vehicle)
-    for run in together.runs:
-        assert [f["id"] for f in run.findings].count("unlike_grounds") == 1
-    alone = diagnose_runs([first], vehicle).runs[0]
-    assert "unlike_grounds" not in [f["id"] for f in alone.findings]
 
 
 def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
@@ -293,11 +270,6 @@ def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_i
     assert uneven.low < -0.0513 < uneven.high < 0.0
 
 
-def test_little_driving_is_said(tmp_path: Path) -> None:
-    (run,) = _diagnose(replace(_SCENE, effects={"effective_track": 1.8}, duration_s=45.0), tmp_path).runs
-    assert "little_driving" in {finding["id"] for finding in run.findings}
-
-
 def test_two_runs_of_one_vehicle_are_judged_together(tmp_path: Path) -> None:
     recordings = []
     for seed in (1, 2):
@@ -332,20 +304,6 @@ def test_a_diagnosis_is_the_same_each_time_on_one_core_or_more(
     first = diagnose_runs([recording], vehicle).to_json()
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
     assert diagnose_runs([recording], vehicle).to_json() == first
-
-
-def test_a_late_clock_that_is_known_keeps_nothing_else_from_being_named(tmp_path: Path) -> None:
-    scenario = replace(
-        _SCENE,
-        vehicle=VEHICLES["husky"],
-        effects={"clock_offset": 0.15, "effective_track": 1.6},
-        recording=Recorded("body_command"),
-        imu=Imu(),
-    )
-    recording, vehicle = _record(scenario, tmp_path)
-    known = Model(vehicle, (find_effect("clock_offset")(d=0.15),))
-    (run,) = diagnose_runs([recording], vehicle, model=known).runs
-    assert [effect.id for effect in run.effects] == ["effective_track"]
 
 
 @pytest.mark.long

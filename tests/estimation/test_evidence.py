@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.acceptance import LEAST_T, compare
-from pipeline.estimation.evidence import Evidence, Hypothesis, Start, find_gains
+from pipeline.estimation.evidence import Evidence, find_gains
 from pipeline.estimation.fit import PartFit, fit_part
 from pipeline.estimation.parts import Part, make_weights
 from pipeline.models import find_effect, list_effects
@@ -98,37 +96,3 @@ def test_nothing_significant_is_found_where_nothing_is_hidden() -> None:
             larger = fit_part(part, fit.weights, hypothesis.starts[0].add_to(fit.state))
             found.append(compare(evidence.noise, fit.weights, fit.residual, larger.residual).t)
     assert max(found) < LEAST_T
-
-
-def test_a_candidate_that_is_in_the_model_is_no_candidate(skidding: MotionRun) -> None:
-    problem, part, fit = _fit(skidding, "effective_track")
-    evidence = _take(problem, part, fit)
-    assert "effective_track" not in {start.effect.id for start in evidence.starts}
-    fewer = evidence.leave_out("icr_offset")
-    assert "icr_offset" not in {one.starts[0].effect.id for one in fewer.rank_singles(0.0)}
-    assert fewer.expect_gain([0]) == evidence.expect_gain([0])
-
-
-def test_clocks_of_several_runs_start_each_at_its_own(skidding: MotionRun) -> None:
-    other = replace(skidding, name="another run")
-    problem = Problem([skidding, other], HUSKY, Input.MEASURED)
-    part = problem.whole
-    fit = fit_part(
-        part, make_weights(part.find_residuals(problem.start_state()), part), problem.start_state()
-    )
-    for start in _take(problem, part, fit, (*GROUND, *part.clocks)).starts:
-        state = start.add_to(fit.state)
-        assert state.find(start.effect.id) is not None
-        assert len(start.own) == (2 if start.effect.id in part.clocks else 0)
-
-
-def test_what_starts_as_a_whole_is_charged_for_all_of_its_numbers() -> None:
-    """A servo of six numbers has one column, as a lag of one: it pays for six."""
-    servo = find_effect("wheel_servo")(tau=0.2, reset=0.1, drag=0.05, bound=2.0, scrub=0.5, creep=0.07)
-    lag = Start(find_effect("drive_lag")(tau=0.5), (), (7,))
-    assert Hypothesis((Start(servo, (), (3,)),), 1.0).numbers == 6
-    assert Hypothesis((Start(servo.fix("tau", "reset"), (), (3,)), lag), 1.0).numbers == 5
-    # A limit that is never reached is fitted to nothing, and clocks of three runs are three.
-    assert Hypothesis((Start(servo.change(bound=np.inf), (), (3,)),), 1.0).numbers == 5
-    clock = Start(find_effect("clock_offset")(d=0.1), (0.1, 0.2, 0.1), (4, 5, 6))
-    assert Hypothesis((clock,), 1.0).numbers == 3

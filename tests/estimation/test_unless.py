@@ -16,7 +16,7 @@ from pipeline.estimation import (
     fit_model,
     load_recording,
 )
-from pipeline.estimation.acceptance import LEAST_GAIN, Improvement, NotSignificant
+from pipeline.estimation.acceptance import NotSignificant
 from pipeline.estimation.estimates import find_unless
 from pipeline.estimation.ladder import judge_model, note_fit
 from pipeline.export import export_model
@@ -104,17 +104,6 @@ def test_what_changes_no_other_number_is_a_finding(
         "body_inertia is not significant: it reaches 90 % of the significance threshold (tau = 0.0"
     )
     assert list(find_unless(judgement, (), nearly, ("body_inertia",))) == []
-
-
-def test_evidence_and_gain_are_required_alike() -> None:
-    t = acceptance.LEAST_T
-    for improvement, reached in (
-        (Improvement(2.0 * t, t, 0.5 * LEAST_GAIN), 0.5),
-        (Improvement(0.9 * t, t, 3.0 * LEAST_GAIN), 0.9),
-        (Improvement(2.0 * t, t, LEAST_GAIN), 1.0),
-    ):
-        assert improvement.reached == pytest.approx(reached)
-        assert improvement.is_significant == (reached >= 1.0)
 
 
 def test_the_written_model_says_it_until_the_effect_is_in(

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from datetime import UTC, date, datetime, timedelta
 from typing import TYPE_CHECKING
 
-import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
-from pipeline.fleet.rank_tests import LEVEL
-from pipeline.fleet.trend import Trend, follow_quantities
+from pipeline.fleet.trend import Trend
 from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
 from pipeline.store.names import read_day
@@ -138,19 +135,6 @@ def test_changes_not_worth_a_name_raise_no_alert(store: Store) -> None:
     assert not found.alerts
 
 
-@pytest.mark.parametrize(("runs", "steps"), [(8, 0), (9, 1)])
-def test_a_step_of_slip_takes_runs_of_which_an_order_is_rare_enough(runs: int, steps: int) -> None:
-    """Low values first or high ones first are 2 of all orders; half of the level is for all series."""
-    assert (2.0 / math.comb(runs, runs // 2) <= 0.5 * LEVEL) == bool(steps)
-    rows = [
-        (day, "husky", "median_modulus (command)", "m/s", f"2026-05-{day + 1:02d}", f"run_{day}", slip)
-        for day, slip in enumerate([0.1] * (runs // 2) + [0.5] * (runs - runs // 2))
-    ]
-    names = ["order", "group", "quantity", "unit", "day", "run", "value"]
-    (found,) = follow_quantities(pl.DataFrame(rows, schema=names, orient="row"))
-    assert len(found.steps) == steps
-
-
 def test_the_exit_code_serves_a_nightly_job(store: Store, capsys: pytest.CaptureFixture[str]) -> None:
     drive_a_season(store, [1.8, 1.8], median=1.0)
     for limit, code in (("median_modulus=9.0", 0), ("median_modulus=0.1", 4), ("nonsense", 1)):
@@ -179,21 +163,6 @@ def test_a_limit_holds_for_a_last_run_that_is_odd_or_at_a_bound(store: Store, *,
     unsure = ", which does not determine it" if at_bound else ""
     text = f"effective_track.k of warthog-2 is 0.75 in last{unsure}, above the limit of 0.7"
     assert text in [alert.text for alert in found.alerts]
-
-
-def test_a_placeholder_of_a_clock_orders_no_run(store: Store) -> None:
-    for name in ("ice_2024_7_30", "gravel_2023_12_12", "asphalt"):
-        write_run(store, Run(name=name, seconds=30.0))
-    found = follow(store)
-    assert found.series[0].points["run"].to_list() == ["gravel_2023_12_12", "ice_2024_7_30"]
-    assert found.notes[:2] == (
-        (
-            "the clocks of 3 runs start at the same instant of 2023-11-14, which names contradict: "
-            "the dates in the names of 2 count; the others have no date"
-        ),
-        "left out, because no date is known: asphalt",
-    )
-    assert "same instant of 2023-11-14" in write_trend(store, found).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from pipeline.fleet.forecast import FleetNumber, fit_fleet
 from pipeline.job.compare import Question, compare_results
 from pipeline.job.over_runs import follow_trend
 from pipeline.job.prediction import fit_results
-from pipeline.models import find_effect
 from pipeline.models.parameter import Level
 from pipeline.store import Store
 from pipeline.store.mirror import Mirror
@@ -134,42 +133,6 @@ def test_only_what_is_named_counts_and_of_the_runs_whose_model_holds_it() -> Non
     assert (held.named, len(held.runs), held.name) == (3, 9, "longitudinal_slip")
 
 
-@pytest.mark.parametrize(
-    ("effect", "parameter", "value", "error", "physical"),
-    [
-        ("wheel_radius", "k", -0.372, 0.243, False),
-        ("wheel_radius", "k", -0.1, 2.0, False),
-        ("wheel_radius", "k", 2.271, 0.199, False),
-        ("wheel_radius", "k", 0.226, 0.02, True),
-        ("wheel_radius", "k", 1.4, 0.1, True),
-        ("drive_lag", "tau", -0.02, 0.02, True),
-        ("drive_lag", "tau", -0.2, 0.02, False),
-        ("body_speed_limit", "limit", 0.0, 0.1, False),
-        ("lateral_drift", "c", -0.05, 0.01, True),
-    ],
-)
-def test_what_is_outside_physics_enters_no_fleet_and_is_said(
-    effect: str,
-    parameter: str,
-    value: float,
-    error: float,
-    physical: bool,  # noqa: FBT001 - a case
-) -> None:
-    number = find_effect(effect)().parameter(parameter)
-    assert number.is_physical(value, error) == physical
-    usual = number.typical
-    rows = draw(dict.fromkeys(ALIKE, usual), effect=effect, parameter=parameter, runs=2, spread=0.0)
-    rows = rows.with_columns(value=pl.lit(usual), standard_error=pl.lit(0.01 * abs(usual)))
-    odd = draw({"ice": value}, effect=effect, parameter=parameter, runs=1, vehicle="warthog_odd")
-    odd = odd.with_columns(vehicle=pl.lit("warthog"), value=pl.lit(value), standard_error=pl.lit(error))
-    model = fit_fleet(pl.concat([rows, odd]))
-    (fitted,) = model.numbers
-    used = {*fitted.runs, *fitted.odd}
-    assert ("warthog_odd_ice_0" in used) == physical
-    said = f"{effect}.{parameter} left out, outside the physical range: {value:.3g} in warthog_odd_ice_0"
-    assert (said in model.notes) != physical
-
-
 def test_an_interval_of_a_fleet_takes_three_runs() -> None:
     for runs, known in ((1, False), (2, False), (3, True)):
         number = fit_one(draw({"ice": 0.7}, runs=runs))
@@ -228,22 +191,6 @@ def test_simulated_runs_enter_no_fleet_and_no_trend_of_recordings(results: Store
     assert not any("made" in key for key in trend.keys)
 
 
-def test_of_two_inputs_the_command_counts_once() -> None:
-    both = [draw(ALIKE), draw(ALIKE, input="command", value=0.8)]
-    number = fit_one(pl.concat(both))
-    assert len(number.runs) == 9
-    assert number.fit.value == pytest.approx(0.8)
-
-
-def test_vehicles_are_fitted_apart() -> None:
-    model = fit_fleet(pl.concat([draw(ALIKE), draw(ICE_AND_OTHERS, vehicle="husky_a200")]))
-    assert {number.vehicle: number.level for number in model.numbers} == {
-        "husky_a200": Level.TERRAIN,
-        "warthog": Level.VEHICLE,
-    }
-    assert list(model.runs) == ["husky_a200", "warthog"]
-
-
 @pytest.fixture
 def results(tmp_path: Path) -> Store:
     """Results of nine runs on three grounds, one of them ice."""
@@ -270,28 +217,6 @@ def test_a_batch_keeps_a_fleet_that_was_fitted_up_to_date(
     shown = json.loads(run_slip("fleet", "show", str(results.root), "--json")[1])
     assert "mud" in shown["parameters"][0]["terrains"]
     assert not any("have changed since" in note for note in shown["notes"])
-
-
-def test_a_batch_keeps_a_trend_that_was_asked_for_up_to_date(
-    results: Store,
-) -> None:
-    refresh_pools(results)
-    assert not (results.root / "trend.json").exists()
-    asked = ("--by", "vehicle", "--limit", "wheel_radius.k=1.5")
-    assert run_slip("fleet", "trend", str(results.root), *asked, "--quiet")[0] == 0
-    new = Run(name="new", terrain="ice", seconds=6.0, estimates=[("wheel_radius", "k", 1.6, ERROR)])
-    write_run(results, replace(new, start_ns=new.start_ns + 10**15))
-    refresh_pools(results)
-    told = json.loads((results.root / "trend.json").read_text(encoding="utf-8"))
-    assert told["asked"]["by"] == ["vehicle"]
-    assert any("in new, above the limit of 1.5" in alert["text"] for alert in told["alerts"])
-    assert "above the limit of 1.5" in (results.root / "trend.html").read_text(encoding="utf-8")
-    for number, text in enumerate(
-        ('{"asked": 3}', '{"asked": {"by": ["x"], "threshold": 1e999, "limits": {}}}')
-    ):
-        (results.root / "trend.json").write_text(text, encoding="utf-8")
-        write_run(results, Run(name=f"newer_{number}", terrain="ice", seconds=6.0))
-        assert refresh_pools(results)
 
 
 def test_on_an_object_store_a_batch_keeps_fleet_and_trend_up_to_date_as_well(

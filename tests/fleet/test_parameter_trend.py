@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.joint_levels import find_shifts
 from pipeline.fleet.trend import ParameterTrend, follow_parameters, format_change
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
@@ -112,22 +111,6 @@ def test_a_run_that_does_not_determine_a_number_sets_no_scale() -> None:
         assert trend.shown_latest.endswith(" (undetermined)")
     alone = follow_parameters(wide.filter(is_last), days, level=0.05)
     assert alone == ()
-
-
-def test_grounds_driven_once_cannot_be_compared_over_time() -> None:
-    trend = follow_one(make_season(np.random.default_rng(7), ["asphalt", "gravel", "sand"]))
-    assert trend.changes == ()
-    assert trend.need == "3 more runs on a terrain driven before"
-
-
-def test_a_second_change_is_found_beside_the_first() -> None:
-    rng = np.random.default_rng(9)
-    values = np.concatenate([np.full(10, 1.0), np.full(10, 1.5), np.full(10, 1.2)]) + 0.02 * rng.normal(
-        size=30
-    )
-    found = find_shifts(values, np.full(30, 0.01), ["a", "b", "a"] * 10)
-    assert [shift.index for shift in found.shifts] == [10, 20]
-    assert [shift.after for shift in found.shifts] == pytest.approx([1.5, 1.2], abs=0.03)
 
 
 @pytest.mark.long

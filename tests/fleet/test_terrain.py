@@ -12,7 +12,6 @@ from pipeline.core.arrays import Floats
 from pipeline.fleet.terrain import (
     Drive,
     PassEffect,
-    compare_passes,
     list_crossings,
     measure_pass_effects,
     sum_cells,
@@ -112,32 +111,3 @@ def test_speed_and_turning_are_not_taken_for_passes() -> None:
     faster = found.with_columns(pl.Series("speed", speed), pl.Series("slip", slip))
     assert measure(faster).low < 0.0 < measure(faster).high
     assert measure(faster.with_columns(pl.lit(1.0).alias("speed"))).low > 0.0
-
-
-def test_time_and_passes_of_equal_laps_are_not_separated() -> None:
-    crossings = draw_laps(-0.1, seed=3)
-    random = np.random.default_rng(3)
-    lap_begins = 40.0 * crossings["passes"].to_numpy() + random.normal(0.0, 0.3, crossings.height)
-    (effect,) = measure_pass_effects(crossings.with_columns(pl.Series("t", lap_begins)))
-    assert effect.is_significant
-    assert math.isnan(effect.beside_time[0])
-
-
-def test_the_ends_of_a_narrow_interval_differ_where_they_are_said() -> None:
-    said = PassEffect("snow", change=-0.1216, low=-0.1246, high=-0.1184).describe()
-    assert "slip falls by 12.2 % per pass [-12.5 %, -11.8 %]" in said
-
-
-def test_a_route_that_is_not_repeated_says_so() -> None:
-    x = np.arange(0.0, 300.0, 0.05)
-    effect = measure(list_crossings(make_drive(x, np.zeros(x.size))))
-    assert not effect.is_significant
-    assert effect.describe().endswith("only 0 crossings repeat another one in place and direction")
-
-
-def test_further_passes_are_set_against_the_first() -> None:
-    table = compare_passes(draw_laps(-0.12, 5))
-    second = table.filter(pl.col("passes") == 1).row(0, named=True)
-    assert second["low"] < 0.88 < second["high"]
-    ratios = table["ratio"].to_list()
-    assert ratios == sorted(ratios, reverse=True)

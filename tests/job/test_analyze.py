@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 from pathlib import Path
 
@@ -91,17 +90,6 @@ def test_a_change_redoes_exactly_what_depends_on_it(
     assert analyze(log, out, overrides=change).computed == computed
 
 
-def test_a_reused_stage_keeps_its_findings(tmp_path: Path) -> None:
-    log = simulate_case("warthog_held_poses", out=tmp_path / "held.mcap", duration_s=40.0)
-    before = analyze(log, tmp_path / "out").manifest.read("findings")
-    after = analyze(log, tmp_path / "out", overrides={"slip": {"length_scale_m": 0.5}}).manifest.read(
-        "findings"
-    )
-
-    assert "extract" in before["stage"].to_list()
-    assert after.filter(pl.col("stage") == "extract").equals(before.filter(pl.col("stage") == "extract"))
-
-
 def test_two_folders_hold_the_same_bytes(log: Path, tmp_path: Path) -> None:
     for name in ("a", "b"):
         analyze(log, tmp_path / name, report=True)
@@ -122,14 +110,6 @@ def test_a_stage_alone_writes_its_tables_and_no_later_ones(log: Path, out: Path)
     assert "velocities" in velocity.manifest.tables
 
 
-def test_a_stage_asked_for_again_does_not_take_results_away(log: Path, out: Path) -> None:
-    whole = analyze(log, out)
-    again = analyze(log, out, through="velocity")
-
-    assert again.computed == ()
-    assert again.manifest.folder == whole.manifest.folder
-
-
 def test_force_computes_again_and_gives_the_same(log: Path, out: Path) -> None:
     first = analyze(log, out)
     second = analyze(log, out, force=True)
@@ -147,17 +127,6 @@ def test_equal_content_is_one_run(log: Path, out: Path, tmp_path: Path) -> None:
 
     assert analyze(copy, out).manifest.run == first.manifest.run
     assert len(Store(out).runs()) == 1
-
-
-def test_logs_of_one_name_are_two_runs(log: Path, out: Path, tmp_path: Path) -> None:
-    other = tmp_path / "elsewhere" / log.parent.name / log.name
-    other.parent.mkdir(parents=True)
-    simulate_case("husky_tile", out=other, seed=5, duration_s=30.0)
-
-    first, second = analyze(log, out), analyze(other, out)
-    assert second.manifest.run.startswith(f"{first.manifest.run}-")
-    assert len(second.manifest.run) == len(first.manifest.run) + 9
-    assert analyze(other, out).computed == ()
 
 
 def test_a_log_that_grew_is_the_same_run_with_new_results(out: Path, tmp_path: Path) -> None:
@@ -235,22 +204,6 @@ def test_slip_can_be_told_relative_to_a_model(out: Path, tmp_path: Path) -> None
     without = analyze(log, out)
     assert without.summary["by_input"]["command"]["median_residual_modulus"] is None
     assert without.manifest.read("slip")["model_x"].null_count() == table.height
-
-
-def test_a_split_recording_is_read_once(log: Path, out: Path, tmp_path: Path) -> None:
-    recording = tmp_path / "split"
-    recording.mkdir()
-    shutil.copy(log, recording / "split_0.mcap")
-    for path in (recording / "split_0.mcap", recording):
-        # What has only just changed is not trusted to have stopped.
-        os.utime(path, (1.7e9, 1.7e9))
-    told: list[str] = []
-    first = analyze_log(recording, Options(out=out, report=False), told.append)
-    assert "read" in told
-    told.clear()
-    second = analyze_log(recording, Options(out=out, report=False), told.append)
-    assert (second.computed, told) == ((), [])
-    assert second.manifest == first.manifest
 
 
 def test_a_summary_that_was_damaged_is_one_clear_error_and_made_anew_with_force(log: Path, out: Path) -> None:

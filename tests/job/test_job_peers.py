@@ -49,14 +49,3 @@ def test_an_unknown_terrain_is_compared_with_nothing(tmp_path: Path) -> None:
     store = Store(tmp_path)
     keep(store, "field/a", 0.4)
     assert find_peers(store, {**OWN, "terrain": "unknown"}) == {}
-
-
-def test_results_that_cannot_be_read_do_not_stop_a_report(tmp_path: Path) -> None:
-    store = Store(tmp_path)
-    keep(store, "field/a", 0.4)
-    keep(store, "field/b", 0.6)
-    keep(store, "field/c", 0.8)
-    (tmp_path / "runs" / "field" / "b" / "manifest.json").write_text("{")
-    (summary,) = (tmp_path / "runs" / "field" / "c").rglob("summary.json")
-    summary.write_text("[" * 100_000)
-    assert find_peers(store, OWN) == {"command": [0.4]}

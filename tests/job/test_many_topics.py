@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
     from pathlib import Path
 
-FEW, MANY = 150, 600
+FEW = 150
 """Topics of a kind beside those of a drive."""
 
 OPTIONS = Options(overrides={"vehicle": {"preset": "husky_a200"}})

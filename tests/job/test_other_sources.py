@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import polars as pl
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -18,7 +17,6 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.log_choice import Choice, choose
 from pipeline.logs import definition_text, open_log
-from pipeline.logs.writer import LogWriter
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.platforms import (
     Fields,
@@ -36,11 +34,12 @@ from pipeline.sources import load_configuration
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
+    import polars as pl
+
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 WHEEL = "{}_wheel_joint"
 HUSKY = PLATFORMS["husky_a200"].vehicle
 PLAIN = replace(HUSKY, controller_track_multiplier=1.0)
-START_NS = 1_700_000_000_000_000_000
 Messages = list[tuple[str, str, dict[str, Any]]]
 
 
@@ -177,46 +176,6 @@ def test_dynamic_joint_states_are_joint_states(tmp_path: Path, monkeypatch: pyte
 JOINT_STATE = "sensor_msgs/msg/JointState"
 
 
-def test_joints_with_different_quantities_are_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def shorten(topic: str, message: Any) -> Messages | None:  # noqa: ANN401 - a decoded message
-        made = to_dynamic(topic, message)
-        if made:
-            made[0][2]["interface_values"][0] = {"interface_names": ["position"], "values": [0.0]}
-        return made
-
-    log = publish(tmp_path, monkeypatch, *DRIVE, odometry("/icp_odom", "localization", "map", "base_link"))
-    options = Options(
-        out=tmp_path / "results", report=False, through="extract", overrides={"vehicle": {"preset": "husky"}}
-    )
-    manifest = analyze_log(rewrite(log, shorten), options).manifest
-    findings = manifest.read("findings").filter(pl.col("id") == "no_measured_wheels")
-    assert findings.height == 1
-    assert "wheels" not in manifest.tables
-
-
-def test_a_bicycle_controller_has_one_wheel_of_a_kind(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    car = PLATFORMS["ackermann_steering_controller"]
-    state = Published(
-        "/bicycle_steering_controller/controller_state",
-        "control_msgs/msg/SteeringControllerStatus",
-        "wheels",
-        {"traction_wheels_velocity": (Q("left"),), "steer_positions": (Q("steering"),)},
-    )
-    reference = twist("/bicycle_steering_controller/reference", stamped=True)
-    lidar = odometry("/lio/odometry", "localization", "map", "base_link")
-    description = next(one for one in car.topics if one.topic == "/robot_description")
-    log = publish(tmp_path, monkeypatch, reference, state, lidar, description, kind=car)
-    chosen = choose_for(log)
-    assert [str(chosen.sources.command), str(chosen.sources.wheels)] == [reference.topic, state.topic]
-    options = Options(out=tmp_path / "results", report=False, through="extract")
-    wheels = analyze_log(log, options).manifest.read("wheels")
-    assert float(wheels["speed"].abs().max()) > 0.5  # type: ignore[arg-type]
-
-
 def frames(places: Mapping[str, tuple[float, float, float]], parent: str = "base_link") -> list[Published]:
     """Static transforms of frames."""
     return [
@@ -250,18 +209,6 @@ def test_frames_of_wheels_tell_the_vehicle(tmp_path: Path, monkeypatch: pytest.M
     assert chosen.vehicle.kind == "differential"
     assert chosen.vehicle.track_width_m == pytest.approx(0.555)
     assert chosen.vehicle.wheel_radius_m == pytest.approx(0.1651)
-
-
-def test_frames_that_give_no_radius_leave_it_to_be_fitted(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    cameras = {"left_wheel_camera": (0.0, 0.1, 0.0), "right_caster_wheel": (0.3, -0.1, 0.0)}
-    log = publish(tmp_path, monkeypatch, *DRIVE, LIDAR, *frames({**WHEELS, **cameras}))
-    chosen = choose_for(log)
-    assert chosen.vehicle_source == "fitted"
-    assert chosen.vehicle.track_width_m == pytest.approx(0.555)
-    assert chosen.vehicle.wheel_radius_m == pytest.approx(0.1651, rel=0.03)
-    assert "track_width_m as recorded" in " ".join(finding.text for finding in chosen.findings)
 
 
 def test_a_body_command_and_its_wheels_tell_the_controllers_geometry(
@@ -333,32 +280,6 @@ def test_recorded_parameters_count_before_a_preset_and_that_is_said(
     assert (named.vehicle.wheel_radius_m, named.vehicle.track_width_m) == (0.2, 0.5)
 
 
-def test_parameters_may_stand_in_the_metadata(tmp_path: Path) -> None:
-    times = START_NS + np.arange(10) * 10**8
-    with LogWriter(tmp_path / "run.mcap") as writer:
-        for topic, kind in (("/cmd_vel", "Twist"), ("/pose", "PoseStamped")):
-            fields: dict[str, Any] = {} if kind == "Twist" else {"pose.orientation.w": 1.0}
-            header = None if kind == "Twist" else times
-            writer.write_columns(topic, f"geometry_msgs/msg/{kind}", times, fields, header_time=header)
-        writer.metadata(
-            "controllers",
-            {"base.wheel_separation": "0.4", "base.wheel_radius": "0.1", "base.type": "diff_drive"},
-        )
-    chosen = choose_for(tmp_path / "run.mcap")
-    assert (chosen.vehicle.id, chosen.vehicle_source) == ("controllers", "parameters")
-    assert (chosen.vehicle.track_width_m, chosen.vehicle.wheel_radius_m) == (0.4, 0.1)
-
-
-def test_a_receivers_velocity_is_no_command_and_a_fix_is_below_a_localization(tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=5, duration_s=20.0, platform="panther")
-    chosen = choose_for(log)
-    said = {str(rating.source): rating for rating in chosen.ratings}
-    assert next(iter(said)) == "/kiss/odometry"
-    assert "put on its course" in said["/panther/gps/fix"].reason
-    assert said["/panther/gps/fix"].score > said["/panther/odometry/wheels"].score
-    assert "/panther/gps/vel" not in {str(other) for other in chosen.sources.others["command"]}
-
-
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("topics", "named"),
@@ -386,19 +307,3 @@ def test_hidden_effects_are_named_by_satellites(
     assert found["effective_track"]["k"]["value"] == pytest.approx(1.5, rel=0.03)
     if "lateral_skid" in named:
         assert found["lateral_skid"]["c"]["value"] == pytest.approx(0.08, abs=0.01)
-
-
-def test_an_odometry_that_is_no_pose_after_all_measures_the_wheels(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Of a car that nobody names its odometry is first taken for the pose, and read as one."""
-    car = PLATFORMS["f1tenth"]
-    drive = next(one for one in car.topics if one.topic == "/drive")
-    wheels = odometry("/odom", "odometry", "odom", "base_link")
-    lidar = odometry("/pf/pose/odom", "localization", "map", "base_link")
-    log = publish(tmp_path, monkeypatch, drive, wheels, lidar, imu("/imu/data"), kind=car)
-    anonymous = rewrite(log, lambda _topic, _message: None)
-    choice = choose_for(anonymous)
-    assert (str(choice.sources.wheels), str(choice.sources.pose)) == ("/odom", "/pf/pose/odom")
-    analyzed = analyze_log(anonymous, Options(out=tmp_path / "results", report=False, through="extract"))
-    assert analyzed.manifest.read("wheels").height > 500

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,12 +16,10 @@ from pipeline.job.analyze import analyze_log
 from pipeline.job.terrain_map import Beside, draw_up_terrain, locate_on_earth, read_beside
 from pipeline.simulate import (
     PLATFORMS,
-    VEHICLES,
     Ground,
     Program,
     Recording,
     Scenario,
-    State,
     simulate_run,
     write_log,
 )
@@ -150,47 +147,6 @@ def test_hills_lean_the_vehicle_and_flat_poses_say_nothing_of_it(tmp_path: Path)
     assert np.median(cells["lean"].to_numpy()) == pytest.approx(0.1, abs=0.01)
 
 
-def test_a_run_too_fast_for_the_cells_is_named_and_alone_is_one_line(tmp_path: Path) -> None:
-    results = tmp_path / "results"
-    fast = record(tmp_path / "fast.mcap", vehicle=VEHICLES["warthog"], program=Program("circle"))
-    analyze(fast, results)
-    shown = run_verb("fleet", "map", "--terrain", "--cell", 0.25, "--results", results)
-    assert shown.returncode == 1
-    assert "no run crosses a cell of 0.25 m" in shown.stderr
-    analyze(record(tmp_path / "slow.mcap", program=Program("smooth", speed_scale=0.3)), results)
-    drawn = draw_up_terrain(Store(results), cell_m=0.25)
-    assert [note for note in drawn.notes if "/fast" in note] == [
-        f"left out, too short a time in every cell of 0.25 m: {tmp_path.name}/fast"
-    ]
-    assert not any(f"{tmp_path.name}/fast" in members for members in drawn.frames.values())
-
-
-def test_poses_and_fixes_that_disagree_place_nothing() -> None:
-    times = np.arange(0.0, 60.0, 0.5)
-    path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
-    latitude, longitude = from_local_plane(path, (46.78, -71.27))
-    fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
-    found = locate_on_earth(times, path * 3.0, Beside(times, fixes), (46.78, -71.27))
-    assert isinstance(found, str)
-    assert found.startswith("its poses and its fixes are")
-    still = locate_on_earth(times, 0.0 * path, Beside(times, 0.0 * fixes + fixes[0]), (46.78, -71.27))
-    assert isinstance(still, str) or still.distance_m < 1e-6
-
-
-def test_reflections_do_not_turn_a_map() -> None:
-    times = np.arange(0.0, 60.0, 0.5)
-    path = np.stack((times, 3.0 * np.sin(0.2 * times)), axis=1)
-    turned = (path[:, 0] + 1j * path[:, 1]) * np.exp(0.7j)
-    there = np.stack((turned.real + 5.0, turned.imag - 9.0), axis=1)
-    there[::10] += 40.0
-    latitude, longitude = from_local_plane(there, (46.78, -71.27))
-    fixes = np.column_stack((latitude, longitude, np.zeros(times.size)))
-    found = locate_on_earth(times, path, Beside(times, fixes), (46.78, -71.27))
-    assert not isinstance(found, str)
-    assert found.turn == pytest.approx(0.7, abs=1e-4)
-    assert (found.east, found.north) == (pytest.approx(5.0, abs=0.01), pytest.approx(-9.0, abs=0.01))
-
-
 @pytest.mark.parametrize("gone", [slice(0, 3), slice(None)])
 def test_poses_that_are_not_known_do_not_place_a_run(gone: slice) -> None:
     times = np.arange(0.0, 60.0, 0.5)
@@ -204,12 +160,3 @@ def test_poses_that_are_not_known_do_not_place_a_run(gone: slice) -> None:
     else:
         assert not isinstance(found, str)
         assert found.distance_m < 1e-3
-
-
-def test_compacted_ground_forgets_with_a_new_drive() -> None:
-    ground = CompactedGround(0.4, 0.5)
-    for _ in range(2):
-        losses = [ground(State(t=time, v0=1.0, w0=0.5)) for time in (0.0, 10.0, 20.0)]
-        assert losses[0] == (pytest.approx(-0.4), 0.0, pytest.approx(-0.2))
-        assert [loss[0] for loss in losses] == pytest.approx([-0.4, -0.2, -0.1])
-        assert math.isclose(losses[2][2], -0.05)

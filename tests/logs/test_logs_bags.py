@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from bag_files import STORE_1, write_bag, write_db3
-from mcap_files import FLOAT, SHARED, START, small_truth, value_of, write_small
+from mcap_files import FLOAT, SHARED, START, value_of, write_small
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode
@@ -70,11 +70,6 @@ def test_what_a_file_is_is_told_by_its_content(tmp_path: Path) -> None:
     assert len(read_all(bag)) == 180
 
 
-def test_a_name_with_marks_of_an_address_is_a_name(tmp_path: Path) -> None:
-    (file,) = write_db3(tmp_path / "run").glob("*.db3")
-    assert len(read_all(file.rename(tmp_path / "50%25 of it? #1 é.db3"))) == 180
-
-
 def test_a_recording_split_over_several_files_is_one(tmp_path: Path) -> None:
     first, second = (next(write_db3(tmp_path / name).glob("*.db3")) for name in ("a", "b"))
     folder = tmp_path / "run"
@@ -88,15 +83,6 @@ def test_a_recording_split_over_several_files_is_one(tmp_path: Path) -> None:
     (speed,) = data.of("/speed")
     assert len(speed) == 120
     assert np.diff(speed.log_time).min() > 0
-
-
-def test_a_type_without_definition_is_one_that_is_bundled(tmp_path: Path) -> None:
-    (file,) = write_db3(tmp_path / "run").glob("*.db3")
-    with sqlite3.connect(file) as database:
-        database.executescript("DROP TABLE message_definitions; UPDATE schema SET schema_version = 3;")
-    database.close()
-    assert read_all(file) == small_truth()[1]
-    assert "bundled" in read_topics(file, [Wanted("/speed")]).of("/speed")[0].notes[0]
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.99])
@@ -198,14 +184,6 @@ def test_all_chunks_of_a_bag_together_inflate_to_no_more_than_their_budget(
     assert len(some.of("/speed")[0]) < len(whole.of("/speed")[0])
 
 
-def test_messages_compressed_alone_have_a_budget_together(tmp_path: Path) -> None:
-    folder = write_db3(tmp_path / "run", mode=CompressionMode.MESSAGE)
-    whole = read_topics(folder, [Wanted("/joints")])
-    some = read_topics(open_log(folder, max_inflated=500), [Wanted("/joints")])
-    assert [loss.kind for loss in some.losses] == ["max_inflated"]
-    assert 0 < len(some.of("/joints")[0]) < len(whole.of("/joints")[0])
-
-
 def test_a_database_of_something_else_is_no_recording(tmp_path: Path) -> None:
     path = tmp_path / "notes.db3"
     with sqlite3.connect(path) as database:
@@ -214,13 +192,6 @@ def test_a_database_of_something_else_is_no_recording(tmp_path: Path) -> None:
     with pytest.raises(LogError, match="missing tables") as caught:
         open_log(path)
     assert caught.value.code == "log_unreadable"
-
-
-def test_a_transaction_under_way_is_a_recording_under_way(tmp_path: Path) -> None:
-    (file,) = write_db3(tmp_path / "run").glob("*.db3")
-    assert is_finished(file)
-    Path(f"{file}-journal").write_bytes(b"x")
-    assert not is_finished(file)
 
 
 def test_the_foreign_bags_hold_what_their_readers_say() -> None:

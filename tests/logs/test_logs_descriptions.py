@@ -13,7 +13,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from mcap_files import START, payloads, record_starts
 
-from pipeline.logs import LogData, Wanted, open_log, read_topics, spans
+from pipeline.logs import LogData, Wanted, open_log, read_topics
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -80,33 +80,6 @@ def test_a_channel_under_a_checksum_wins_over_the_summarys(tmp_path: Path) -> No
     data = read(path, zero_summary_crc(change_letter(write(path), b"/motion", b"m")))
     assert data.index.topics() == ("/motion",)
     assert [loss.kind for loss in data.losses] == ["contradiction"]
-
-
-def test_a_summary_without_checksum_that_agrees_says_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    data = read(path, zero_summary_crc(bytearray(write(path))))
-    assert not data.losses
-    assert not data.unchecked
-
-
-def test_only_the_chunks_that_channels_begin_in_are_read_for_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    read_spans = []
-    function = spans.load_span
-
-    def counting(*args: Any) -> object:
-        read_spans.append(args[1])
-        return function(*args)
-
-    monkeypatch.setattr(spans, "load_span", counting)
-    path = tmp_path / "log.mcap"
-    content = write(path)
-    open_log(path)
-    assert not read_spans, "a summary that its checksum covers is believed"
-    path.write_bytes(zero_summary_crc(bytearray(content)))
-    assert open_log(path).chunk_count > 10
-    assert len(read_spans) == 1
 
 
 @pytest.mark.parametrize("data_crc", [False, True])

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.records import Schema
 from mcap_files import (
     FLOAT,
     JOINTS,
@@ -19,7 +18,6 @@ from mcap_files import (
     text_of,
     write_channels,
 )
-from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.logs import (
     LogError,
@@ -77,20 +75,6 @@ def test_other_encapsulations_are_named_never_decoded_as_plain(tmp_path: Path, k
     assert loss.kind == "unsupported_encoding"
     assert name in loss.text
     assert (loss.start_ns, loss.end_ns) == (START + 1, START + 1)
-
-
-def test_the_official_decoder_takes_other_encapsulations_for_plain_ones() -> None:
-    """Why they are not left to it. When this fails, it has learnt them, and they may be."""
-    delimited = b"\x00\x09\x00\x00" + struct.pack("<Id", 8, 1.5)
-    listed = b"\x00\x03\x00\x00" + struct.pack("<HHdHH", 1, 8, 1.5, 1, 0)
-    decode = DecoderFactory().decoder_for("cdr", Schema(1, b"float64 x\n", "ros2msg", "demo/msg/X"))
-    assert decode is not None
-    for payload in (delimited, listed):
-        assert decode(payload).x != 1.5
-    wide = DecoderFactory().decoder_for("cdr", Schema(1, b"wstring x\n", "ros2msg", "demo/msg/X"))
-    assert wide is not None
-    with pytest.raises(NotImplementedError):
-        wide(b"\0\1\0\0" + bytes(8))
 
 
 def test_payloads_that_do_not_fit_their_type_are_lost_and_counted(tmp_path: Path) -> None:
@@ -191,49 +175,3 @@ def test_messages_that_name_their_fields_at_will_fill_no_memory(tmp_path: Path) 
     with pytest.raises(LogError, match="5000 messages have 5001 different fields"):
         read_topics(path, [Wanted("/j")])
     assert read_topics(path, [Wanted("/j", ("a",))]).of("/j")[0].fields["a"].tolist() == list(range(5000))
-
-
-def test_half_a_character_in_json_is_a_mark(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    write_channels(
-        path, [("/j", "T", "jsonschema", b"{}", "json", [b'{"a": "x\\ud800"}', b'{"a": "\xc3\xa9"}'])]
-    )
-    assert read_one(path, "/j").fields["a"].to_list() == ["x?", "é"]
-
-
-def test_ros1_messages_are_columns(tmp_path: Path) -> None:
-    pytest.importorskip("mcap_ros1", reason="mcap-ros1-support is not installed")
-    from mcap.reader import make_reader  # noqa: PLC0415 - optional
-    from mcap_ros1.decoder import DecoderFactory  # noqa: PLC0415 - optional
-
-    path = tmp_path / "log.mcap"
-    text = "Header header\nfloat64[] velocity\nstring[] name\nint8 level\n" + "=" * 80
-    text += "\nMSG: std_msgs/Header\nuint32 seq\ntime stamp\nstring frame_id\n"
-    body = struct.pack("<III", 7, 5, 6) + struct.pack("<I", 3) + b"map" + struct.pack("<I2d", 2, 1.5, 2.5)
-    body += struct.pack("<I", 1) + struct.pack("<I", 2) + b"ab" + b"\xff"
-    write_channels(path, [("/r", "demo/Joints", "ros1msg", text.encode(), "ros1", [body])])
-    columns = read_one(path, "/r")
-    with path.open("rb") as stream:
-        ((_, _, _, official),) = make_reader(
-            stream, decoder_factories=[DecoderFactory()]
-        ).iter_decoded_messages()
-    assert columns.fields["velocity"].row(0).tolist() == list(official.velocity)
-    assert columns.fields["name"].row(0) == official.name
-    assert columns.fields["header.frame_id"].to_list() == [official.header.frame_id]
-    assert columns.fields["level"].tolist() == [official.level] == [-1]
-    assert columns.header_time.tolist() == [5_000_000_006]
-
-
-def test_absurd_stamps_and_numbers_in_json_warn_nobody(tmp_path: Path) -> None:
-    """Tests turn every warning of numpy into an error."""
-    path = tmp_path / "log.mcap"
-    seconds = ["1e308", "NaN", "-Infinity", "1" * 400, "-9223372036854775808", "5"]
-    encoded = [
-        f'{{"header": {{"stamp": {{"sec": {text}, "nanosec": {text}}}}}, "x": {text}}}'.encode()
-        for text in seconds
-    ]
-    write_channels(path, [("/json", "T", "jsonschema", b"{}", "json", encoded)])
-    columns = read_one(path, "/json")
-    assert columns.header_time is None
-    assert columns.fields["x"][3] == np.inf
-    assert columns.fields["x"][5] == 5.0

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import io
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +10,6 @@ import pytest
 from mcap.writer import Writer
 from mcap_files import (
     FLOAT,
-    JOINTS,
     START,
     TEXT,
     Channel,
@@ -29,7 +26,6 @@ from mcap_files import (
 from pipeline.logs import (
     LogError,
     Ragged,
-    RaggedStrings,
     TransformBuffer,
     Wanted,
     hash_log,
@@ -144,27 +140,6 @@ def test_idl_schemas_mean_the_same_as_msg(tmp_path: Path) -> None:
     assert idl.fields["pair"].tolist() == [[1.0, 2.0], [3.0, 4.0]]
     assert idl.fields["count"].tolist() == [1, 2**40]
     assert idl.fields["name"].to_list() == msg.fields["name"].to_list() == ["a", "bcd"]
-
-
-def test_an_empty_schema_falls_back_to_the_bundled_definition_and_says_so(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    encoded = payloads(FLOAT, 2, {"data": np.array([1.0, 2.0])})
-    channels: list[Channel] = [
-        ("/known", FLOAT, "ros2msg", b"", "cdr", encoded),
-        ("/unknown", "vendor_msgs/msg/Thing", "ros2msg", b"", "cdr", encoded),
-        ("/odd", "vendor_msgs/msg/Thing", "ros2msg", b"this is ! no definition", "cdr", encoded),
-        ("/none", "", "", b"", "cdr", encoded),
-    ]
-    write_channels(path, channels)
-    data = read_topics(path, [Wanted(topic) for topic in ("/known", "/unknown", "/odd", "/none")])
-    (known,) = data.of("/known")
-    assert known.fields["data"].tolist() == [1.0, 2.0]
-    assert any("bundled" in note for note in known.notes)
-    (unknown,) = data.of("/unknown")
-    assert len(unknown) == 2
-    assert not unknown.fields
-    assert [loss.kind for loss in data.losses] == ["unsupported_encoding"]
-    assert "/odd" in data.losses[0].text
 
 
 def test_messages_longer_than_a_guessed_type_are_refused_and_than_their_own_noted(tmp_path: Path) -> None:
@@ -289,30 +264,6 @@ def test_a_folder_of_several_recordings_is_refused(tmp_path: Path) -> None:
     assert caught.value.code == "not_a_recording"
 
 
-def test_fields_are_chosen_by_path(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    write_small(path, rows=5)
-    wanted = [Wanted("/joints", ("velocity[1]", "velocity[5]", "name[0]", "header.stamp"))]
-    fields: Any = read_topics(path, wanted).of("/joints")[0].fields
-    assert list(fields) == [
-        "velocity[1]",
-        "velocity[5]",
-        "name[0]",
-        "header.stamp.sec",
-        "header.stamp.nanosec",
-    ]
-    assert np.isnan(fields["velocity[5]"]).all()
-    assert fields["name[0]"].to_list() == ["left"] * 5
-    with pytest.raises(LogError) as missing:
-        read_topics(path, [Wanted("/joints", ("velocities",))])
-    assert missing.value.code == "field_not_found"
-    assert "velocity" in missing.value.hint
-    with pytest.raises(LogError) as absent:
-        read_topics(path, [Wanted("/nowhere")])
-    assert absent.value.code == "topic_not_found"
-    assert "/joints" in absent.value.hint
-
-
 def test_a_chunk_without_checksum_is_read_up_to_the_last_wanted_message(tmp_path: Path) -> None:
     path = tmp_path / "log.mcap"
     encoded = payloads(FLOAT, 50, {"data": np.arange(50.0)})
@@ -326,29 +277,3 @@ def test_a_chunk_without_checksum_is_read_up_to_the_last_wanted_message(tmp_path
     assert data.of("/x")[0].fields["data"].tolist() == list(range(50))
     assert not data.losses
     assert "no checksum" in data.unchecked
-
-
-def test_the_index_tells_what_a_log_holds(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    truth = write_small(path)
-    index = open_log(path)
-    assert index.complete
-    assert index.metadata == {"deployment": {"vehicle": "husky_a200"}}
-    assert index.compressions == ("zstd",)
-    assert index.topics() == ("/joints", "/speed", "/state")
-    assert index.message_count == len(truth)
-    assert index.start_ns == min(time for _, time in truth)
-    assert index.duration_s == pytest.approx(0.59, abs=1e-6)
-    assert {channel.type_name for channel in index.channels} == {FLOAT, JOINTS, TEXT}
-    assert isinstance(read_topics(path, [Wanted("/joints")]).topics[0].fields["name"], RaggedStrings)
-    assert io.BytesIO(path.read_bytes()).read(5) == b"\x89MCAP"
-
-
-def test_a_recording_of_farm_ng_is_named_and_how_it_can_be_read(tmp_path: Path) -> None:
-    uri = b"\x0a\x08protobuf\x12\x05amiga\x1a\x0c/canbus/twist"
-    event = b"\x0a" + bytes([len(uri)]) + uri + b"\x18\x05"
-    path = tmp_path / "log.0000.bin"
-    path.write_bytes(struct.pack("<I", len(event)) + event + b"\x0d\x00\x00\x80\x3f")
-    with pytest.raises(LogError, match="farm-ng") as error:
-        open_log(path)
-    assert "mcap_protobuf" in error.value.hint

@@ -6,7 +6,6 @@ import shutil
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
 from fomo_session import START_US, write_session
 
@@ -44,11 +43,6 @@ def test_poses_in_the_format_of_tum_are_poses(session: Path) -> None:
     assert topic.fields["pose.position.y"].tolist() == [5242729.390226772]  # type: ignore[union-attr]
 
 
-def test_a_name_that_stands_twice_in_the_first_line_is_its_first_column(session: Path) -> None:
-    (topic,) = read(session, "/warthog/platform/odom").topics
-    assert np.max(np.abs(topic.fields["twist.twist.angular.z"])) > 0.05  # type: ignore[arg-type]
-
-
 def test_what_cannot_be_read_is_left_out_and_counted(session: Path) -> None:
     table = session / "metadata" / "velocity_left.csv"
     table.write_text("timestamp,value\n1760456485757616,0\nx,1\n1760456486000000\nnan,2\n1760456486500000,3")
@@ -64,31 +58,10 @@ def test_the_folder_that_one_stands_in_is_read(session: Path, monkeypatch: pytes
     assert read(Path()).topics[0].log_time.size == read(session).topics[0].log_time.size > 0
 
 
-def test_a_byte_order_mark_is_no_part_of_the_first_name(session: Path) -> None:
-    table = session / "metadata" / "velocity_left.csv"
-    table.write_text("timestamp,value\n1760456485757616,2\n", encoding="utf-8-sig")
-    assert not open_log(session).losses
-    assert read(session).topics[0].fields["data"].tolist() == [2.0]  # type: ignore[union-attr]
-
-
-def test_a_table_of_remarks_alone_has_no_messages(session: Path) -> None:
-    (session / "gt.txt").write_text("# t x y z qx qy qz qw\n  # no fix\n")
-    assert not open_log(session).losses
-    (topic,) = read(session, "/ppk_gnss/pose").topics
-    assert topic.log_time.size == 0
-
-
 def test_a_table_without_its_columns_is_said(session: Path) -> None:
     (session / "metadata" / "velocity_left.csv").write_text("time,rpm\n1,2\n")
     (loss,) = open_log(session).losses
     assert "has no column timestamp, value" in loss.text
-
-
-def test_what_is_not_in_the_folder_is_said(session: Path) -> None:
-    (session / "metadata" / "voltage_left.csv").unlink()
-    notes = " ".join(open_log(session).notes)
-    assert "a recording of FoMo" in notes
-    assert "not in the folder: xsens.csv, metadata/cmd_velocity.csv, metadata/voltage_left.csv" in notes
 
 
 def test_a_table_beyond_the_limit_is_refused(session: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -108,24 +81,11 @@ def test_a_table_of_nothing_but_line_ends_is_refused_before_it_is_cut_into_lines
     assert str(table) in caught.value.where
 
 
-def test_lines_may_end_as_on_windows(session: Path) -> None:
-    table = session / "metadata" / "velocity_left.csv"
-    table.write_bytes(b"timestamp,value\r\n1760456485757616,0\r\n1760456486017763,-1.25\r\n\r\n")
-    assert read(session).topics[0].fields["data"].tolist() == [0.0, -1.25]  # type: ignore[union-attr]
-    table.write_bytes(b"timestamp,value\r\n1760456485757616,0\r\nx,1\r\n")
-    assert read(session).topics[0].fields["data"].tolist() == [0.0]  # type: ignore[union-attr]
-
-
 def test_other_folders_of_tables_are_no_recordings(session: Path) -> None:
     (session / "gt.txt").unlink()
     with pytest.raises(LogError) as caught:
         open_log(session)
     assert caught.value.code == "not_a_recording"
-
-
-def test_messages_win_over_tables_beside_them(session: Path) -> None:
-    shutil.copy(Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap", session / "run.mcap")
-    assert VELOCITY not in open_log(session).topics()
 
 
 def test_the_hash_is_of_all_tables(session: Path) -> None:

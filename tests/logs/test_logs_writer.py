@@ -11,7 +11,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap_files import FLOAT, JOINTS, START, TEXT, assert_equals_official, read_small, write_small
 
-from pipeline.logs import LogError, Ragged, RaggedStrings, Wanted, bundled_types, open_log, read_topics
+from pipeline.logs import LogError, Wanted, bundled_types, open_log, read_topics
 from pipeline.logs.writer import LogWriter
 
 if TYPE_CHECKING:
@@ -56,41 +56,6 @@ def test_a_failed_write_leaves_what_was_there(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_every_way_to_give_a_column(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    times = START + np.arange(3)
-    ragged = Ragged(np.array([1.0, 2.0, 3.0]), np.array([0, 0, 1, 3]))
-    names = RaggedStrings(np.array([1, 1, 0], dtype=np.int32), ("a", "bé"), np.array([0, 0, 1, 3]))
-    kind = "tf2_msgs/msg/TFMessage"
-    with LogWriter(path) as writer:
-        writer.write_columns(
-            "/lists", JOINTS, times, {"name": [["a"], [], ["b", "c"]], "velocity": [[1.0], [], [2, 3]]}
-        )
-        writer.write_columns("/ragged", JOINTS, times, {"name": names, "velocity": ragged}, header_time=times)
-        writer.write_columns("/same", JOINTS, times, {"name": ["l", "r"], "velocity": np.ones((3, 2))})
-        pose = {
-            "pose.covariance": np.arange(36.0),
-            "child_frame_id": "base",
-            "pose.pose.position.x": times * 1.0,
-        }
-        writer.write_columns("/odom", ODOMETRY, times, pose, publish_time=times + 5)
-        both = {"transforms[].child_frame_id": ["x", "y", "z"], "transforms[].transform.rotation.w": 1.0}
-        writer.write_columns("/tf", kind, times, both, header_time=times)
-    data = read_topics(path, [Wanted(topic) for topic in open_log(path).topics()])
-    fields: dict[str, Any] = {columns.topic: columns.fields for columns in data.topics}
-    assert [fields["/lists"]["name"].row(row) for row in range(3)] == [["a"], [], ["b", "c"]]
-    assert [fields["/lists"]["velocity"].row(row).tolist() for row in range(3)] == [[1.0], [], [2.0, 3.0]]
-    assert fields["/ragged"]["name"].row(2) == ["bé", "a"]
-    assert fields["/same"]["name"].fixed().shape == (3, 2)
-    assert fields["/odom"]["pose.covariance"][2].tolist() == list(range(36))
-    assert fields["/odom"]["pose.pose.orientation.w"].tolist() == [0.0, 0.0, 0.0]
-    assert data.of("/odom")[0].publish_time.tolist() == (times + 5).tolist()
-    assert data.of("/ragged")[0].header_time.tolist() == times.tolist()
-    assert fields["/tf"]["transforms[].child_frame_id"].row(1) == ["y"]
-    assert fields["/tf"]["transforms[].header.stamp.nanosec"].row(2).tolist() == [2]
-    assert assert_equals_official(path) == 15
-
-
 @pytest.mark.parametrize(
     ("kind", "fields", "code"),
     [
@@ -108,19 +73,6 @@ def test_what_cannot_be_written_is_said(tmp_path: Path, kind: str, fields: dict[
             writer.write_columns("/x", kind, START + np.arange(3), fields)
         assert caught.value.code == code
     assert open_log(tmp_path / "log.mcap").message_count == 0
-
-
-def test_a_topic_without_messages_is_there(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    nothing = np.empty(0, dtype=np.int64)
-    with LogWriter(path) as writer:
-        writer.write_columns("/joints", JOINTS, nothing, {"name": [], "velocity": []}, header_time=nothing)
-    index = open_log(path)
-    assert index.topics() == ("/joints",)
-    (columns,) = read_topics(index, [Wanted("/joints")]).of("/joints")
-    assert len(columns) == 0
-    assert isinstance(columns.fields["velocity"], Ragged)
-    assert isinstance(columns.fields["name"], RaggedStrings)
 
 
 def test_times_before_1970_are_refused(tmp_path: Path) -> None:
@@ -144,19 +96,6 @@ def test_a_type_with_its_own_definition(tmp_path: Path) -> None:
             "/x", "demo/msg/Pair", np.array([START]), {"b": 2.5}, definition="int8 a\nfloat64 b\n"
         )
     assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["b"].tolist() == [2.5]
-
-
-def test_messages_are_ordered_however_they_were_given(tmp_path: Path) -> None:
-    path = tmp_path / "log.mcap"
-    rng = np.random.default_rng(3)
-    times = START + rng.permutation(500)
-    with LogWriter(path, chunk_size=1000) as writer:
-        for part in np.split(times, 5):
-            writer.write_columns("/x", FLOAT, part, {"data": (part - START).astype(float)})
-    with path.open("rb") as stream:
-        logged = [m.log_time for _, _, m in make_reader(stream).iter_messages(log_time_order=False)]
-    assert logged == sorted(times.tolist())
-    assert read_topics(path, [Wanted("/x")]).of("/x")[0].fields["data"].tolist() == list(range(500))
 
 
 def test_what_is_settled_is_written_and_forgotten(tmp_path: Path) -> None:

@@ -12,7 +12,6 @@ from scipy.optimize import fsolve
 
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, Timing
-from pipeline.models.catalogue import find_effect
 from pipeline.models.literature import find_model, list_models
 from pipeline.run import MotionError
 from pipeline.simulate import Program
@@ -77,15 +76,6 @@ def test_the_formulas_are_where_forces_and_moment_vanish(driven: Problem, rollin
     np.testing.assert_array_equal(found[1], 0.0)
 
 
-def test_without_rolling_resistance_it_is_an_effective_track(driven: Problem) -> None:
-    wider = 1.0 + ((HUSKY.wheelbase_m or np.nan) / (HUSKY.track_width_m or np.nan)) ** 2
-    # The vendor's own multiplier of the Husky's track is 1.875.
-    assert wider == pytest.approx(1.87, abs=0.02)
-    track = Model(HUSKY, (find_effect("effective_track")().change(k=wider),))
-    free = find_model("friction_based").make(HUSKY).change(TERMS, rolling=0.0)
-    np.testing.assert_allclose(predict(driven, free), predict(driven, track), atol=1e-12)
-
-
 def slip_by_balance(state: SimulatedState) -> tuple[float, float, float]:
     base, track = HUSKY.wheelbase_m or np.nan, HUSKY.track_width_m or np.nan
     left, right = (state.v0 + side * 0.5 * track * state.w0 for side in (-1.0, 1.0))
@@ -108,15 +98,6 @@ def test_a_fit_returns_the_share_of_rolling_resistance() -> None:
     problem = Problem([simulate({}, extra=slip_by_balance, duration_s=120.0)], HUSKY, Input.MEASURED)
     fitted = fit_model(problem, find_model("friction_based").make(HUSKY), exact=True)
     assert fitted.model.effect(TERMS).values["rolling"] == pytest.approx(0.2, abs=0.02)
-
-
-def test_it_has_one_number_and_takes_the_geometry_of_the_vehicle() -> None:
-    model = find_model("friction_based")
-    assert model.count_numbers() == 1
-    made = model.make(HUSKY).effect(TERMS)
-    assert (made.values["wheelbase"], made.values["track"]) == (HUSKY.wheelbase_m, HUSKY.track_width_m)
-    assert made.fixed == {"wheelbase", "track"}
-    assert model in list_models(HUSKY)
 
 
 @pytest.mark.parametrize("change", [{"wheelbase_m": None}, {"running_gear": "tracks"}])

@@ -59,10 +59,6 @@ def test_a_formula_computes_what_it_says(a: float, b: float) -> None:
     assert expression.evaluate(values) == pytest.approx(-a + 2 * b * b / abs(b) - max(a, b) * math.sin(0.5))
 
 
-def test_a_caret_is_a_power_too() -> None:
-    assert parse_expression("a^2", KNOWN, "").evaluate({"a": 3.0}) == pytest.approx(9.0)
-
-
 @pytest.mark.parametrize(
     ("text", "code"),
     [

@@ -32,7 +32,7 @@ from pipeline.simulate import (
 )
 from pipeline.stages import Finding
 from pipeline.stages.align import align_tables
-from pipeline.stages.incidents import Rims, _report_expired, find_incidents
+from pipeline.stages.incidents import find_incidents
 from pipeline.stages.slip_stage import Ideal
 
 HUSKY = vehicle_of("husky_a200")
@@ -142,18 +142,6 @@ def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:
     pauses = sparse["commands"]["t"].diff().drop_nulls().to_numpy()
     assert kept.value == pytest.approx(np.max(pauses) - 0.5, abs=1.0)
     assert not [one for one in findings if one.id in INCIDENTS]
-
-
-@pytest.mark.parametrize(("lasts_s", "is_kept"), [(9.0, True), (1.5, False)])
-def test_a_base_that_stops_by_itself_does_not_keep_its_command(lasts_s: float, *, is_kept: bool) -> None:
-    times = np.arange(0.0, 40.0, 0.05)
-    expired, moves = np.zeros((times.size, 3)), np.ones((times.size, 3)) * (1.0, 0.0, 0.0)
-    for start in (10.0, 20.0):
-        expired[(times > start) & (times < start + 3.0), 0] = 1.0
-        moves[(times > start + lasts_s) & (times < start + 3.0)] = 0.0
-    known, speed = np.ones(times.size, dtype=bool), np.abs(moves).sum(axis=1)
-    rims = Rims(times, speed, moves, known, expired, speed, moves, speed, moves, 1.0)
-    assert bool(_report_expired(rims)) is is_kept
 
 
 @pytest.mark.long

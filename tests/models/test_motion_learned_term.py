@@ -18,18 +18,15 @@ from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.learned_step import (
     ResidualData,
-    add_term,
-    check_bands,
     learn_beyond,
     learn_fold,
     learn_where_it_helps,
-    leave_grounds_out,
     make_learned_step,
     regress,
 )
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
-from pipeline.models.learned_term import INPUTS, Bands, InputProbe, LearnedInput, ResidualTerm
+from pipeline.models.learned_term import INPUTS, Bands, LearnedInput, ResidualTerm
 from pipeline.models.model_file import parse_model
 from pipeline.simulate import simulate_case
 
@@ -136,21 +133,6 @@ def test_it_fades_to_the_physics_where_an_input_leaves_its_data() -> None:
     assert sizes[3] < 1e-6
 
 
-def test_inputs_know_nothing_of_what_comes_later(problem: Problem) -> None:
-    run, moment = problem.runs[0], problem.runs[0].start_s + 60.0
-    assert run.wheels is not None
-    later = run.wheels.times > moment
-    wheels = run.wheels.change(run.wheels.times, lambda speeds: np.where(later, 0.0, speeds))
-    known = []
-    for comparison in problem.comparisons[0], Comparison(replace(run, wheels=wheels), HUSKY, Input.MEASURED):
-        probe = InputProbe()
-        comparison.find_residuals((probe,), Timing(), restarted=True)
-        known.append(probe.known)
-    before = problem.comparisons[0].grid.times < moment - 0.5
-    np.testing.assert_allclose(known[0][before], known[1][before], atol=1e-9)
-    assert not np.allclose(known[0][~before], known[1][~before])
-
-
 def test_the_regression_shrinks_noise_and_finds_what_is_there() -> None:
     generator = np.random.default_rng(2)
     inputs = generator.normal(0.0, 1.0, (2000, 6))
@@ -245,55 +227,11 @@ def grounds() -> list[MotionRun]:
 
 
 @pytest.mark.long
-def test_bands_of_several_grounds_come_from_runs_on_those_left_out(grounds: list[MotionRun]) -> None:
-    alike, unlike, alone = (
-        Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:], grounds[:1])
-    )
-    model = fit_track(alike)[0].model
-    found, worse = leave_grounds_out(alike, model), leave_grounds_out(unlike, model)
-    assert found is not None
-    assert worse is not None
-    assert found.bands is not None
-    assert worse.bands is not None
-    assert found.bands.of == "of 2 terrains, each left out in turn"
-    # What differs between grounds belongs into the band.
-    assert worse.bands.position > 1.2 * found.bands.position
-    assert leave_grounds_out(alone, model) is None
-
-
-@pytest.mark.long
 def test_a_term_that_makes_a_ground_worse_that_it_has_not_seen_is_refused(grounds: list[MotionRun]) -> None:
     alike, unlike = (Problem(runs, HUSKY, Input.MEASURED) for runs in (grounds[:2], grounds[1:]))
     assert make_learned_step(alike, *fit_track(alike)).refusal == ""
     refusal = make_learned_step(unlike, *fit_track(unlike)).refusal
     assert "learned without ice, on seed 3 position error rises by" in refusal
-
-
-@pytest.mark.long
-def test_a_number_of_each_run_alone_is_no_difference_between_grounds(grounds: list[MotionRun]) -> None:
-    name, model = "effective_track.k", Model(HUSKY, (find_effect("effective_track")(),))
-    truth = {**SLOWED, "effective_track": {"k": 1.4}}
-    other = replace(simulate(truth, seed=2, duration_s=200.0), terrain="wood")
-    steps = []
-    for runs in (grounds[:2], [grounds[0], other]):
-        problem = Problem(runs, HUSKY, Input.MEASURED)
-        fitted = fit_model(problem, model, per_run=(name,), exact=True)
-        assert fitted.per_run == (name,)
-        steps.append(make_learned_step(problem, fitted, hold_out(problem, fitted)))
-    assert [step.refusal for step in steps] == ["", ""]
-    alike, unlike = (step.term.bands for step in steps)
-    assert alike is not None
-    assert unlike is not None
-    assert unlike.heading == pytest.approx(alike.heading, rel=0.2)
-    # What slows it in turns grows with the turn, which a smaller track makes faster.
-    assert unlike.position < 1.8 / 1.4 * alike.position
-    # Nor is it a reason for the bands of one ground not to hold on another.
-    whole = add_term(fit_track(Problem(grounds[:2], HUSKY, Input.MEASURED))[0], steps[0].term).model
-    held, missed = (
-        check_bands(whole, [other], Input.MEASURED, own)[0]["heading"].as_it_is for own in ((name,), ())
-    )
-    assert held > 0.9
-    assert missed < 0.5
 
 
 @pytest.mark.long

@@ -117,30 +117,6 @@ def test_the_full_linear_model_reaches_any_map_near_the_ideal_one(driven: Proble
     assert np.abs(least_squares(miss, start, x_scale=0.1).fun).max() < 1e-8
 
 
-def test_the_track_of_the_roc_model_follows_the_curvature(driven: Problem) -> None:
-    left, right = split_sides(driven)
-    turns = np.abs(right - left) > 0.05
-    q = np.abs((left + right) / (right - left))[turns]
-    model = change(find_model("roc").make(HUSKY), roc_terms__a=0.9, roc_terms__c=0.4)
-    ideal, found = predict(driven, Model(HUSKY)), predict(driven, model)
-    np.testing.assert_array_equal(found[:2], ideal[:2])
-    expected = ideal[2][turns] / (1.0 + 0.9 / (1.0 + 0.4 * np.sqrt(q)))
-    np.testing.assert_allclose(found[2][turns], expected, rtol=2e-3)
-    assert np.isfinite(found).all()
-
-
-def test_drive_slips_by_the_published_features(driven: Problem) -> None:
-    forward, _, turning = predict(driven, Model(HUSKY))
-    weights = (0.1, 0.03, -0.02, 0.01, 0.4)
-    named = {f"drive_terms__w{number}": value for number, value in enumerate(weights, start=1)}
-    found = predict(driven, change(find_model("drive").make(HUSKY), **named))
-    w1, w2, w3, w4, w5 = weights
-    np.testing.assert_allclose(found[0], forward * (1.0 - w1), atol=1e-12)
-    np.testing.assert_allclose(found[1], -w2 * forward * turning, atol=1e-12)
-    expected = turning - w3 * forward * turning - w4 * forward - w5 * turning
-    np.testing.assert_allclose(found[2], expected, atol=1e-12)
-
-
 def test_seegmiller_on_flat_ground_is_linear_in_speed_and_centripetal_force(driven: Problem) -> None:
     forward, _, turning = predict(driven, Model(HUSKY))
     named = {"c1": 3.0, "c2": -0.1, "c3": 2.0, "c4": 0.5, "c5": 0.02, "c6": -0.3}

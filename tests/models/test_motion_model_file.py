@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from motion_runs import vehicle_of
 
-from pipeline.models import Model, ModelFile, find_effect, format_model, list_effects, read_model, write_model
+from pipeline.models import Model, ModelFile, format_model, list_effects, read_model, write_model
 from pipeline.models.catalogue import trust
 from pipeline.models.model_file import list_code, parse_model
 from pipeline.run import MotionError
@@ -85,33 +85,6 @@ def test_a_model_beside_a_log_is_not_its_configuration(name: str, tmp_path: Path
     assert load_configuration(log).run.terrain == "ice"
 
 
-def test_a_vehicle_without_preset_keeps_its_geometry() -> None:
-    text = '[vehicle]\nname = "crab"\nkind = "differential"\nwheel_radius_m = 0.2\ntrack_width_m = 0.7\n'
-    file = parse_model(text, HERE)
-    assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
-
-
-def test_a_vehicle_that_is_named_like_a_preset_keeps_what_it_does_not_know() -> None:
-    """A car called "car" has no track width, the example that goes by this name has; so with another kind."""
-    for name, kind in (("car", "ackermann"), ("husky", "ackermann")):
-        text = f'[vehicle]\nname = "{name}"\nkind = "{kind}"\nwheel_radius_m = 0.3\nwheelbase_m = 2.7\n'
-        file = parse_model(text, HERE)
-        assert file.model.vehicle.track_width_m is None
-        assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
-
-
-def test_a_stand_in_stays_a_stand_in() -> None:
-    text = (
-        '[vehicle]\nname = "crab"\nkind = "differential"\nwheel_radius_m = 0.1\ntrack_width_m = 0.5\n'
-        'stand_ins = ["wheel_radius_m"]\n'
-    )
-    file = parse_model(text, HERE)
-    assert file.model.vehicle.stand_ins == ["wheel_radius_m"]
-    assert parse_model(format_model(file), HERE).model.vehicle == file.model.vehicle
-    with pytest.raises(MotionError, match="stand_ins"):
-        parse_model(text.replace('wheel_radius_m"]', 'mass_kg"]'), HERE)
-
-
 def test_formulas_are_read_and_written() -> None:
     text = HEAD + '[[effect]]\nid = "wind"\nv_y = "k * sin(yaw)"\nk = { unit = "m/s", bounds = [-1, 1] }\n'
     file = parse_model(text, HERE)
@@ -143,17 +116,3 @@ def test_a_file_of_effects_that_does_not_work_is_named(tmp_path: Path, text: str
     with pytest.raises(MotionError, match=says) as caught:
         read_model(path)
     assert caught.value.where == f"{path}:1"
-
-
-def test_models_compose_in_the_order_of_a_command_s_way() -> None:
-    ideal = Model(vehicle_of("husky_a200"))
-    lever, track, lag = (find_effect(name)() for name in ("lever_arm", "effective_track", "drive_lag"))
-    model = ideal + lever + track + lag
-    assert model.ids == ("drive_lag", "effective_track", "lever_arm")
-    assert (model - "effective_track").ids == ("drive_lag", "lever_arm")
-    with pytest.raises(MotionError, match="already in the model"):
-        _ = model + track
-    with pytest.raises(MotionError, match="no effect 'speed_slip'"):
-        _ = model - "speed_slip"
-    with pytest.raises(MotionError, match="outside"):
-        model.change("effective_track", k=50.0)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -9,7 +8,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-from pipeline.estimation import Comparison, Errors, HeldOut, Input, Problem, fit_model, hold_out
+from pipeline.estimation import Errors, HeldOut, Input, Problem, fit_model, hold_out
 from pipeline.estimation.rivals import (
     Contest,
     Lesson,
@@ -19,7 +18,6 @@ from pipeline.estimation.rivals import (
     judge_learned,
     judge_rival,
     list_learners,
-    make_features,
 )
 from pipeline.models import Model
 from pipeline.models.literature import find_model
@@ -138,19 +136,6 @@ def test_a_fold_is_learned_without_its_stretches(problem: Problem) -> None:
     assert len(seen) == len(problem.folds)
     for rows, fold in zip(seen, problem.folds, strict=True):
         assert not (rows & fold.test).any()
-
-
-def test_features_know_nothing_of_what_comes_later(problem: Problem) -> None:
-    run, moment = problem.runs[0], problem.runs[0].start_s + 60.0
-    assert run.wheels is not None
-    later = run.wheels.times > moment
-    wheels = run.wheels.change(run.wheels.times, lambda speeds: np.where(later, 0.0, speeds))
-    features = make_features(problem.comparisons[0])
-    changed = make_features(Comparison(replace(run, wheels=wheels), HUSKY, Input.MEASURED))
-    assert np.isfinite(features).all()
-    before = problem.comparisons[0].grid.times < moment - 0.5
-    np.testing.assert_allclose(features[before], changed[before], atol=1e-9)
-    assert not np.allclose(features[~before], changed[~before])
 
 
 def test_the_verb_compares_with_the_literature_and_with_what_is_learned(log: Path, tmp_path: Path) -> None:

@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from exported_files import FIT, make, predict, take
-from motion_runs import vehicle_of
+from exported_files import make, predict, take
 
 from pipeline.export import export_model
 from pipeline.models import find_effect
@@ -51,23 +50,3 @@ def test_ramps_of_the_command_are_limits_of_acceleration() -> None:
     steep = make(*effects, find_effect("acceleration_limit")(limit=99.0))
     assert take("nav2", steep)["FollowPath.ax_max"] == p["FollowPath.ax_max"]
     assert "Not covered by these parameters" not in export_model(make(*effects[2:]), "ros2_control")
-
-
-def test_a_limit_of_the_command_is_written_as_the_body_reaches_it() -> None:
-    """Wet grass: a command that is clipped at 1.01 rad/s turns a track twice as wide by .5 rad/s."""
-    effects = (find_effect("effective_track")(k=2.0), find_effect("body_turn_limit")(limit=1.0))
-    file = make(*effects)
-    spin = predict(file, [(-1.0, -99.0, 99.0)], 4.0)
-    assert spin[-1, 6] == pytest.approx(take("nav2", file)["FollowPath.wz_max"], rel=1e-4)
-    assert "# Not covered by these parameters:\n#   effective_track.k = 2\n" in export_model(file, "nav2")
-    # What the body reaches is not known with a track that is not: the command's own limit is written.
-    leo = vehicle_of("leo_rover")
-    fit = FIT | {"undecided": [["effective_track", "icr_lateral"]]}
-    known = {"effective_track.k": (1.9, 2.1), "body_turn_limit.limit": (0.9, 1.1)}
-    open_track = make(*effects, vehicle=leo, fit=fit, intervals=known)
-    assert take("nav2", open_track)["FollowPath.wz_max"] == 1.0
-    assert take("nav2", make(effects[1], vehicle=leo))["FollowPath.wz_max"] == 1.0
-    # The controller that is told of the track asks for no more than its limit lets through.
-    control = take("ros2_control", file)
-    asked = control["angular.z.max_velocity"] * control["wheel_separation_multiplier"]
-    assert asked == pytest.approx(1.0, rel=1e-4)

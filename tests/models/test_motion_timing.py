@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -84,25 +83,6 @@ def test_good_stamps_and_good_poses_stay_as_they_are(tables: Mapping[str, pl.Dat
     assert run.alignment.latency_spread_s == 0.0
     assert run.alignment.outlier_s == 0.0
     assert np.allclose(run.track.times, np.sort(tables["poses"]["t"].to_numpy()), atol=2e-3)
-
-
-def test_poses_at_a_hundred_a_second_do_not_push_each_other_on() -> None:
-    pose = replace(QUIET, rate_hz=102.0)
-    made = simulate_run(make_scenario(SKID, duration_s=120.0, pose=pose, imu=Imu()))
-    stamps = np.sort(made.poses.stamp_s)
-    run = load(tables_of(made, HUSKY))
-    assert run.alignment.latency_spread_s == 0.0
-    assert np.allclose(run.track.times, stamps, atol=2e-3)
-
-
-def test_nothing_is_scored_before_the_first_command(tables: Mapping[str, pl.DataFrame]) -> None:
-    late = float(tables["commands"]["t"][0]) + 20.0
-    after = pl.col("t") >= late
-    slip = pl.DataFrame(
-        {"t": np.arange(late, 240.0, 0.05)},
-    ).with_columns(input=pl.lit("command"), step=pl.lit(0), suspect=pl.lit(value=False))
-    run = load(tables, commands=tables["commands"].filter(after), slip=slip)
-    assert Comparison(run, HUSKY, Input.COMMAND).windows.times.min() > late - 1e-6
 
 
 def test_the_gyro_tells_how_old_each_pose_is(tables: Mapping[str, pl.DataFrame]) -> None:
@@ -246,19 +226,3 @@ def test_a_fit_is_the_same_to_the_last_bit_wherever_the_map_lies_and_whenever_it
     assert np.allclose(one.poses[..., 2] + _TURNED, two.poses[..., 2])
     plain = predict_from(Comparison(recorded, HUSKY, Input.COMMAND), effects, timing)
     assert np.allclose(plain.poses, one.poses, atol=1e-4)
-
-
-def test_stamps_nearer_than_a_step_give_no_stamp_twice(tables: Mapping[str, pl.DataFrame]) -> None:
-    run = load_run(tables, HUSKY, name="dense")
-    assert run.commands is not None
-    later = run.commands.change(run.commands.times + 3e-7, lambda signal: signal + 0.1)
-    times = np.concatenate((run.commands.times, later.times))
-    order = np.argsort(times, kind="stable")
-    dense = run.commands.change(times[order], lambda signal: np.concatenate((signal, signal + 0.1))[order])
-    anchored = replace(run, commands=dense, streams=np.unique(np.concatenate((run.streams, times)))).anchored
-    assert anchored.commands is not None
-    assert (np.diff(anchored.commands.times) > 0.0).all()
-    assert (np.diff(anchored.streams) > 0.0).all()
-    # Two stamps of one step are the later command; some lie on either side of an edge.
-    assert run.commands.times.size <= anchored.commands.times.size < 1.5 * run.commands.times.size
-    assert np.isfinite(Problem([replace(run, commands=dense)], HUSKY, Input.COMMAND).whole.noise).all()

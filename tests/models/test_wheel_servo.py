@@ -16,7 +16,6 @@ from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, find_effect
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import JointDrive
-from pipeline.models.parameter import Conditions, Largest
 from pipeline.run.heading import Grid, average_held
 from pipeline.run.signals import Resets, RunContext, Wheels
 from pipeline.simulate import VEHICLES, Program
@@ -191,27 +190,3 @@ def test_what_comes_out_changes_steadily_with_every_number(seed: int, late: floa
     most = int(np.argmax(size))
     # A jump stays as large, however small the step.
     assert max(measure(np.linspace(steps[most], steps[most + 1], 50))) < 0.2 * max(size) + 1e-6
-
-
-@pytest.mark.parametrize(
-    ("numbers", "is_lag"),
-    [
-        ({}, True),
-        ({"scrub": 0.5}, False),
-        ({"drag": 0.1}, False),
-        ({"bound": 0.3}, False),
-        ({"bound": 1.5}, True),
-        ({"bound": 1.5, "no_load": 2.0}, False),
-    ],
-)
-def test_a_loop_that_nothing_loads_or_bounds_is_a_lag(numbers: dict[str, float], *, is_lag: bool) -> None:
-    conditions = Conditions(Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11)))
-    assert find_effect("wheel_servo")(tau=0.3, **numbers).is_degenerate(conditions) is is_lag
-
-
-@pytest.mark.parametrize("rim", [0.0, 1e-3, 0.05, 1.0, 5.0, 80.0, 1e4])
-def test_its_starts_are_within_its_bounds_however_fast_the_wheels_are(rim: float) -> None:
-    kind = find_effect("wheel_servo")
-    largest = Largest(1.0, 1.0, 1.0, 1.0, np.linspace(0.0, 30.0, 11), rim=rim)
-    starts = [kind(**values) for values in kind().list_starts(largest)]
-    assert len(starts) == (3 if rim in {0.0, 5.0} else 6)

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from pipeline.job import Options
-from pipeline.job.analyze import PREVIEW, analyze_log, leave_plan, locate_plan, read_preview
-from pipeline.job.next_drive import choose_topic
 from pipeline.models import find_effect
 from pipeline.plan import (
     LEAD_S,
@@ -41,10 +36,9 @@ from pipeline.plan.plan_files import (
 )
 from pipeline.plan.questions import ask_presence
 from pipeline.plan.rehearsal import Rehearsal, assume
-from pipeline.simulate import find_vehicle, simulate_case
+from pipeline.simulate import find_vehicle
 from pipeline.simulate.programs import read_played
 from pipeline.sources import Vehicle, find_preset, list_presets
-from pipeline.store import Store
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -213,20 +207,6 @@ def test_wheel_commands_on_two_topics_are_the_same_drive(plan: Plan, tmp_path: P
         write_plan(replace(wheels, topic="/one"), tmp_path / "other")
 
 
-def test_a_plan_goes_where_the_log_was_commanded() -> None:
-    """Wheel topics are taken where they are known to be rad/s; else the vehicle's usual body command."""
-    warthog = _find("warthog")
-    pair = "/left_drive/velocity.data, /right_drive/velocity.data"
-    choices = {"choices": {"command": {"topic": pair, "type": WHEELS, "others": []}}}
-    assert choose_topic(warthog, choices, "gone.mcap") == (
-        "/left_drive/velocity, /right_drive/velocity",
-        WHEELS,
-    )
-    for source in ({"unit": "m/s"}, {"sign": -1}, {"per_turn": 400.0}):
-        topic, type_name = choose_topic(warthog, {**choices, "command_source": source}, "gone.mcap")
-        assert (topic, type_name) == ("/controller/cmd_vel", "geometry_msgs/msg/Twist")
-
-
 def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle)
@@ -235,13 +215,6 @@ def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     assert not plan.manoeuvres
     assert not plan.promises
     assert "slope" in plan.impossible[0].because
-
-
-def test_an_effect_that_cannot_act_in_the_model_is_refused() -> None:
-    vehicle = _find("husky_a200")
-    knowledge, limits = assume(vehicle), choose_limits(vehicle)
-    with pytest.raises(PlanError, match="motor_imbalance acts only beside wheel_servo, which the model"):
-        ask_presence(knowledge, ["motor_imbalance"], find_largest(knowledge, limits, 60.0))
 
 
 def _ask_for(effect: str, seconds: float, area: str, speed_mps: float = 1.0) -> Plan:
@@ -262,19 +235,6 @@ def test_what_no_drive_within_the_limits_decides_is_said_with_what_the_best_reac
 @pytest.mark.parametrize(("text", "seconds"), [("60s", 60.0), ("2min", 120.0), ("45", 45.0)])
 def test_times_are_read(text: str, seconds: float) -> None:
     assert parse_time(text) == seconds
-
-
-def test_a_vehicle_without_limits_asks_for_them() -> None:
-    vehicle = msgspec.structs.replace(_find("husky_a200"), max_speed_mps=None)
-    with pytest.raises(PlanError, match="--max-speed"):
-        choose_limits(vehicle)
-    assert choose_limits(vehicle, speed_mps=0.5).speed_mps == 0.5
-
-
-def test_limits_asked_for_never_raise_those_of_the_vehicle() -> None:
-    limits = choose_limits(_find("husky_a200"), speed_mps=50.0, yaw_rate_radps=50.0)
-    assert (limits.speed_mps, limits.turn) == (1.0, 1.0)
-    assert math.isinf(limits.yaw_rate_radps)
 
 
 def test_an_interrupted_plan_leaves_the_earlier_one_whole(
@@ -312,38 +272,6 @@ def test_a_plan_tells_what_it_does_and_may_be_ended_there() -> None:
     assert told[0].startswith("rehearsing ")
     assert told[0].endswith(" manoeuvres for 1 open question")
     assert told[-1] == "choosing manoeuvres, attempt 1 of at most 3"
-
-
-def test_a_plan_stands_in_the_report_of_its_run(plan: Plan, tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=1, duration_s=20.0, vehicle="husky")
-    options = Options(out=tmp_path / "results", diagnosis=False)
-    manifest = analyze_log(log, options).manifest
-    store = Store(options.out)
-    assert "planned:" not in manifest.path("report.html").read_text(encoding="utf-8")
-    report = leave_plan(store, manifest, plan)
-    assert report is not None
-    page = report.read_text(encoding="utf-8")
-    assert plan.promises[0].question in page
-    (address,) = re.findall(r'href="([^"]+plan\.html)"', page)
-    assert (report.parent / address).resolve() == locate_plan(store.root, manifest.run, "plan.html").resolve()
-    assert (report.parent / address).is_file()
-    # What was stored is there still, and as it was; a report that is written anew shows the plan too.
-    assert store.examine().problems == ()
-    assert analyze_log(log, options).computed == ()
-    again = analyze_log(log, replace(options, force=True)).manifest
-    assert address in again.path("report.html").read_text(encoding="utf-8")
-    # A plan that has nothing to drive leaves none of another one to be played.
-    assert leave_plan(store, again, replace(plan, manoeuvres=())) is not None
-    assert [path.name for path in locate_plan(store.root, manifest.run, PREVIEW).parent.iterdir()] == [
-        PREVIEW
-    ]
-    leave_plan(store, again, plan)
-    # Other results of the run are not what it was planned for.
-    assert read_preview(store.root, manifest.run, "0" * 16) == {}
-    preview = locate_plan(store.root, manifest.run, "plan.json")
-    for spoiled in ("", "[]", '{"key": 3}', preview.read_text(encoding="utf-8").replace('"promises"', '"x"')):
-        preview.write_text(spoiled, encoding="utf-8")
-        assert read_preview(store.root, manifest.run, manifest.key) == {}
 
 
 @pytest.mark.long

@@ -15,8 +15,6 @@ from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 from verbs import run_verb
 
-from pipeline.cli import main
-from pipeline.cli.conventions import FAILED
 from pipeline.estimation import Input, Named, Problem, RunDiagnosis, Value, load_recording
 from pipeline.estimation.ambiguity import Undecided, Unobservable
 from pipeline.models import Excitation, find_effect
@@ -61,35 +59,6 @@ def test_a_decision_needs_several_stretches_however_large_one_is() -> None:
     even = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), np.full(4, 1e3), np.zeros((0, 0)))
     assert Answerable(question, (even,), groups).answer(np.ones(4)) == 1.0
     assert Answerable(question, (even,), groups).answer(np.array([1.0, 1.0, 0.0, 0.0])) < 1.0
-
-
-def test_many_weights_at_once_give_what_each_gives_alone() -> None:
-    generator = np.random.default_rng(2)
-    columns = generator.standard_normal((6, 30, 2))
-    apart = generator.standard_normal((6, 30))
-    evidence = Evidence(
-        np.einsum("grp,grq->gpq", columns, columns),
-        np.einsum("grp,gr->gp", columns, apart),
-        (apart**2).sum(axis=1),
-        np.eye(2),
-    )
-    model = Hypothesis((), (), np.zeros((0, 0)))
-    groups = Groups(generator.uniform(5.0, 12.0, 6), np.array([0, 0, 1, 2, 2, 2]), 20.0)
-    weights = generator.integers(0, 3, (5, 6)).astype(np.float64)
-    for question in (
-        Separation("a or b", ("a", "b"), (model, model)),
-        Precision("k", ("k",), model, 1, 0.3),
-    ):
-        one = Answerable(question, (evidence, evidence), groups)
-        for method in (one.measure, one.bound, one.answer):
-            alone = [float(method(weight)) for weight in weights]
-            assert method(weights).tolist() == pytest.approx(alone)
-            assert np.ptp(alone) > 0.0
-    # Groups of one stretch count together: of two stretches no decision is made.
-    strong = Evidence(np.zeros((6, 0, 0)), np.zeros((6, 0)), np.full(6, 1e3), np.zeros((0, 0)))
-    pair = Answerable(Separation("a or b", ("a", "b"), (model, model)), (strong, strong), groups)
-    assert pair.answer(np.array([1.0, 1.0, 0.0, 1.0, 1.0, 1.0])) < 0.7
-    assert pair.answer(np.ones(6)) > 0.7
 
 
 def test_what_is_named_is_kept_apart_from_what_looks_like_it(tmp_path: Path) -> None:
@@ -231,16 +200,6 @@ def test_a_circle_leaves_open_what_the_plan_then_decides(tmp_path: Path) -> None
     )
 
 
-def test_an_effect_that_there_is_not_is_refused_before_anything_is_worked_out(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["plan", "--vehicle", "husky_a200", "--for", "foo", "--folder", str(tmp_path / "plan")])
-    assert ended.value.code == FAILED
-    assert "choosing manoeuvres" not in (said := capsys.readouterr().err)
-    assert "no effect is called 'foo'" in said
-
-
 def _answer(
     names: tuple[str, ...],
     normal: list[float],
@@ -255,16 +214,6 @@ def _answer(
         np.array(normal).reshape(-1, 1, 1), np.zeros((size, 1)), np.zeros(size), np.array([[prior]])
     )
     return Answerable(question, (evidence,), Groups(np.full(size, 10.0), np.arange(size), 20.0, excited))
-
-
-def test_a_drive_that_tells_nothing_of_a_number_narrows_no_interval() -> None:
-    # The logs know it to 0.02, too few blocks of which are known to promise 0.1: driving on is no evidence.
-    nothing = _answer(("wheel_radius",), [1e-9] * 8, 2500.0)
-    idle, driven = np.zeros(8), np.ones(8)
-    assert float(nothing.bound(driven)) == pytest.approx(float(nothing.bound(idle)))
-    telling = _answer(("wheel_radius",), [2500.0] * 8, 2500.0)
-    assert float(telling.bound(driven)) < 0.5 * float(telling.bound(idle))
-    assert float(telling.answer(driven)) == 1.0
 
 
 @pytest.mark.parametrize("effect", ["wheel_radius", "effective_track", "lateral_drift", "yaw_misalignment"])

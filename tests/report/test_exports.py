@@ -31,9 +31,8 @@ from pipeline.report.viewer_files import (
     write_derived_log,
     write_foxglove_layout,
 )
-from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
-from pipeline.store import Store, StoreError
+from pipeline.store import Store
 from pipeline.store.checksums import encode_manifest
 
 ROOT = Path(__file__).parents[2]
@@ -84,21 +83,6 @@ def test_the_official_reader_finds_what_the_tables_hold(source: ExportSource, de
     assert {"/slip/velocity/model", "/slip/predicted_path", "/slip/trail", "/slip/segment"} <= set(found)
 
 
-def test_what_the_model_leaves_is_its_distance_from_the_measured_velocity(derived: Path) -> None:
-    found = read_officially(derived)
-    measured, model = (
-        {
-            time: (twist.linear.x, twist.linear.y, twist.angular.z)
-            for time, twist in ((time, message.twist) for time, message in found[f"/slip/velocity/{kind}"])  # type: ignore[attr-defined]
-        }
-        for kind in ("measured", "model")
-    )
-    left = {time: message.data for time, message in found["/slip/residual_modulus"]}  # type: ignore[attr-defined]
-    assert left.keys() == model.keys()
-    own = {time: float(np.linalg.norm(np.subtract(model[time], measured[time]))) for time in model}
-    assert left == pytest.approx(own, abs=1e-12)
-
-
 def test_another_reader_finds_the_same(derived: Path) -> None:
     official = read_officially(derived)
     counts: dict[str, int] = {}
@@ -107,17 +91,6 @@ def test_another_reader_finds_the_same(derived: Path) -> None:
             reader.deserialize(raw, connection.msgtype)
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert counts == {topic: len(messages) for topic, messages in official.items()}
-
-
-def test_the_derived_log_lies_within_the_times_of_the_original(log: Path, derived: Path) -> None:
-    with log.open("rb") as file:
-        summary = make_reader(file).get_summary()
-    assert summary is not None
-    assert summary.statistics is not None
-    start, end = summary.statistics.message_start_time, summary.statistics.message_end_time
-    times = [time for messages in read_officially(derived).values() for time, _ in messages]
-    assert start - 1e8 <= min(times)
-    assert max(times) <= end + 1e8
 
 
 def test_predictions_begin_at_the_measured_pose_and_last_two_seconds(derived: Path) -> None:
@@ -167,20 +140,6 @@ def test_a_long_run_is_exported_in_stretches_that_nobody_sees(
     apart = np.abs([before[time] - after[time] for time in common])
     assert np.median(apart) < 2e-3
     assert apart.max() < 0.05
-
-
-def test_a_model_that_cannot_be_run_leaves_no_file(
-    source: ExportSource, results: Path, tmp_path: Path
-) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    sides = (f"{side}{column}" for side in ("left", "right") for column in ("", "_aligned"))
-    still = manifest.read("wheels").with_columns(pl.lit(0.0).alias(name) for name in sides)
-    still.write_parquet(manifest.path("wheels"))
-    with pytest.raises(MotionError, match="no measured wheels"):
-        write_derived_log(replace(source, manifest=manifest, input="measured"), tmp_path / "out.mcap")
-    assert list(tmp_path.glob("*.mcap*")) == []
 
 
 def test_csv_holds_every_row_with_units_in_its_heads(source: ExportSource, tmp_path: Path) -> None:
@@ -299,21 +258,3 @@ def test_formulas_in_texts_are_texts_in_csv(results: Path, tmp_path: Path) -> No
     assert found["terrain"].unique().to_list() == ["'=HYPERLINK(1)"]
     assert found["dataset"].unique().to_list() == ["'@x"]
     assert found["f_x [m/s]"].unique().to_list() == [-1.5]
-
-
-def test_a_table_that_is_cut_leaves_no_part_of_a_file(results: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "results"
-    shutil.copytree(results, copy)
-    (manifest,) = Store(copy).manifests()
-    path = manifest.path("velocities")
-    data = bytearray(path.read_bytes())
-    data[4 : len(data) // 2] = b"\xff" * (len(data) // 2 - 4)
-    path.write_bytes(data)
-    with pytest.raises(StoreError, match="cannot be read"):
-        write_csv(ExportSource(manifest), tmp_path / "csv")
-    assert [each.name for each in tmp_path.iterdir()] == ["results"]
-    (tmp_path / "csv").mkdir()
-    (tmp_path / "csv" / "aggregates.csv").write_text("the one before")
-    with pytest.raises(StoreError, match="cannot be read"):
-        write_csv(ExportSource(manifest), tmp_path / "csv")
-    assert [each.read_text() for each in (tmp_path / "csv").iterdir()] == ["the one before"]

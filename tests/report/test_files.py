@@ -10,11 +10,8 @@ import pytest
 from report_synthesis import list_places, make_report
 
 from pipeline.report import ReportError, theme
-from pipeline.report.figures import list_figures
 from pipeline.report.page import write_figures
-from pipeline.report.scene import Scene
 from pipeline.report.theme import (
-    build_spec,
     cache_path,
     load_bundle,
     warm_bundle,
@@ -56,21 +53,6 @@ def test_an_unknown_format_and_a_blocked_folder_say_what_to_do(report: RunReport
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(ReportError, match="Choose a folder"):
         write_figures(report, tmp_path / "file", "svg")
-
-
-def test_the_map_has_equal_scales(report: RunReport) -> None:
-    figure = next(figure for figure in list_figures() if figure.id == "trajectory")
-    drawing = figure.draw(Scene(report))
-    assert drawing is not None
-    spec = build_spec(drawing)
-    layers = spec["layer"]
-    assert isinstance(layers, list)
-    spans = {axis: layers[0]["encoding"][axis]["scale"]["domain"] for axis in "xy"}
-    scales = [
-        (spans[axis][1] - spans[axis][0]) / float(str(spec[size]))
-        for axis, size in (("x", "width"), ("y", "height"))
-    ]
-    assert scales[0] == pytest.approx(scales[1], rel=0.01), "height is a whole number of pixels"
 
 
 def test_the_ramp_of_slip_is_monotonous_in_lightness() -> None:

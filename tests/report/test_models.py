@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-import polars as pl
 import pytest
 
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.problem import predict_at_from
 from pipeline.models import Model, Timing, find_effect
-from pipeline.report.figures.residual_figures import choose_signal
-from pipeline.report.figures.slip_figures import find_steps
-from pipeline.report.motion_view import SIGNALS, MotionStage, MotionView
+from pipeline.report.motion_view import MotionStage
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, find_preset
@@ -22,22 +19,6 @@ def vehicle() -> Vehicle:
     found = find_preset("husky_a200")
     assert found is not None
     return found
-
-
-def view_of(**residuals: np.ndarray) -> MotionView:
-    count = next(iter(residuals.values())).size
-    columns = {"t": np.arange(count) * 0.25, **dict.fromkeys(SIGNALS, np.zeros(count)), **residuals}
-    empty = pl.DataFrame()
-    return MotionView("command", (), (), None, pl.DataFrame(columns), empty, empty, empty)
-
-
-def test_the_signal_is_the_one_that_explains() -> None:
-    rng = np.random.default_rng(5)
-    signals = {name: rng.uniform(-1.0, 1.0, 800) for name in SIGNALS}
-    noise = rng.normal(0.0, 0.05, 800)
-    for name in ("f_w", "a_x", "pitch"):
-        assert choose_signal(view_of(**signals, ideal_w=noise + 0.3 * signals[name]), "w") == name
-    assert choose_signal(view_of(**signals, ideal_x=noise), "x") == "f_x"
 
 
 def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> None:
@@ -54,15 +35,6 @@ def test_autocorrelation_tells_noise_from_structure_and_crosses_no_hole() -> Non
     assert np.allclose(autocorrelate(split, np.sin(t))[0], lags)
 
 
-def test_no_correlation_exceeds_one_where_stretches_differ() -> None:
-    # Single windows between holes are quiet, so that the pairs of the long stretch are larger than the mean.
-    lone = np.arange(400) * 100.0
-    t = np.concatenate((np.arange(400) * 0.5, 1000.0 + lone))
-    given = np.concatenate((3.0 * np.sin(0.3 * t[:400]), np.full(400, 0.01)))
-    assert np.abs(autocorrelate(t, given)[1]).max() <= 1.0 + 1e-9
-    assert np.abs(cross_correlate(t, given, -given)[1]).max() <= 1.0 + 1e-9
-
-
 def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
     rng = np.random.default_rng(8)
     t = np.arange(2000) * 0.25
@@ -72,17 +44,6 @@ def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
     assert found.max() > 0.9
     outside = [np.abs(cross_correlate(t, given, rng.normal(size=2000))[1]) > bound for _ in range(20)]
     assert np.mean(outside) < 0.1
-
-
-def test_steps_are_those_of_a_command_that_rests_before_and_after() -> None:
-    t = np.arange(0.0, 30.0, 0.05)
-    asked = np.select([t < 5.0, t < 10.0, t < 11.0], [0.0, 1.0, 0.5], 0.2)
-    starts, low, high = find_steps(t, asked, smallest=0.15)
-    assert starts == pytest.approx([5.0, 11.0], abs=0.051)
-    assert low == pytest.approx([0.0, 0.5])
-    assert high == pytest.approx([1.0, 0.2])
-    holed = np.concatenate((t[t < 6.0], t[t >= 7.0]))
-    assert find_steps(holed, np.interp(holed, t, asked), smallest=0.15)[0] == pytest.approx([11.0], abs=0.051)
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:

@@ -42,14 +42,6 @@ def test_a_line_without_its_flat_rows_is_the_same_line(line: pl.DataFrame) -> No
         np.testing.assert_allclose(drawn, piece["value"].to_numpy(), atol=1e-12)
 
 
-def test_a_line_of_many_points_is_shortened_to_four_a_bin() -> None:
-    count = 27_000
-    noise = np.random.default_rng(0).normal(size=count)
-    line = pl.DataFrame({"t": np.arange(count) / 20, "value": noise, "piece": np.zeros(count, np.int32)})
-    assert thin_series(line, "value", bins=1000).height <= 4000
-    assert thin_to_peaks(line, "value", bins=1000).height <= 1001
-
-
 @given(lines())
 def test_no_line_is_drawn_from_one_piece_to_the_next(line: pl.DataFrame) -> None:
     broken = break_lines(line, "value")
@@ -69,9 +61,3 @@ def test_spans_end_one_period_after_their_last_row_and_never_cross_a_segment() -
     )
     spans = find_spans(rows, "flag", period=0.1)
     assert spans.rows() == [(0.0, 0.2), (0.3, 0.4), (0.4, 0.5)]
-
-
-def test_spans_closer_than_a_pixel_are_one() -> None:
-    t = np.arange(100) * 0.1
-    rows = pl.DataFrame({"t": t, "segment": np.zeros(100, np.int32), "flag": np.arange(100) % 3 != 2})
-    assert find_spans(rows, "flag", period=0.1, shortest_gap=0.5).height == 1

@@ -15,20 +15,14 @@ from pipeline.simulate import (
     VEHICLES,
     Case,
     Clock,
-    CommandTopic,
-    Encoders,
-    Layout,
     PoseSensor,
-    PoseTopic,
     Recording,
     Scenario,
     SimulateError,
-    WheelTopic,
     list_cases,
     simulate_case,
     simulate_run,
     write_log,
-    write_samples,
 )
 
 if TYPE_CHECKING:
@@ -60,11 +54,6 @@ def read_back(path: Path) -> dict[str, list[Message]]:
         for _, channel, message, decoded in reader.iter_decoded_messages(log_time_order=False):
             topics.setdefault(channel.topic, []).append(Message(message.log_time, decoded))
     return topics
-
-
-def read_metadata(path: Path) -> dict[str, dict[str, str]]:
-    with path.open("rb") as stream:
-        return {record.name: record.metadata for record in make_reader(stream).iter_metadata()}
 
 
 def record(scenario: Scenario, path: Path) -> tuple[SimulatedRun, dict[str, list[Message]]]:
@@ -131,43 +120,6 @@ def test_sideways_commands_and_four_wheels_that_differ_arrive(tmp_path: Path) ->
     assert len(set(state.velocity)) == 4
 
 
-def test_measured_wheels_of_both_sides_arrive(tmp_path: Path) -> None:
-    run, topics = record(SHORT, tmp_path / "a.mcap")
-    state = topics["/joint_states"][111].body
-    speeds = dict(zip(state.name, state.velocity, strict=True))
-    angles = dict(zip(state.name, state.position, strict=True))
-    assert speeds["rear_left_wheel"] == run.wheels.left[111]
-    assert speeds["front_right_wheel"] == run.wheels.right[111]
-    assert angles["front_right_wheel"] == run.wheels.right_angle[111]
-
-
-def test_encoders_may_report_angles_only(tmp_path: Path) -> None:
-    _, topics = record(replace(SHORT, encoders=Encoders(report="position")), tmp_path / "a.mcap")
-    state = topics["/joint_states"][111].body
-    assert len(state.velocity) == 0
-    assert len(state.position) == 4
-
-
-def test_a_side_has_its_own_topic_on_a_warthog(tmp_path: Path) -> None:
-    run, topics = record(
-        replace(SHORT, vehicle=VEHICLES["warthog"], recording=Recording("warthog")), tmp_path / "a.mcap"
-    )
-    assert topics["/left_drive/status/speed"][120].body.data == run.wheels.left[120]
-    right = (run.commands.speed_mps[120] + 0.54 * run.commands.turn[120]) / 0.3
-    assert topics["/right_drive/velocity"][120].body.data == pytest.approx(right)
-
-
-def test_a_car_has_speed_and_steering(tmp_path: Path) -> None:
-    run, topics = record(in_layout("ackermann"), tmp_path / "a.mcap")
-    drive = topics["/ackermann_cmd"][100].body.drive
-    assert drive.speed == pytest.approx(run.commands.speed_mps[100], rel=1e-6)
-    assert drive.steering_angle == pytest.approx(run.commands.turn[100], rel=1e-6)
-    state = topics["/joint_states"][100].body
-    measured = dict(zip(state.name, zip(state.position, state.velocity, strict=True), strict=True))
-    assert measured["front_left_steering"][0] == run.wheels.steering[100]
-    assert measured["rear_right_wheel"][1] == run.wheels.right[100]
-
-
 def test_transforms_chain_to_the_pose_and_step_at_a_jump(tmp_path: Path) -> None:
     scenario = replace(in_layout("tf"), pose=PoseSensor(jumps=1, jump_m=0.7))
     run, topics = record(scenario, tmp_path / "a.mcap")
@@ -223,70 +175,6 @@ def test_clock_may_start_unset_and_go_back(tmp_path: Path) -> None:
     assert twice == pytest.approx(60, abs=2)
 
 
-def test_a_pose_stamped_before_the_start_is_a_moment_older_than_the_run(tmp_path: Path) -> None:
-    early = replace(SHORT, effects={"clock_offset": -0.3})
-    _, topics = record(early, tmp_path / "a.mcap")
-    stamps = np.array([m.stamp_ns for m in topics["/mapping/icp_odom"]])
-    assert stamps.min() == pytest.approx(START_NS - 0.3e9, abs=1e7)
-
-
-def test_a_clock_at_zero_is_written(tmp_path: Path) -> None:
-    _, topics = record(replace(SHORT, clock=Clock(start_ns=0)), tmp_path / "a.mcap")
-    assert topics["/mapping/icp_odom"][0].stamp_ns == 0
-
-
-def test_recorder_gaps_are_on_every_topic(tmp_path: Path) -> None:
-    scenario = replace(SHORT, recording=Recording(gaps=1, gap_s=3.0))
-    _, topics = record(scenario, tmp_path / "a.mcap")
-    for messages in topics.values():
-        assert np.diff([message.log_ns for message in messages]).max() == pytest.approx(3e9, abs=0.12e9)
-
-
-def test_hand_driving_is_told_by_the_state_topic(tmp_path: Path) -> None:
-    _, topics = record(replace(SHORT, recording=Recording(hand_driven_s=5.0)), tmp_path / "a.mcap")
-    states = [(message.log_ns - START_NS, message.body.data) for message in topics["/drive/calib_state"]]
-    assert {text for at, text in states if at < 5e9} == {"idle"}
-    assert {text for at, text in states if at >= 5e9} == {"calib"}
-
-
-def test_decoys_stand_beside_the_right_topics(tmp_path: Path) -> None:
-    scenario = replace(SHORT, recording=Recording("husky_body_command", decoys="both"))
-    run, topics = record(scenario, tmp_path / "a.mcap")
-    odometry = topics["/platform/odom"]
-    assert odometry[50].body.header.frame_id == "odom"
-    assert len(odometry) == run.wheels.time_s.size
-    assert {message.body.linear.x for message in topics["/navigation/cmd_vel"]} != {
-        message.body.twist.linear.x for message in topics["/controller/cmd_vel"]
-    }
-
-
-def test_commands_may_be_recorded_at_the_wrong_scale(tmp_path: Path) -> None:
-    _, right = record(SHORT, tmp_path / "a.mcap")
-    _, wrong = record(replace(SHORT, recording=Recording(command_scale=1.82)), tmp_path / "b.mcap")
-    before, after = (np.array(topics["/wheel_commands"][100].body.velocity) for topics in (right, wrong))
-    np.testing.assert_allclose(after, 1.82 * before)
-
-
-def test_deployment_is_named_unless_it_shall_not_be(tmp_path: Path) -> None:
-    record(replace(SHORT, recording=Recording(terrain="mud")), tmp_path / "a.mcap")
-    mark = {"simulation": {"by": "slip simulate"}}
-    deployment = {"deployment": {"vehicle": "husky_a200", "terrain": "mud"}}
-    assert read_metadata(tmp_path / "a.mcap") == mark | deployment
-    record(replace(SHORT, recording=Recording(deployment="absent")), tmp_path / "b.mcap")
-    assert read_metadata(tmp_path / "b.mcap") == mark
-
-
-def test_a_layout_of_ones_own_is_written(tmp_path: Path) -> None:
-    own = Layout(
-        "differential",
-        (CommandTopic("float_sides", ("/rover/l", "/rover/r")),),
-        (WheelTopic("joint_state", ("/rover/joints",)),),
-        PoseTopic("pose_stamped", "/rover/pose"),
-    )
-    _, topics = record(replace(SHORT, recording=Recording(own)), tmp_path / "a.mcap")
-    assert set(topics) == {"/rover/l", "/rover/r", "/rover/joints", "/rover/pose"}
-
-
 def test_a_layout_that_does_not_fit_is_refused_before_anything_is_written(tmp_path: Path) -> None:
     with pytest.raises(SimulateError):
         write_log(simulate_run(replace(SHORT, recording=Recording("ackermann"))), tmp_path / "a.mcap")
@@ -307,30 +195,9 @@ def test_the_truth_stays_out_of_the_log(tmp_path: Path) -> None:
     assert b"lateral_skid" not in (tmp_path / "a.mcap").read_bytes()
 
 
-def test_a_folder_gets_a_file_named_after_the_case(tmp_path: Path) -> None:
-    assert simulate_case("ideal_husky", out=tmp_path, duration_s=5.0) == tmp_path / "ideal_husky.mcap"
-    assert simulate_case(None, out=tmp_path / "new" / "x.mcap", duration_s=5.0).stat().st_size > 0
-
-
-def test_a_place_that_cannot_be_written_is_one_clear_line(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(SimulateError, match="cannot be written"):
-        simulate_case(None, out=tmp_path / "file" / "x.mcap", duration_s=5.0)
-
-
 @pytest.mark.parametrize("case", list_cases(), ids=lambda case: case.name)
 def test_every_case_is_written_and_read(case: Case, tmp_path: Path) -> None:
     if case.machine is not None:
         pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
     topics = read_back(simulate_case(case.name, out=tmp_path / "a.mcap", duration_s=12.0))
     assert sum(len(messages) for messages in topics.values()) > 500
-
-
-def test_samples_are_small_and_long_enough(tmp_path: Path) -> None:
-    samples = write_samples(tmp_path / "data_samples")
-    assert [path.name for path in samples] == ["husky_tile.mcap", "warthog_ice.mcap", "ackermann_gravel.mcap"]
-    for path in samples:
-        assert path.stat().st_size < 2_000_000
-        with path.open("rb") as stream:
-            statistics = make_reader(stream).get_summary().statistics
-        assert 120e9 <= statistics.message_end_time - statistics.message_start_time <= 300e9

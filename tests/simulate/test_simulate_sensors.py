@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.core.rigid import euler_from_quaternions, interpolate_poses, rotate, wrap_angle
 from pipeline.simulate.facts import SimulateError
 from pipeline.simulate.messages import SimulatedRun, integrate_odometry, simulate_run
-from pipeline.simulate.scenario import Encoders, Ground, Imu, PoseSensor, Program, Recording, Scenario
+from pipeline.simulate.scenario import Ground, Imu, PoseSensor, Program, Scenario
 
 Floats = NDArray[np.float64]
 
@@ -89,81 +89,6 @@ def test_white_noise_has_the_asked_size() -> None:
     assert not (position - base)[:, 2].any()
 
 
-def test_slow_error_is_correlated_over_eight_seconds() -> None:
-    run = simulate_run(
-        replace(SHORT, duration_s=3000.0, step_s=0.005, pose=replace(CLEAN, rate_hz=5.0, drift_m=0.05))
-    )
-    error = (run.poses.position - true_poses(run, run.poses.stamp_s)[0])[:, 0]
-    # 3000 s hold some 190 independent stretches.
-    assert error.std() == pytest.approx(0.05, rel=0.2)
-    assert np.corrcoef(error[:-40], error[40:])[0, 1] == pytest.approx(math.exp(-1.0), abs=0.15)
-
-
-def test_held_poses_repeat_exactly_and_are_old() -> None:
-    run = simulate_run(replace(SHORT, pose=replace(CLEAN, noise_m=0.002, update_hz=5.0)))
-    repeated = np.mean(~np.diff(run.poses.position, axis=0).any(axis=1))
-    assert repeated == pytest.approx(0.75, abs=0.02)
-    age = run.poses.stamp_s - run.poses.sampled_s
-    assert age.min() >= 0.0
-    assert 0.1 < age.max() <= 0.2
-
-
-def test_dropouts_are_holes_of_the_asked_length_and_number() -> None:
-    run = simulate_run(replace(SHORT, pose=replace(CLEAN, dropouts=3, dropout_s=2.0)))
-    gaps = np.diff(run.poses.stamp_s)
-    assert (gaps > 0.06).sum() == 3
-    np.testing.assert_allclose(gaps[gaps > 0.06], 2.0, atol=0.06)
-
-
-def test_jumps_have_the_asked_size_wherever_the_robot_is() -> None:
-    still = replace(SHORT, program=Program(lead_s=60.0), start_pose=(40.0, -30.0, 1.0))
-    run = simulate_run(replace(still, pose=replace(CLEAN, jumps=2, jump_m=0.4, jump_rad=0.2)))
-    position, yaw = reported(run)
-    leaps = np.linalg.norm(np.diff(position, axis=0), axis=1)
-    assert sorted(leaps)[-3:] == pytest.approx([0.0, 0.4, 0.4], abs=1e-9)
-    turns = np.abs(wrap_angle(np.diff(yaw)))
-    assert sorted(turns)[-3:] == pytest.approx([0.0, 0.2, 0.2], abs=1e-9)
-    assert not np.diff(run.poses.position, axis=0).any()
-
-
-def test_jitter_of_sampling_is_known_to_the_stamp_and_jitter_of_the_stamp_is_not() -> None:
-    sampled = simulate_run(replace(SHORT, pose=replace(CLEAN, jitter_s=0.005)))
-    assert np.diff(sampled.poses.stamp_s).std() == pytest.approx(0.005 * math.sqrt(2.0), rel=0.1)
-    assert (sampled.poses.stamp_s == sampled.poses.sampled_s).all()
-    blurred = simulate_run(replace(SHORT, pose=replace(CLEAN, stamp_jitter_s=0.01)))
-    assert (blurred.poses.stamp_s - blurred.poses.sampled_s).std() == pytest.approx(0.01, rel=0.1)
-
-
-def test_invalid_poses_and_rotated_stretches_appear() -> None:
-    faulty = PoseSensor(invalid=6, rotated_stretches=2, noise_m=0.0, noise_rad=0.0)
-    run = simulate_run(replace(SHORT, pose=faulty))
-    assert np.isnan(run.poses.position[:, 0]).sum() == 3
-    assert (~run.poses.quaternion.any(axis=1)).sum() == 3
-    _, yaw = reported(run)
-    off = np.abs(wrap_angle(yaw - true_poses(run, run.poses.stamp_s)[1])) > 1.5
-    assert 70 <= np.nansum(off) <= 90
-
-
-def test_encoders_are_late_and_noisy_as_asked() -> None:
-    run = simulate_run(
-        replace(
-            SHORT, effects={"drive_lag": 0.5}, encoders=Encoders(noise_radps=0.02, delay_s=0.2, rate_hz=50.0)
-        )
-    )
-    drive = run.truth.drive
-    middle = (np.arange(drive.left.size) + 0.5) * drive.step_s
-    error = run.wheels.left - np.interp(run.wheels.time_s - 0.2, middle, drive.left)
-    assert error.std() == pytest.approx(0.02, rel=0.06)
-    turned = np.diff(run.wheels.left_angle) * 50.0
-    assert np.median(np.abs(turned - 0.5 * (run.wheels.left[1:] + run.wheels.left[:-1]))) < 0.02
-
-
-def test_dead_encoders_say_zero() -> None:
-    run = simulate_run(replace(SHORT, encoders=Encoders(gain=0.0)))
-    assert not run.wheels.left.any()
-    assert not run.wheels.left_angle.any()
-
-
 def test_gyro_has_sign_scale_and_bias() -> None:
     run = simulate_run(replace(SHORT, imu=Imu(noise_radps=0.0, bias_radps=0.02, scale=1.05, sign=-1)))
     path = run.truth.path
@@ -180,13 +105,6 @@ def test_accelerometer_feels_gravity_on_a_slope() -> None:
     np.testing.assert_allclose(forces[5], [-9.80665 * math.sin(0.2), 0.0, 9.80665 * math.cos(0.2)], atol=1e-9)
 
 
-def test_tilted_sensor_sees_the_yaw_rate_in_its_own_axes() -> None:
-    run = simulate_run(replace(SHORT, imu=Imu(noise_radps=0.0, tilt_roll_rad=0.1)))
-    flat = simulate_run(replace(SHORT, imu=Imu(noise_radps=0.0)))
-    np.testing.assert_allclose(run.imu.rates[:, 2], flat.imu.rates[:, 2] * math.cos(0.1), atol=1e-12)
-    np.testing.assert_allclose(run.imu.rates[:, 1], flat.imu.rates[:, 2] * math.sin(0.1), atol=1e-12)
-
-
 def test_pose_from_wheels_has_no_slip_at_all() -> None:
     odometry = replace(SHORT, pose=replace(CLEAN, source="wheels"), effects={"effective_track": 1.8})
     run = simulate_run(odometry)
@@ -195,14 +113,6 @@ def test_pose_from_wheels_has_no_slip_at_all() -> None:
     np.testing.assert_allclose(run.poses.position, expected, atol=1e-12)
     with pytest.raises(SimulateError, match="needs encoders"):
         simulate_run(replace(odometry, encoders=None))
-
-
-def test_hand_driving_leaves_the_command_topic_at_zero_while_the_robot_moves() -> None:
-    run = simulate_run(replace(SHORT, recording=Recording(hand_driven_s=20.0)))
-    by_hand = run.commands.time_s < 20.0
-    assert not run.commands.speed_mps[by_hand].any()
-    assert run.commands.speed_mps[~by_hand].any()
-    assert np.ptp(run.poses.position[run.poses.stamp_s < 20.0], axis=0).max() > 0.5
 
 
 def test_each_source_has_random_numbers_of_its_own() -> None:

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.sources import Configuration, ConfigurationError, load_configuration, merge
-from pipeline.sources.configuration import VehicleSection, resolve_vehicle
+from pipeline.sources import load_configuration, merge
 
 Write = Callable[[str, str], Path]
 
@@ -33,16 +32,6 @@ def write(tmp_path: Path) -> Write:
         return path
 
     return write_file
-
-
-def test_without_any_file_everything_is_at_its_default(log: Path) -> None:
-    assert load_configuration(log) == Configuration()
-
-
-def test_an_empty_name_is_no_vehicle() -> None:
-    with pytest.raises(ConfigurationError, match="no vehicle preset is called ''"):
-        resolve_vehicle(VehicleSection(preset=""), recorded="husky_a200", where="run.mcap")
-    assert resolve_vehicle(VehicleSection(), recorded="husky_a200", where="run.mcap").id == "husky_a200"
 
 
 def test_folders_inherit_and_the_nearer_file_wins(log: Path, write: Write) -> None:
@@ -103,12 +92,6 @@ def test_another_preset_does_not_inherit_a_geometry(log: Path, write: Write) -> 
     assert (found.track_width_m, found.wheel_radius_m) == (0.56, 0.18)
 
 
-def test_lists_are_replaced_whole() -> None:
-    assert merge([{"command": {"left": ["a", "b"]}}, {"command": {"left": ["c"]}}]) == {
-        "command": {"left": ["c"]}
-    }
-
-
 trees = st.recursive(
     st.integers(), lambda below: st.dictionaries(st.sampled_from("abc"), below, max_size=3), max_leaves=8
 ).filter(lambda tree: isinstance(tree, dict))
@@ -118,20 +101,3 @@ trees = st.recursive(
 def test_merging_is_associative_and_the_empty_layer_changes_nothing(a: dict, b: dict, c: dict) -> None:
     assert merge([a, b, c]) == merge([merge([a, b]), c])
     assert merge([a, {}]) == merge([{}, a]) == a
-
-
-def test_a_missing_file_says_so(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError, match="no such configuration file") as caught:
-        load_configuration(log, given=tmp_path / "nowhere.toml")
-    assert caught.value.code == "config_not_found"
-
-
-def test_a_folder_in_place_of_a_file_says_so(log: Path, tmp_path: Path) -> None:
-    with pytest.raises(ConfigurationError) as caught:
-        load_configuration(log, given=tmp_path)
-    assert caught.value.code == "config_unreadable"
-
-
-def test_a_wrong_override_names_the_command_line(log: Path) -> None:
-    with pytest.raises(ConfigurationError, match="command line"):
-        load_configuration(log, overrides={"velocity": {"yaw": "gyro"}})

@@ -16,8 +16,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.sources import Vehicle, find_preset, kinematics
-from pipeline.sources.kinematics import Kinematics, find_kinematics, list_kinds
+from pipeline.sources import Vehicle, find_preset
+from pipeline.sources.kinematics import find_kinematics, list_kinds
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -122,10 +122,6 @@ def test_a_cars_body_command_comes_back_within_its_steering(speed: float, turnin
         assert predict(CAR, **asked)[2] == pytest.approx(turning, abs=1e-9)
 
 
-def test_a_car_that_stands_has_its_wheels_straight() -> None:
-    assert ask(CAR, 0.0, 1.0) == {"speed": 0.0, "steering": 0.0}
-
-
 YOUBOT, OMNI = (
     preset("youbot"),
     Vehicle(id="omni", name="omni", kind="omni", wheel_radius_m=0.05, track_width_m=0.36),
@@ -196,26 +192,6 @@ def test_what_a_controller_asked_comes_back_from_the_inputs_of_every_kind(
     inputs = vehicle.kinematics.inverse(body, vehicle)
     assert set(inputs) == {quantity.name for quantity in vehicle.kinematics.inputs}
     assert np.allclose(vehicle.kinematics.asked(inputs, vehicle), body, atol=1e-12)
-
-
-def test_a_kind_that_nobody_knows_is_named_with_those_there_are() -> None:
-    with pytest.raises(LookupError, match="'hovercraft'; there are differential, ackermann"):
-        find_kinematics("hovercraft")
-
-
-def test_a_new_kind_is_a_class(monkeypatch: pytest.MonkeyPatch) -> None:
-    content: dict[str, type[Kinematics]] = {}
-    exec(CRAB, content)  # noqa: S102 - the text that the next test adds to the file
-    monkeypatch.setattr(kinematics, "KINDS", (*kinematics.KINDS, content["Crab"]))
-    assert "crab" in list_kinds()
-    crab = Vehicle(
-        id="crab", name="crab", kind="crab", wheel_radius_m=0.1, track_width_m=0.5, wheelbase_m=0.3
-    )
-    sideways = predict(crab, front_left=-2.0, front_right=2.0, rear_left=2.0, rear_right=-2.0)
-    assert sideways == pytest.approx([0.0, 0.2, 0.0])
-    spinning = predict(crab, front_left=-2.0, front_right=2.0, rear_left=-2.0, rear_right=2.0)
-    assert spinning == pytest.approx([0.0, 0.0, 0.5])
-    assert predict(crab, **ask(crab, 0.7, -0.4)) == pytest.approx([0.7, 0.0, -0.4])
 
 
 ASK_THE_COPY = """

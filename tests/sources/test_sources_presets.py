@@ -24,11 +24,6 @@ def test_a_preset_is_found_by_id_and_alias_however_they_are_written(vehicle: Veh
         assert find_preset(f" {name.upper().replace('_', '-')} ") == vehicle
 
 
-def test_no_two_presets_share_a_name() -> None:
-    names = [name for vehicle in PRESETS for name in {vehicle.id, *vehicle.aliases}]
-    assert len(names) == len(set(names))
-
-
 @pytest.mark.parametrize(
     ("name", "radius", "track", "mass"),
     [
@@ -45,20 +40,6 @@ def test_published_vehicles_have_their_published_numbers(
     assert (vehicle.wheel_radius_m, vehicle.track_width_m, vehicle.mass_kg) == (radius, track, mass)
 
 
-@pytest.mark.parametrize("name", ["marmotte", "bunker"])
-def test_tracked_vehicles_are_known_by_name(name: str) -> None:
-    vehicle = find_preset(name)
-    assert vehicle is not None
-    assert (vehicle.kind, vehicle.running_gear) == ("differential", "tracks")
-
-
-@pytest.mark.parametrize(("word", "gear"), [("tracked", "tracks"), ("skid_steer", "wheels")])
-def test_words_for_a_differential_drive_are_understood(word: str, gear: str) -> None:
-    section = VehicleSection(kind=word, wheel_radius_m=0.1, track_width_m=0.4)
-    found = resolve_vehicle(section, recorded=None, where="a.mcap")
-    assert (found.kind, found.running_gear) == ("differential", gear)
-
-
 def test_the_log_names_the_vehicle_when_nobody_else_does() -> None:
     assert resolve_vehicle(VehicleSection(), recorded="Husky", where="a.mcap").id == "husky_a200"
 
@@ -66,18 +47,6 @@ def test_the_log_names_the_vehicle_when_nobody_else_does() -> None:
 def test_the_configuration_wins_over_the_log() -> None:
     found = resolve_vehicle(VehicleSection(preset="jackal"), recorded="husky", where="a.mcap")
     assert found.id == "jackal"
-
-
-def test_values_win_over_the_preset_and_leave_the_rest() -> None:
-    found = resolve_vehicle(VehicleSection(preset="husky", track_width_m=0.6), recorded=None, where="a.mcap")
-    assert (found.track_width_m, found.wheel_radius_m) == (0.6, 0.165)
-
-
-def test_a_geometry_needs_no_preset() -> None:
-    section = VehicleSection(wheel_radius_m=0.1, track_width_m=0.4)
-    found = resolve_vehicle(section, recorded=None, where="a.mcap")
-    assert (found.kind, found.wheel_radius_m, found.track_width_m) == ("differential", 0.1, 0.4)
-    assert resolve_vehicle(section, recorded="Gold Digger", where="a.mcap").id == "gold_digger"
 
 
 @pytest.mark.parametrize(

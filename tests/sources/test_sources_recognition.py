@@ -113,26 +113,6 @@ def test_a_namespace_tells_the_platform(topic: str, vehicle: str) -> None:
     assert (found.vehicle.id, found.source) == (vehicle, "namespace")
 
 
-def test_message_types_and_hosts_tell_the_platform() -> None:
-    by_type = recognize("/wheel_vels", types="irobot_create_msgs/msg/WheelVels")
-    by_host = recognize("/cmd_vel", metadata={"recorder": {"hostname": "cpr-w200-0012"}})
-    assert by_type is not None
-    assert by_host is not None
-    assert (by_type.vehicle.id, by_type.source) == ("turtlebot4", "message_types")
-    assert (by_host.vehicle.id, by_host.source) == ("warthog", "namespace")
-
-
-@pytest.mark.parametrize("topic", ["/cmd_vel", "/scouting/cmd_vel", "/lynxes/odom", "/nav/husk"])
-def test_other_words_tell_nothing(topic: str) -> None:
-    assert recognize(topic) is None
-
-
-def test_a_tracked_platform_is_told_by_its_message_types() -> None:
-    found = recognize("/bunker_status", types="bunker_msgs/msg/BunkerStatus")
-    assert found is not None
-    assert (found.vehicle.id, found.vehicle.running_gear) == ("bunker", "tracks")
-
-
 def test_mecanum_wheels_are_told_by_a_description_that_speaks_of_them() -> None:
     (text,) = [one.fields["data"] for one in PLATFORMS["youbot"].topics if "description" in one.topic]
     plain = read_description(str(text).replace("youbot", "my_robot"))
@@ -171,14 +151,6 @@ def test_a_fitted_geometry_is_compared_with_the_platforms() -> None:
     assert find_alike(0.5, 0.1) is None
 
 
-def test_another_vehicle_than_the_logs_is_contradicted() -> None:
-    husky, jackal = find_preset("husky"), find_preset("jackal")
-    assert husky is not None
-    assert jackal is not None
-    assert [text for text in list_contradictions(husky, jackal) if "wheel_radius_m" in text]
-    assert list_contradictions(husky, husky) == []
-
-
 def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None:
     youbot, car = find_preset("youbot"), find_preset("car")
     assert youbot is not None
@@ -189,15 +161,3 @@ def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None
     assert described.vehicle.kind == "differential"
     assert list_contradictions(described.vehicle, youbot) == []
     assert "kind differential, not ackermann" in list_contradictions(described.vehicle, car)
-
-
-def test_of_several_platforms_in_a_log_the_configured_topic_tells_which_is_meant() -> None:
-    topics = ("/husky/odom", "/husky/cmd_vel", "/warthog/odom", "/warthog/cmd_vel")
-    channels = [
-        ChannelInfo(i, topic, "nav_msgs/msg/Odometry", "ros2msg", "cdr", 5, {})
-        for i, topic in enumerate(topics)
-    ]
-    assert recognize_vehicle(channels, {}, None) is None
-    meant = recognize_vehicle(channels, {}, None, ["/warthog/odom"])
-    assert meant is not None
-    assert meant.vehicle.id == "warthog"

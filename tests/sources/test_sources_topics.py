@@ -229,23 +229,6 @@ def test_every_simulated_layout_is_understood(name: str) -> None:
     assert sources.pose.topic == layout.pose.topic
 
 
-def test_a_choice_between_several_says_which_and_why() -> None:
-    topics = {"/nav/cmd_vel": TWIST, "/controller/cmd_vel": TWIST, **ICP}
-    sources = choose(topics)
-    assert sources.command is not None
-    assert sources.command.reason
-    assert [note for note in sources.notes if "/nav/cmd_vel" in note and note.startswith("command")]
-
-
-def test_the_busier_of_two_equal_topics_is_taken() -> None:
-    topics = {"/imu_a": IMU, "/imu_b": IMU}
-    assert names(choose(topics, counts={"/imu_a": 5, "/imu_b": 500}))["imu"] == "/imu_b"
-
-
-def test_an_empty_topic_is_not_there() -> None:
-    assert names(choose({"/cmd_vel": TWIST, **ICP}, counts={"/cmd_vel": 0}))["command"] is None
-
-
 def test_what_is_configured_is_taken_whatever_it_is_called() -> None:
     topics = {"/a": JOINTS, "/b": JOINTS, "/wheel_commands": JOINTS, "/odd": POSE, "/i": IMU, **ICP}
     sources = choose(

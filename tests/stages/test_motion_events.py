@@ -12,7 +12,6 @@ from pipeline.export import export_model
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, ModelFile
-from pipeline.models.catalogue import find_effect
 from pipeline.run.signals import Limits, trace_traction
 from pipeline.simulate import (
     TRACTION,
@@ -89,12 +88,6 @@ def test_steps_of_commands_and_turns_are_no_event(tau: float) -> None:
     assert set(trace(np.ones(times.size), np.where(times > 8.0, 0.1, 1.0), turning=1.2)) == {0}
 
 
-def test_poses_that_ran_ahead_and_wait_are_no_event() -> None:
-    times = np.arange(0.0, 20.0, STEP_S)
-    share = np.where((times > 8.0) & (times < 9.5), 3.0, np.where((times > 9.5) & (times < 12.0), 0.0, 1.0))
-    assert set(trace(np.ones(times.size), share)) == {0}
-
-
 @pytest.mark.parametrize(
     ("forward", "sideways", "said"), [(0.2, -0.95, []), (0.0, 0.9, []), (0.4, 0.0, ["digging_in"])]
 )
@@ -158,14 +151,6 @@ def test_an_event_of_a_log_stands_in_its_table_its_findings_and_its_report(
     assert kind.replace("_", " ") in report
 
 
-def test_what_happens_again_and_again_is_how_the_ground_is(tmp_path: Path) -> None:
-    log = make_log(tmp_path / "run.mcap", "digging_in", (14.0, 20.0), (44.0, 50.0), (74.0, 80.0))
-    events = analyze_log(log, Options(out=tmp_path / "out", diagnosis=False, report=False)).manifest.read(
-        "events"
-    )
-    assert "digging_in" not in events["kind"].to_list()
-
-
 def test_the_exported_function_needs_nothing_and_says_the_same() -> None:
     vehicle = find_preset("husky_a200")
     assert vehicle is not None
@@ -179,14 +164,3 @@ def test_the_exported_function_needs_nothing_and_says_the_same() -> None:
     assert judge(wheels[:160], [0.0] * 160, body[:160], STEP_S) == "spinning"  # type: ignore[operator]
     codes = space["trace_traction"](wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[operator]
     assert codes == trace_traction(wheels, [0.0] * 240, body, STEP_S, **space["LIMITS"])  # type: ignore[arg-type]
-
-
-def test_better_ground_is_no_slide_for_the_exported_function() -> None:
-    vehicle = find_preset("husky_a200")
-    assert vehicle is not None
-    model = Model(vehicle, (find_effect("wheel_radius")().change(k=0.6),))
-    space: dict[str, object] = {}
-    exec(compile(export_model(ModelFile(model), "traction"), "exported", "exec"), space)  # noqa: S102
-    judge = space["judge_traction"]
-    for share, said in ((0.6, "drive"), (1.2, "drive"), (2.5, "sliding")):
-        assert judge([0.9] * 240, [0.0] * 240, [share * 0.9] * 240, STEP_S) == said  # type: ignore[operator]

@@ -9,8 +9,7 @@ import polars as pl
 import pytest
 from stage_logs import FIELD, Taken, TakeThrough
 
-from pipeline.fleet import measure_difficulty
-from pipeline.simulate import Ground, Recording
+from pipeline.simulate import Ground
 from pipeline.stages.slip_stage import aggregate_run
 
 
@@ -86,60 +85,9 @@ def test_distance_energy_and_height_are_those_of_the_motion(drive: TakeThrough) 
     assert hilly["height_rate"] > 3.0 * flat["height_rate"]
 
 
-def test_the_largest_energy_is_that_of_the_fleet_and_not_that_of_a_jump(drive: TakeThrough) -> None:
-    taken = drive(FIELD)
-    calm = row(aggregate(taken), "measured")["largest_kinetic_energy"]
-    slip = taken.result.slip.with_columns(v_x=pl.col("v_x") + 9.0 * (pl.int_range(pl.len()) % 40 == 7))
-    jumping = aggregate_run(
-        slip, taken.result.windows, taken.velocities, vehicle=taken.aligned.vehicle, length=1.0
-    )
-    assert row(jumping, "measured")["largest_kinetic_energy"] == pytest.approx(calm, rel=0.02)
-    vehicle = {"run": ["a/run"], "mass": [75.0], "squared_gyration": [0.1], "length_scale": [1.0]}
-    fleet = measure_difficulty(slip.with_columns(run=pl.lit("a/run")).lazy(), pl.DataFrame(vehicle))
-    for one in fleet.iter_rows(named=True):
-        assert one["largest_kinetic_energy"] == row(jumping, one["input"])["largest_kinetic_energy"]
-
-
-def test_holes_are_not_driven(drive: TakeThrough) -> None:
-    whole = row(aggregate(drive(FIELD)), "measured")
-    taken = drive(replace(FIELD, recording=Recording(gaps=2, gap_s=5.0)))
-    # A drive whose commands ceased is left out besides.
-    left_out = 0.05 * taken.slip("measured").filter("suspect").height
-    holed = row(aggregate(taken), "measured")
-    assert holed["duration"] + left_out == pytest.approx(whole["duration"] - 10.0, abs=0.5)
-
-
-def test_only_the_samples_that_are_compared_count_as_time_and_distance(drive: TakeThrough) -> None:
-    taken = drive(FIELD)
-    some = taken.result.slip.with_columns(suspect=pl.col("t") > 50.0).filter(pl.col("t") > 30.0)
-    found = aggregate_run(
-        some, taken.result.windows, taken.velocities, vehicle=taken.aligned.vehicle, length=1.0
-    )
-    for name in ("command", "measured"):
-        kept = some.filter(pl.col("input") == name, ~pl.col("suspect"))
-        assert row(found, name)["duration"] == pytest.approx(20.0, abs=0.2)
-        way = float(np.hypot(kept["v_x"], kept["v_y"]).sum()) * 0.05
-        assert row(found, name)["distance"] == pytest.approx(way, rel=1e-6)
-        parts = [row(found, name, subset)["distance"] for subset in ("transitory", "steady")]
-        assert sum(parts) == pytest.approx(way, rel=1e-6)
-
-
 def test_noise_of_the_poses_is_no_distance_of_a_vehicle_that_stands(drive: TakeThrough) -> None:
     taken = drive(FIELD)
     parts = (taken.result.slip, taken.result.windows, taken.velocities)
     found = aggregate_run(*parts, vehicle=taken.aligned.vehicle, length=1.0, moves=False)
     assert found["distance"].null_count() == found.height
     assert row(found, "command")["duration"] > 0.0
-
-
-def test_a_run_without_windows_has_no_window_norm(drive: TakeThrough) -> None:
-    taken = drive(FIELD)
-    found = aggregate_run(
-        taken.result.slip.head(30),
-        taken.result.windows.head(0),
-        taken.velocities,
-        vehicle=taken.aligned.vehicle,
-        length=1.0,
-    )
-    assert row(found, "command")["median_window_norm"] is None
-    assert row(found, "command")["median_modulus"] is not None

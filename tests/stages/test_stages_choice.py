@@ -8,15 +8,13 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from msgspec import structs
 from stage_logs import FIELD, PLAIN, TakeThrough
 
 from pipeline.job.log_choice import Choice, choose
-from pipeline.logs import Ragged, RaggedStrings, Strings, TopicColumns, open_log, read_topics
+from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
 from pipeline.simulate import (
     Clock,
-    Encoders,
     PoseSensor,
     Recording,
     Scenario,
@@ -24,12 +22,12 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.sources import Configuration, DriveForm, DriveSection, find_preset, load_configuration
+from pipeline.sources import Configuration, DriveSection, find_preset, load_configuration
 from pipeline.stages.clocks import Recorded, align_clocks
-from pipeline.stages.drive import read_joints, read_pair, unwrap_counter
+from pipeline.stages.drive import read_joints, unwrap_counter
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.pose_choice import fit_controller
-from pipeline.stages.reading import list_wanted, read_pose_topic, with_texts
+from pipeline.stages.reading import list_wanted, read_pose_topic
 
 SECOND = 10**9
 COUNT = 600
@@ -90,26 +88,6 @@ def test_a_localization_is_never_taken_for_the_wheels(tmp_path: Path) -> None:
     assert chosen.findings == ()
 
 
-def test_what_needs_no_comparison_is_not_read(tmp_path: Path) -> None:
-    chosen = look(record(replace(FIELD, duration_s=20.0), tmp_path))
-    assert str(chosen.sources.pose) == "/mapping/icp_odom"
-    assert chosen.data is None
-
-
-def test_what_was_extracted_to_rate_the_pose_is_what_the_stages_extract(tmp_path: Path) -> None:
-    log = record(replace(FIELD, duration_s=20.0, recording=Recording("tf")), tmp_path)
-    chosen = look(log)
-    index, made = open_log(log), chosen.extracted
-    assert made is not None
-    assert chosen.data is not None
-    assert chosen.data.topics == (), "the columns are held no longer than needed"
-    data = read_topics(index, list_wanted(chosen.sources, index.types))
-    again = extract_tables(data, chosen.sources, load_configuration(log), chosen.vehicle, where=str(log))
-    assert made.tables.keys() == again.tables.keys()
-    assert all(made.tables[name].equals(again.tables[name]) for name in again.tables)
-    assert (made.findings, made.start_ns, made.frames) == (again.findings, again.start_ns, again.frames)
-
-
 @pytest.mark.parametrize(
     ("layout", "track", "said"),
     [
@@ -146,14 +124,6 @@ def test_commands_on_another_scale_than_the_motion_give_no_geometry() -> None:
     assert told[1] is None
 
 
-def test_body_commands_alone_need_no_vehicle(tmp_path: Path) -> None:
-    scenario = make_scenario(None, {}, seed=2, duration_s=30.0, vehicle="husky", layout="body_command")
-    unnamed = replace(scenario, encoders=None, recording=Recording("body_command", deployment="absent"))
-    chosen = look(record(unnamed, tmp_path))
-    (finding,) = chosen.findings
-    assert "none is needed" in finding.text
-
-
 @pytest.mark.parametrize("period", [2**16, 2**32])
 def test_a_counter_that_begins_again_goes_on(period: int) -> None:
     true = np.arange(0.0, 3.0 * period, period / 40.0)
@@ -186,20 +156,6 @@ def test_simulated_time_carries_topics_without_stamps_along(factor: float) -> No
     assert "simulated_time" in {finding.id for finding in findings}
     assert np.array_equal(clocks["pose"].stamp, simulated)
     assert np.abs(clocks["cmd"].stamp - simulated[::7]).max() < SECOND // 100
-
-
-def test_a_pause_of_the_simulation_moves_no_command() -> None:
-    simulated = np.arange(2000) * SECOND // 20
-    log = 1_700_000_000 * SECOND + (simulated / 0.5).astype(np.int64)
-    log[1000:] += 30 * SECOND
-    clocks, _ = align_clocks(
-        {
-            "pose": Recorded("/pose", log, log, simulated),
-            "cmd": Recorded("/cmd_vel", log, log, None),
-        }
-    )
-    late = np.abs(clocks["cmd"].stamp - simulated) > SECOND // 10
-    assert late.mean() < 0.05
 
 
 def test_a_simulated_log_keeps_its_effects(tmp_path: Path) -> None:
@@ -244,11 +200,6 @@ def test_a_body_command_tells_a_small_error_of_the_radius_from_ground_that_slips
         assert taken.finding("wheel_radius_wrong").value == pytest.approx(0.165, rel=0.03)
 
 
-def test_wheels_in_turns_a_minute_are_recognized(drive: TakeThrough) -> None:
-    taken = drive(replace(PLAIN, encoders=Encoders(gain=60.0 / (2.0 * np.pi))), {})
-    assert "rpm" in taken.finding("unit_wrong").text
-
-
 def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
     tmp_path: Path, stamps: np.ndarray
 ) -> None:
@@ -267,19 +218,6 @@ def test_a_command_that_the_vehicle_cannot_follow_sideways_is_said(
     assert 'kind = "mecanum"' in finding.text
     assert "youbot" in finding.text
     assert finding.value == pytest.approx(0.5, abs=0.02)
-
-
-def test_an_odometry_of_a_controller_is_read_with_the_controllers_track() -> None:
-    # The controller's odometry divides by its own track; the base's own status by the nominal one.
-    husky = find_preset("husky_a200")
-    assert husky is not None
-    vehicle = structs.replace(husky, controller_track_multiplier=1.5)
-    half = 0.5 * 1.0 * vehicle.track_width_m / vehicle.wheel_radius_m  # type: ignore[operator]
-    for nominal, factor in ((True, 1.0), (False, 1.5)):
-        still, turning = np.zeros(3), np.ones(3)
-        drive = read_pair(DriveForm.BODY, still, turning, DriveSection(), vehicle, nominal=nominal)
-        assert drive.right == pytest.approx(half * factor)
-        assert drive.left == pytest.approx(-half * factor)
 
 
 @pytest.mark.parametrize(
@@ -324,18 +262,3 @@ def test_a_pose_whose_heading_does_not_follow_the_gyro_loses(tmp_path: Path, sta
     chosen = look(tmp_path / "run.mcap")
     assert str(chosen.sources.pose) == "/other"
     assert "differs from the gyro's" in chosen.ratings[1].reason
-
-
-def test_texts_that_are_no_objects_of_numbers_are_left_out() -> None:
-    texts = ('{"x": 1, "y": 0, "z": -0.5}', '{"x": 1e999, "y": 0, "z": 0}', "", "[1, 2]", '{"x": 1, "y": 0}')
-    codes = np.array([0, 1, 2, 3, 4, -1, 0], dtype=np.int32)
-    kinds = np.array([1008, 1008, 1008, 1008, 1008, 1008, 1007])
-    times = np.arange(codes.size)
-    fields = {"parameter": Strings(codes, texts), "header.identity.api_id": kinds}
-    read = with_texts(TopicColumns("/r", 1, "unitree_api/msg/Request", times, times, None, fields, ()))
-    assert {name: column.tolist() for name, column in read.fields.items()} == {
-        "parameter.x": [1.0],
-        "parameter.y": [0.0],
-        "parameter.z": [-0.5],
-    }
-    assert read.log_time.tolist() == [0]

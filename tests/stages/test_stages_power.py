@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 import pytest
 from fomo_session import RADIUS_M, write_session
-from verbs import run_verb
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.logs.writer import LogWriter
 from pipeline.report.figures.slip_figures import draw_power
 from pipeline.report.scene import RunReport, Scene
-from pipeline.sources.candidates import Topics, choose_power
+from pipeline.sources.candidates import choose_power
 from pipeline.store import Manifest
 
 FLOAT = "std_msgs/Float64"
@@ -61,17 +59,6 @@ def test_currents_of_motors_are_found_by_type_or_name(types: dict[str, str], exp
     assert found.sign == (-1 if expected.startswith("/battery") else 1)
 
 
-def test_what_is_no_current_is_none() -> None:
-    assert choose_power({"/talon/current_position": FLOAT, "/current_speed": FLOAT}) is None
-
-
-def test_currents_of_two_sides_are_never_taken_for_wheels() -> None:
-    sides = {f"/motor/{side}/status/current": FLOAT for side in ("left", "right")}
-    topics = Topics(sides)
-    for commanded in (True, False):
-        assert topics.list_drives(commanded=commanded, steered=False) == []
-
-
 def test_power_is_told_over_time_and_over_the_way(tmp_path: Path) -> None:
     session = write_session(tmp_path / "red_2025-10-14-11-41", duration_s=60.0)
     manifest = extract(session)
@@ -92,13 +79,6 @@ def test_power_is_told_over_time_and_over_the_way(tmp_path: Path) -> None:
     (told,) = manifest.read("findings").filter(pl.col("id") == "power_drawn").to_dicts()
     assert told["value"] == pytest.approx(PER_METRE, rel=0.02)
     assert " J/m (median)" in told["text"]
-
-
-def test_inspect_says_where_power_is_read(tmp_path: Path) -> None:
-    session = write_session(tmp_path / "red_2025-10-14-11-41", duration_s=10.0)
-    said = json.loads(run_verb("inspect", session, "--json").stdout)["roles"]["power"]
-    assert "/motor/left/status/current_battery" in said["topic"]
-    assert "power     /warthog" in run_verb("inspect", session).stdout
 
 
 def test_without_a_voltage_the_current_is_told_alone(tmp_path: Path) -> None:
@@ -142,14 +122,3 @@ def test_a_battery_that_counts_what_is_drawn_as_negative_is_turned_round(tmp_pat
     power = analyze_log(log, options).manifest.read("power")
     np.testing.assert_allclose(power["current"], 5.0)
     np.testing.assert_allclose(power["energy_per_m"].drop_nulls(), 5.0 * 24.0 / 0.5, rtol=0.01)
-
-
-def test_power_is_drawn_where_it_is_known() -> None:
-    assert draw_power(Scene(RunReport({}))) is None
-    table = pl.DataFrame(
-        {"t": np.arange(50.0), "current": np.linspace(0.0, 20.0, 50), "energy_per_m": np.full(50, 300.0)}
-    )
-    drawing = draw_power(Scene(RunReport({}, {"power": table})))
-    assert drawing is not None
-    assert set(drawing.rows) >= {"power_current", "power_energy_per_m"}
-    assert "median 300 J/m" in drawing.words

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -12,13 +11,12 @@ import pytest
 from stage_logs import PLAIN, Taken, TakeThrough, rms, slope
 
 from pipeline.logs import TopicColumns
-from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Program, Scenario
+from pipeline.simulate import Imu, Layout, PoseSensor, PoseTopic, Scenario
 from pipeline.simulate.platforms import Published, fix, ground_velocity, imu, joints, twist
 from pipeline.simulate.sensors import to_earth
-from pipeline.sources import PoseContent
 from pipeline.sources.candidates import Topics
 from pipeline.stages.reading import Receiver
-from pipeline.stages.satellite import follow_track, locate_vehicle, read_over_ground, to_local_plane
+from pipeline.stages.satellite import locate_vehicle, read_over_ground, to_local_plane
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 SKIDDING = replace(
@@ -58,12 +56,6 @@ def test_a_fix_is_placed_where_a_surveyor_would() -> None:
     degrees = np.array([0.0, 1e-3, 0.0])
     placed = to_local_plane(degrees, degrees[[0, 2, 1]], np.array([np.nan, np.nan, np.nan]))
     np.testing.assert_allclose(placed[:, :2], [[0.0, 0.0], [0.0, 110.574], [111.320, 0.0]], atol=1e-3)
-
-
-def test_places_of_the_simulated_earth_come_back() -> None:
-    places = np.random.default_rng(1).uniform(-2e3, 2e3, (50, 3)) * [1.0, 1.0, 0.01]
-    places[0] = 0.0
-    np.testing.assert_allclose(to_local_plane(*to_earth(places)), places, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -165,15 +157,6 @@ def test_a_log_with_hardly_a_fix_has_no_pose_and_no_crash(count: int) -> None:
     assert made.arrays.position.shape == (made.rows.size, 3)
 
 
-def test_a_topic_that_repeats_its_fixes_counts_each_once() -> None:
-    def hold(fields: dict[str, np.ndarray]) -> None:
-        for values in fields.values():
-            values[1::2] = values[::2]
-
-    made = locate_vehicle(receive(hold), None, None, None, np.zeros(3))
-    assert made.rows.size == 150
-
-
 def test_velocities_that_give_north_first_are_recognized_and_those_of_the_body_refused() -> None:
     times = np.arange(600) / 10.0
     heading = 0.2 * times
@@ -185,17 +168,6 @@ def test_velocities_that_give_north_first_are_recognized_and_those_of_the_body_r
         np.testing.assert_array_equal(read, plain)
     body = np.stack((np.ones_like(times), np.zeros_like(times)), axis=-1)
     assert read_over_ground(times, place, times, body) is None
-
-
-def test_about_a_change_of_direction_the_course_is_not_known() -> None:
-    times = np.arange(400) / 20.0
-    speed = np.where(times < 10.0, 0.5, -0.5)
-    place = np.stack((10.0 - np.abs(times - 10.0), np.zeros_like(times), np.zeros_like(times)), axis=-1) * 0.5
-    course = follow_track(times, place, (times, speed))
-    angle, known = course.angles()
-    np.testing.assert_allclose(np.cos(angle[known]), 1.0, atol=1e-3)
-    assert not known[np.abs(times - 10.0) < 0.5].any()
-    assert known[np.abs(times - 10.0) > 1.5].all()
 
 
 @pytest.mark.parametrize(
@@ -213,14 +185,6 @@ def test_a_velocity_over_ground_is_no_command(types: dict[str, str], found: list
     assert topics.ground_velocities() == found
     commands = {str(source) for _, source in topics.list_drives(commanded=True, steered=False)}
     assert commands.isdisjoint(found)
-
-
-def test_fixes_take_the_velocities_beside_them(drive: TakeThrough, tmp_path: Path) -> None:
-    del tmp_path
-    short = replace(SKIDDING, duration_s=20.0)
-    pose = drive(publishing(short, fix("/gps/fix"), ground_velocity("/gps/vel"))).sources.pose
-    assert pose is not None
-    assert (pose.topic, pose.velocity, pose.content) == ("/gps/fix", "/gps/vel", PoseContent.FIX)
 
 
 ALONE = replace(SKIDDING, pose=PoseSensor(noise_m=0.005, reports_heading=False))
@@ -242,9 +206,3 @@ def test_poses_that_look_one_way_all_the_time_are_positions_alone(
     assert moving.height > 300
     assert rms(moving["g_x"]) < 0.05
     assert lateral_skid(taken) == pytest.approx(0.08 if turns else 0.0, abs=0.02)
-
-
-def test_poses_with_a_heading_and_a_straight_drive_stay_as_they_are(drive: TakeThrough) -> None:
-    straight = Program("straight")
-    for scenario in (SKIDDING, replace(ALONE, program=straight, pose=replace(ALONE.pose, noise_m=0.002))):
-        assert not {"no_heading", "heading_from_course"} & drive(scenario).ids()

@@ -11,11 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
-from pipeline.core.arrays import usual_hold
-from pipeline.simulate import VEHICLES, Program, Recording
-from pipeline.sources import Vehicle, convert, find_preset
-from pipeline.stages import StageError
-from pipeline.stages.slip_stage import compute_slip, cut_windows, hold_commands, interpolate_wheels
+from pipeline.simulate import VEHICLES, Program
+from pipeline.sources import Vehicle, find_preset
+from pipeline.stages.slip_stage import cut_windows, hold_commands, interpolate_wheels
 
 
 def preset(name: str, **changes: float) -> Vehicle:
@@ -73,11 +71,6 @@ def test_the_window_norm_is_root_40_times_the_root_mean_square_at_any_rate(rate:
     assert np.allclose(windows["t_end"] - windows["t_start"], 2.0)
 
 
-def test_at_20_hz_it_is_the_norm_of_the_windows_matrix() -> None:
-    slip = make_slip(40, 20.0).with_columns(modulus=pl.Series(np.linspace(0.0, 2.0, 40)))
-    assert cut_windows(slip, 20.0)["window_norm"][0] == pytest.approx(np.linalg.norm(slip["modulus"]))
-
-
 @given(st.integers(1, 300))
 def test_a_remainder_is_dropped(count: int) -> None:
     windows = cut_windows(make_slip(count, 20.0), 20.0)
@@ -116,36 +109,6 @@ def test_every_way_of_driving_has_windows_inside_steps_and_segments(drive: TakeT
             assert inside["step"].n_unique() == inside["segment"].n_unique() == 1
 
 
-def test_windows_of_windowed_recordings_start_at_their_steps(drive: TakeThrough) -> None:
-    taken = drive(replace(FIELD, recording=Recording(gaps=3, gap_s=2.5)))
-    starts = taken.slip("command").group_by("step").agg(pl.col("t").min())["t"].to_numpy()
-    since = taken.windows("command")["t_start"].to_numpy()[:, None] - starts[None, :]
-    into = np.where(since >= -1e-6, since, np.inf).min(axis=1)
-    assert np.allclose(into / 2.0, np.round(into / 2.0), atol=1e-6)
-
-
-def test_both_inputs_have_the_same_steps_whichever_is_asked_for(drive: TakeThrough) -> None:
-    both = drive(FIELD).windows("measured")
-    alone = drive(FIELD, inputs=("measured",)).windows("measured")
-    assert alone.equals(both)
-
-
-def test_without_any_input_there_is_nothing_to_compare() -> None:
-    velocities = pl.DataFrame({"t": [0.0, 0.05], "stamp": [0, 1], "segment": [0, 0]})
-    with pytest.raises(StageError, match="no command") as caught:
-        compute_slip(
-            velocities,
-            pl.DataFrame(),
-            pl.DataFrame(),
-            vehicle=HUSKY,
-            configuration=convert({}, "test"),
-            hold_s=None,
-            inputs=("command",),
-            where="a.mcap",
-        )
-    assert caught.value.code == "no_command"
-
-
 def make_drive(times: list[float], left: list[float]) -> pl.DataFrame:
     return pl.DataFrame({"t": times, "left": left, "right": left, "active": [True] * len(times)})
 
@@ -157,36 +120,6 @@ def test_a_command_is_held_until_the_next_one_or_until_it_is_stale() -> None:
     speed = found.velocity[:, 0] / 0.165
     assert np.allclose(speed, [np.nan, 1.0, 2.0, 3.0, np.nan, 4.0], equal_nan=True)
     assert found.stale.tolist() == [False, False, False, False, True, False]
-
-
-@pytest.mark.parametrize(("last", "is_reported"), [(0.0, False), (1.0, True)])
-def test_silence_after_a_stop_is_no_stale_command(
-    drive: TakeThrough, last: float, *, is_reported: bool
-) -> None:
-    # Nav2 ends each goal with a zero, and is silent until the next one.
-    taken = drive(FIELD)
-    stamps = np.arange(0.0, 5.0, 0.05)
-    speeds = np.where(stamps < 4.0, 1.0, last)
-    commands = make_drive(stamps.tolist(), speeds.tolist())
-    made = compute_slip(
-        taken.velocities,
-        commands,
-        pl.DataFrame(),
-        vehicle=HUSKY,
-        configuration=convert({}, "test"),
-        hold_s=0.5,
-        inputs=("command",),
-        where="a.mcap",
-    )
-    assert made.slip["t"].max() < 5.5
-    assert bool([one for one in made.findings if one.id == "stale_command"]) is is_reported
-
-
-def test_a_pair_of_topics_at_2_hz_is_held_for_its_own_period() -> None:
-    stamps = np.sort(np.concatenate((np.arange(20) * 0.5, np.arange(20) * 0.5 + 1e-4)))
-    commands = make_drive(stamps.tolist(), [1.0] * 40)
-    found = hold_commands(np.arange(0.1, 9.4, 0.05), commands, HUSKY, usual_hold(stamps))
-    assert not found.stale.any()
 
 
 def test_measured_wheels_are_interpolated_but_not_across_holes() -> None:
@@ -202,12 +135,6 @@ def test_with_yaw_imu_the_gyro_gives_the_yaw_rate_and_nothing_else(drive: TakeTh
     assert np.array_equal(pose.velocities["v_x"], imu.velocities["v_x"])
     assert np.array_equal(imu.velocities["v_w"], imu.velocities["v_w_imu"])
     assert rms(pose.velocities["v_w"] - imu.velocities["v_w"]) > 1e-4
-
-
-def test_with_yaw_imu_and_no_gyro_it_says_what_to_do(drive: TakeThrough) -> None:
-    with pytest.raises(StageError, match="--yaw pose") as caught:
-        drive(replace(FIELD, imu=None), {"velocity": {"yaw": "imu"}})
-    assert caught.value.code == "no_gyro"
 
 
 def test_a_car_with_base_link_between_its_axles_has_no_lateral_slip(drive: TakeThrough) -> None:

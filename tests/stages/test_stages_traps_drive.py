@@ -7,14 +7,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 import pytest
-from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
+from stage_logs import FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import SlipError
 from pipeline.run import read_drive
-from pipeline.simulate import LAYOUTS, VEHICLES, Encoders, PoseSensor, Program, Recording
-from pipeline.stages import StageError
+from pipeline.simulate import VEHICLES, Encoders, PoseSensor, Program, Recording
 from pipeline.stages.align import _find_ratio
-from pipeline.stages.drive import _mean_steering, interpolate_readings
+from pipeline.stages.drive import _mean_steering
 
 LONGER = replace(FIELD, duration_s=150.0)
 
@@ -27,14 +26,6 @@ def test_trap_7_wheels_are_told_apart_by_name_whatever_their_order(drive: TakeTh
     both = command.filter(steady).join(measured.filter(steady), on="stamp", suffix="_measured")
     assert slope(both["f_w"], both["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
     assert slope(both["f_x"], both["f_x_measured"]) == pytest.approx(1.0, abs=0.02)
-
-
-def test_trap_7_swapped_names_in_the_configuration_swap_the_turn(drive: TakeThrough) -> None:
-    swapped = {"left": ["front_right_wheel"], "right": ["front_left_wheel"]}
-    plain = drive(replace(FIELD, recording=Recording("husky"))).slip("measured")
-    taken = drive(replace(FIELD, recording=Recording("husky")), {"wheels": swapped}).slip("measured")
-    assert np.allclose(taken["f_w"], -plain["f_w"])
-    assert np.allclose(taken["f_x"], plain["f_x"])
 
 
 def test_trap_7_positions_are_differentiated_where_there_is_no_velocity(drive: TakeThrough) -> None:
@@ -128,23 +119,6 @@ def test_trap_8_intervals_by_time_and_by_state(drive: TakeThrough) -> None:
     assert (found.min(), found.max()) == pytest.approx((10.0, 20.0), abs=0.1)
 
 
-@pytest.mark.parametrize(
-    ("interval", "code"),
-    [
-        ({"topic": "/drive/calib_state", "equals": "never said"}, "no_interval"),
-        ({"start_s": 9.0, "end_s": 3.0}, "bad_interval"),
-        ({"start_s": 1e6}, "empty_interval"),
-    ],
-)
-def test_trap_8_an_interval_without_anything_in_it_is_an_error(
-    drive: TakeThrough, interval: dict[str, object], code: str
-) -> None:
-    with pytest.raises(SlipError) as caught:
-        drive(replace(FIELD, recording=Recording(hand_driven_s=10.0)), {"interval": [interval]})
-    assert caught.value.code == code
-    assert "\n" not in str(caught.value)
-
-
 ODOMETRY = PoseSensor(source="wheels", noise_m=0.0, noise_rad=0.0, noise_z_m=0.0, noise_tilt_rad=0.0)
 
 
@@ -153,15 +127,6 @@ def test_trap_9_wheel_odometry_is_recognised_however_it_is_driven(drive: TakeThr
     scenario = replace(LONGER, pose=ODOMETRY, program=Program(program), encoders=Encoders(noise_radps=0.02))  # type: ignore[arg-type]
     taken = drive(scenario)
     assert taken.finding("pose_from_wheels").severity == "error"
-
-
-@pytest.mark.parametrize("rates", [(10.0, 50.0), (50.0, 20.0), (20.0, 10.0)])
-def test_trap_9_wheel_odometry_is_recognised_at_any_rate(
-    drive: TakeThrough, rates: tuple[float, float]
-) -> None:
-    pose = replace(ODOMETRY, rate_hz=rates[0])
-    taken = drive(replace(LONGER, pose=pose, encoders=Encoders(rate_hz=rates[1])))
-    assert "pose_from_wheels" in taken.ids()
 
 
 def test_trap_9_commands_in_place_of_encoders_are_not_evaluated_and_still_show_odometry(
@@ -178,11 +143,6 @@ def test_trap_9_commands_in_place_of_encoders_are_not_evaluated_and_still_show_o
     assert "wheels_from_commands" not in drive(replace(echo, effects={"drive_lag": 0.02})).ids()
     with pytest.raises(SlipError, match="--input command"):
         drive(echo, inputs=("measured",))
-
-
-def test_trap_9_wheel_odometry_with_a_wider_track_is_still_wheel_odometry(drive: TakeThrough) -> None:
-    taken = drive(replace(LONGER, pose=ODOMETRY), {"vehicle": {"track_width_m": 0.55 / 1.875}})
-    assert "pose_from_wheels" in taken.ids()
 
 
 @pytest.mark.parametrize("vehicle", ["husky", "warthog", "turtlebot3"])
@@ -206,16 +166,6 @@ def test_trap_11_a_controller_that_widens_the_track_is_found(drive: TakeThrough)
     both = told.slip("command").join(told.slip("measured"), on="stamp", suffix="_measured")
     steady = both.filter(~pl.col("transitory"))
     assert slope(steady["f_w"], steady["f_w_measured"]) == pytest.approx(1.0, abs=0.02)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("program", ["smooth", "slalom", "stop_and_go", "circle"])
-def test_trap_11_a_multiplier_shows_without_steady_steps(drive: TakeThrough, program: str) -> None:
-    clearpath = replace(VEHICLES["husky"], controller_track_multiplier=1.875)
-    driven = replace(LONGER, recording=Recording("husky_body_command"), program=Program(program))  # type: ignore[arg-type]
-    taken = drive(replace(driven, vehicle=clearpath))
-    assert taken.finding("controller_multiplier").value == pytest.approx(1.875, rel=0.05)
-    assert {"controller_multiplier", "command_scale"} & drive(driven).ids() == set()
 
 
 def test_trap_11_a_multiplier_that_the_controller_does_not_use_is_taken_back(drive: TakeThrough) -> None:
@@ -262,16 +212,6 @@ def test_trap_14_encoders_that_say_zero_are_dead(drive: TakeThrough) -> None:
     taken = drive(replace(FIELD, encoders=Encoders(gain=0.0, noise_radps=0.0)))
     assert taken.finding("wheels_dead").severity == "error"
     assert "not_moving" not in taken.ids()
-
-
-def test_trap_14_standing_under_live_commands_is_both(drive: TakeThrough) -> None:
-    stopped = replace(
-        FIELD, effects={"wheel_radius": 0.0}, encoders=Encoders(gain=0.0, noise_radps=0.0), duration_s=90.0
-    )
-    taken = drive(stopped)
-    assert {"wheels_dead", "not_moving"} <= taken.warned()
-    # Wheels that say zero have turned nothing.
-    assert "it covered 0 % of the " in taken.finding("not_moving").text
 
 
 @pytest.mark.parametrize(
@@ -366,16 +306,6 @@ def test_trap_21_a_dead_band_is_no_scale() -> None:
         assert found == pytest.approx(1.8, rel=0.05)
 
 
-def test_a_joint_state_without_wheels_is_left_out_and_the_command_serves(drive: TakeThrough) -> None:
-    arm = replace(FIELD, recording=Recording(replace(LAYOUTS["husky_body_command"], joints="shoulder")))
-    taken = drive(arm)
-    assert taken.finding("no_measured_wheels").where == "/joint_states"
-    assert set(taken.result.slip["input"]) == {"command"}
-    with pytest.raises(StageError, match="shoulder") as caught:
-        drive(arm, {"wheels": {"topic": "/joint_states"}})
-    assert caught.value.code == "no_wheels"
-
-
 @pytest.mark.parametrize("layout", ["ackermann", "ackermann_status", "ackermann_floats"])
 def test_a_car_is_read_from_every_form(drive: TakeThrough, layout: str) -> None:
     car = replace(PLAIN, vehicle=VEHICLES["car"], pose=ICP, recording=Recording(layout))
@@ -384,34 +314,3 @@ def test_a_car_is_read_from_every_form(drive: TakeThrough, layout: str) -> None:
     assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=0.02)
     assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=0.03)
     assert taken.warned() == set()
-
-
-@pytest.mark.parametrize(
-    "layout", ["warthog_platform", "wheel_float", "pose_stamped", "tf", "husky_joint_commands"]
-)
-def test_a_skid_steer_is_read_from_every_form(drive: TakeThrough, layout: str) -> None:
-    taken = drive(replace(PLAIN, pose=EXACT, recording=Recording(layout)))
-    steady = taken.slip("measured").filter(~pl.col("transitory"))
-    assert slope(steady["f_x"], steady["v_x"]) == pytest.approx(1.0, abs=0.02)
-    assert slope(steady["f_w"], steady["v_w"]) == pytest.approx(1.0, abs=0.03)
-
-
-def test_sides_that_are_read_in_turn_turn_as_the_vehicle_does() -> None:
-    """Encoders that a bus reads four times a second, left and right alternately, in a topic of 20 Hz."""
-    times = np.arange(0.0, 60.0, 0.05)
-    both = 5.0 + 3.0 * np.sin(0.7 * times)
-    rows = np.arange(times.size)
-    left, right = (both[np.maximum((rows - late) // 5 * 5 + late, 0)] for late in (0, 2))
-    wheels = pl.DataFrame({"t": times, "left": left, "right": right, "speed": None, "steering": 0.0})
-    read, (finding,) = interpolate_readings(wheels)
-    assert (finding.id, finding.value) == ("held_wheels", pytest.approx(0.25))
-    turning = (read["right_aligned"] - read["left_aligned"]).to_numpy()[10:-10]
-    assert np.abs(right - left).max() > 0.3
-    assert np.abs(turning).max() < 0.03
-    assert np.array_equal(read["left"], left)
-    assert read["speed_aligned"].null_count() == times.size
-
-
-def test_encoders_that_are_read_for_every_message_are_left_alone(drive: TakeThrough) -> None:
-    taken = drive(replace(FIELD, recording=Recording("husky")))
-    assert "held_wheels" not in {finding.id for finding in taken.findings}

@@ -13,10 +13,9 @@ from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 from pipeline.core import rigid
 from pipeline.run import Track
 from pipeline.run.signals import DriveSeries
-from pipeline.simulate import VEHICLES, Ground, Imu, Program, Recording
+from pipeline.simulate import VEHICLES, Ground, Program, Recording
 from pipeline.sources import Configuration
-from pipeline.stages.pose_topics import cut_track, normalize_quaternions, to_base_link
-from pipeline.stages.reading import PoseArrays
+from pipeline.stages.pose_topics import cut_track
 from pipeline.stages.timing import _take_off
 from pipeline.stages.velocity import compute_velocities
 
@@ -75,14 +74,6 @@ def test_trap_3_a_late_heading_is_found_and_said(drive: TakeThrough) -> None:
     assert taken.finding("heading_skew").value == pytest.approx(0.12, abs=0.03)
 
 
-@pytest.mark.parametrize("effects", [{}, {"clock_offset": 0.15}, {"drive_lag": 0.5}])
-def test_trap_3_what_delays_all_channels_alike_is_no_skew(
-    drive: TakeThrough, effects: dict[str, float]
-) -> None:
-    taken = drive(replace(FIELD, duration_s=120.0, effects={"drive_lag": 0.3, **effects}))
-    assert "heading_skew" not in taken.ids()
-
-
 def test_trap_4_a_motion_at_a_third_of_a_hertz_is_kept(drive: TakeThrough) -> None:
     # The slalom's turn is a sine of period 2 step_s: 0.36 Hz, where the published spline keeps a half.
     weave = replace(PLAIN, program=Program("slalom", step_s=1.0 / 0.72), pose=EXACT, effects={})
@@ -96,20 +87,6 @@ def test_trap_10_a_pose_of_the_lidar_is_moved_to_base_link(drive: TakeThrough) -
     taken = drive(replace(PLAIN, pose=mounted))
     assert taken.finding("child_frame").severity == "info"
     assert rms(taken.velocities["v_y"]) < 2e-3  # not moved, 0.5 m of arm gives 0.3 m/s in turns
-
-
-def test_trap_10_a_frame_that_nothing_places_is_said() -> None:
-    arrays = PoseArrays(np.zeros((2, 3)), np.array([[0.0, 0.0, 0.0, 1.0]] * 2), "map", "lidar")
-    same, (finding,) = to_base_link(arrays, [], "/pose")
-    assert same is arrays
-    assert (finding.id, finding.severity) == ("child_frame", "warning")
-    assert "'lidar'" in finding.text
-
-
-@pytest.mark.parametrize("child", ["", "base_link", "/base_link", "husky/base_link", "base_footprint"])
-def test_trap_10_base_link_is_known_under_its_usual_names(child: str) -> None:
-    arrays = PoseArrays(np.zeros((1, 3)), np.array([[0.0, 0.0, 0.0, 1.0]]), "map", child)
-    assert to_base_link(arrays, [], "/pose") == (arrays, [])
 
 
 def test_trap_10_a_chain_with_a_correction_dated_ahead_gives_the_pose(drive: TakeThrough) -> None:
@@ -127,17 +104,6 @@ def test_trap_12_invalid_poses_are_told_and_left_out(drive: TakeThrough) -> None
     assert taken.finding("bad_quaternion").count == 3
     assert np.isfinite(taken.velocities.select("v_x", "v_y", "v_w").to_numpy()).all()
     assert taken.velocities["segment"].n_unique() == 1
-
-
-def test_trap_12_quaternions_are_scaled_to_unit_length_and_that_is_said() -> None:
-    quaternion = np.array([[0.0, 0.0, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0], [0.0, 0.0, 0.0, 0.0], [np.nan] * 4])
-    unit, usable, findings = normalize_quaternions(quaternion, "/pose")
-    assert usable.tolist() == [True, True, False, False]
-    assert np.allclose(np.linalg.norm(unit[:2], axis=1), 1.0)
-    assert {finding.id: finding.count for finding in findings} == {
-        "quaternion_not_unit": 1,
-        "bad_quaternion": 2,
-    }
 
 
 def test_trap_12_a_yaw_that_wraps_is_no_jump_and_no_turn(drive: TakeThrough) -> None:
@@ -291,10 +257,3 @@ def test_a_short_hole_is_bridged_by_nothing_and_reported(drive: TakeThrough) -> 
     assert gap.value == pytest.approx(1.55, abs=0.06)
     times = taken.velocities["t"].to_numpy()
     assert int((np.diff(times) > 1.0).sum()) == 2
-
-
-def test_the_gyro_of_a_silent_stretch_is_unknown(drive: TakeThrough) -> None:
-    taken = drive(replace(PLAIN, imu=Imu(), recording=Recording(gaps=1, gap_s=3.0)))
-    known = taken.velocities.filter(pl.col("v_w_imu").is_not_null())
-    assert known.height > 0.9 * taken.velocities.height
-    assert rms(known["v_w_imu"].to_numpy() - known["v_w"].to_numpy()) < 0.05

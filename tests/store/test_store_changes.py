@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import os
 import shutil
-import tracemalloc
 from itertools import cycle
 from typing import TYPE_CHECKING
 
 import pytest
-from store_samples import make_slip, read_seed, write_generation
+from store_samples import write_generation
 
-from pipeline.core.untrusted import MOST_BYTES
 from pipeline.store import Store
-from pipeline.store.checksums import decode_checked, encode_checked
 from pipeline.store.names import Sample
 
 if TYPE_CHECKING:
@@ -203,114 +198,3 @@ def test_results_that_are_being_written_are_not_damaged(store: Store, start_writ
         looks += 1
     assert [writer.returncode for writer in writers] == [0, 0]
     assert looks > 5
-
-
-def test_pages_over_all_runs_are_said_to_have_no_checksum(filled: Store) -> None:
-    (filled.root / "comparison.html").write_text("another")
-    found = filled.examine()
-    assert (found.problems, found.unchecked) == ((), ("comparison.html",))
-
-
-def make_old(root: Path) -> None:
-    """Results as they were before there were checksums."""
-    for path in (*root.rglob("manifest.json"), *root.glob("batch/**/*.json")):
-        content = json.loads(path.read_bytes())
-        if content.pop("checksum", None):
-            path.write_text(json.dumps(content, indent=1, sort_keys=True))
-    for path in root.rglob(".generation"):
-        path.write_bytes(b"")
-
-
-def test_results_of_before_there_were_checksums_are_not_damaged(filled: Store) -> None:
-    make_old(filled.root)
-    found = filled.examine()
-    assert found.problems == ()
-    assert found.unchecked == ("comparison.html", f"runs/{RUN}/old/.generation")
-    assert filled.notes("batch/logs").read("log") == {"state": "done"}
-    assert read_seed(filled, RUN) == 2
-
-    write_generation(filled, RUN, "next", 4)
-    filled.prune(0)
-    found = filled.examine()
-    assert (found.problems, found.unchecked) == ((), ("comparison.html",))
-    path = filled.root / "runs" / OTHER / "key" / "summary.json"
-    path.write_text("x")
-    assert [problem.code for problem in filled.examine().problems] == ["file_damaged"]
-
-
-def seal_as_before(root: Path) -> None:
-    """Results as older versions left them: a list, the mark of a key, and signatures in markers."""
-    names = [*(f"runs/{run}/manifest.json" for run in (RUN, OTHER)), "comparison.html"]
-    (root / "listed").mkdir()
-    for number, name in enumerate(names):
-        entry = {"log": "", "path": name, "run": "", "sha256": ["0" * 64], "signature": "1" * 64}
-        (root / "listed" / f"{number:032x}.json").write_bytes(encode_checked(entry))
-    (root / "listed.json").write_bytes(encode_checked({"entries": {}}))
-    (root / "sealed.json").write_bytes(encode_checked({"key": "0" * 16}))
-    for path in root.rglob(".generation"):
-        path.write_bytes(encode_checked({**decode_checked(path.read_bytes()), "signature": "1" * 64}))
-
-
-def test_results_that_were_listed_and_sealed_are_read_verified_and_written(filled: Store) -> None:
-    seal_as_before(filled.root)
-    assert filled.examine().problems == ()
-    assert filled.examine().unchecked == ("comparison.html",)
-    assert read_seed(filled, RUN) == 2
-    (home_of(filled, RUN) / "old" / "summary.json").write_text("x")
-    (home_of(filled, OTHER) / "key" / "summary.json").write_text("x")
-    codes = {problem.run: problem.code for problem in filled.examine().problems}
-    assert codes == {RUN: "old_generation", OTHER: "file_damaged"}
-
-    for run in (RUN, OTHER):
-        write_generation(filled, run, "next", 4)
-    filled.prune(0)
-    assert filled.examine().problems == ()
-    assert read_seed(filled, OTHER) == 4
-
-
-def test_a_generation_made_again_in_the_place_of_a_deleted_one_is_not_pruned(store: Store) -> None:
-    manifest = write_generation(store, RUN, "k", 1)
-    shutil.rmtree(manifest.folder)
-    write_generation(store, RUN, "k", 2)
-    store.prune(0)
-    assert read_seed(store, RUN) == 2
-    assert store.examine().problems == ()
-
-
-def test_a_table_of_results_has_the_rows_that_broke_its_contract_last(store: Store) -> None:
-    store.write_results_table("slip", make_slip(RUN, 1))
-    broken = make_slip(RUN, 1).with_columns(modulus=-1.0)
-    store.write_results_table("slip", broken)
-    assert (store.root / "quarantine_slip.parquet").exists()
-    store.write_results_table("slip", make_slip(RUN, 2))
-    assert not (store.root / "quarantine_slip.parquet").exists()
-
-
-def test_a_note_that_was_changed_is_none(store: Store) -> None:
-    notes = store.notes("identities")
-    notes.write("log", {"sha256": "0" * 64, "size": 1})
-    path = notes.path_of("log")
-    assert notes.read("log") == {"sha256": "0" * 64, "size": 1}
-    path.write_bytes(path.read_bytes().replace(b'"size": 1', b'"size": 2'))
-    assert notes.read("log") is None
-    assert [problem.code for problem in store.examine().problems] == ["note_damaged"]
-
-
-def test_a_huge_note_is_none_and_is_not_read_whole(store: Store) -> None:
-    write_generation(store, RUN, "k", 1)
-    notes = store.notes("batch/logs")
-    notes.write("log", {"state": "done"})
-    manifest = home_of(store, RUN) / "manifest.json"
-    for path in (notes.path_of("log"), manifest):
-        os.truncate(path, 2 * 2**30)
-    tracemalloc.start()
-    assert notes.read("log") is None
-    assert list(notes.read_all()) == []
-    (error,) = store.survey().errors
-    found = store.examine()
-    assert tracemalloc.get_traced_memory()[1] < 4 * MOST_BYTES
-    tracemalloc.stop()
-    assert error.code == "too_large"
-    assert f"{manifest}: it has more than 32 MB" in str(error)
-    assert {problem.code for problem in found.problems} == {"note_damaged", "manifest_damaged"}
-    assert all("it has more than 32 MB" in problem.what for problem in found.problems)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 from typing import TYPE_CHECKING
 
 import pytest
@@ -13,7 +12,6 @@ from pipeline.store import Manifest, Store, StoreError, TableReport
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from pathlib import Path
 
     from pipeline.store import Generation
 
@@ -28,19 +26,6 @@ def test_looking_creates_nothing(store: Store) -> None:
     with pytest.raises(StoreError, match="no results of '2026/husky'"):
         store.read(RUN, "slip")
     assert not store.root.exists()
-
-
-def test_files_stand_where_scripts_expect_them(store: Store) -> None:
-    write_generation(store, RUN, "0123abcd", 5)
-    home = store.root / "runs" / "2026" / "husky"
-    manifest = json.loads((home / "manifest.json").read_text())
-    assert (manifest["run"], manifest["key"], manifest["details"]) == (RUN, "0123abcd", {"seed": 5})
-    for path in (home / "0123abcd", home / "latest"):
-        assert (path / "summary.json").read_text() == "5\n"
-        assert (path / "slip.parquet").exists()
-    table = manifest["tables"]["slip"]
-    assert table["file"] == "slip.parquet"
-    assert (table["rows"], table["quarantined"], table["rules"]) == (500, 0, {})
 
 
 def test_nothing_is_seen_before_the_commit_and_nothing_stays_without_one(store: Store) -> None:
@@ -134,16 +119,6 @@ def test_writing_twice_never_reaches_an_older_generation(
     assert first.path("summary.json").read_text() == "1\n"
 
 
-def test_closed_generation_refuses(store: Store) -> None:
-    with store.open_generation(RUN, "k") as generation:
-        generation.commit({})
-        for late in (lambda: generation.write_text("a.txt", ""), lambda: generation.commit({})):
-            with pytest.raises(StoreError) as caught:
-                late()
-            assert caught.value.code == "generation_closed"
-    assert store.manifest(RUN) is not None
-
-
 def test_stages_read_what_the_ones_before_wrote(store: Store) -> None:
     write_generation(store, RUN, "one", 1)
     with store.open_generation(RUN, "two") as generation:
@@ -158,13 +133,6 @@ def test_stages_read_what_the_ones_before_wrote(store: Store) -> None:
         generation.commit({})
     assert caught.value.code == "no_such_table"
     assert store.read(RUN, "windows").height == 498
-
-
-def test_nested_files_are_kept(store: Store) -> None:
-    with store.open_generation(RUN, "k") as generation:
-        generation.write_bytes("figures/slip.svg", b"<svg/>")
-        manifest = generation.commit({})
-    assert manifest.path("figures/slip.svg").read_bytes() == b"<svg/>"
 
 
 @pytest.mark.parametrize("details", [{"x": float("nan")}, {"x": {1, 2}}, {"x": b""}])
@@ -271,25 +239,3 @@ def test_damaged_table_says_what_to_do(store: Store) -> None:
     with pytest.raises(StoreError, match="--force") as caught:
         store.read(RUN, "slip")
     assert caught.value.code == "table_damaged"
-
-
-def test_latest_that_cannot_be_made_is_no_error(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise OSError("no links here")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(os, "symlink", refuse)
-        manifest = write_generation(store, RUN, "k", 1)
-    assert read_seed(store, RUN) == 1
-
-    (manifest.folder.parent / "latest").mkdir()
-    write_generation(store, RUN, "l", 2)
-    assert read_seed(store, RUN) == 2
-    assert not list(store.root.rglob(".tmp-*"))
-
-
-def test_counts_of_the_quarantine_survive_a_round_trip(store: Store, tmp_path: Path) -> None:
-    with store.open_generation(RUN, "k") as generation:
-        generation.write_table("windows", break_windows(make_windows(RUN, 1)))
-        written = generation.commit({"log": {"path": str(tmp_path), "size": 1}, "ä": [None, True, 1.5]})
-    assert store.manifest(RUN) == written

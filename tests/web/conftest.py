@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+from stored import make_once
 from workbench_server import TRACK, Workbench
 
 from pipeline.job import Options
@@ -19,19 +20,20 @@ if TYPE_CHECKING:
 
 @pytest.fixture(scope="session")
 def hidden_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A log of a vehicle that turns as if its wheels stood 1.6 times as far apart."""
-    folder = tmp_path_factory.mktemp("logs") / "field"
-    folder.mkdir()
-    out = folder / "hidden.mcap"
-    return simulate_case(None, {"effective_track": TRACK}, out=out, seed=3, duration_s=90.0)
+    """A log of a vehicle that turns as if its wheels stood 1.6 times as far apart, beside its results."""
+    return make_once(tmp_path_factory, "workbench", _analyze) / "field" / "hidden.mcap"
+
+
+def _analyze(folder: Path) -> None:
+    out = folder / "field" / "hidden.mcap"
+    simulate_case(None, {"effective_track": TRACK}, out=out, seed=3, duration_s=90.0)
+    analyze_log(out, Options(out=folder / "results", overrides={"vehicle": {"preset": "husky_a200"}}))
 
 
 @pytest.fixture(scope="session")
 def analyzed(hidden_log: Path) -> Path:
-    """Results of that log."""
-    results = hidden_log.parents[1] / "results"
-    analyze_log(hidden_log, Options(out=results, overrides={"vehicle": {"preset": "husky_a200"}}))
-    return results
+    """Results of that log, to read only."""
+    return hidden_log.parents[1] / "results"
 
 
 @pytest.fixture

@@ -14,7 +14,6 @@ from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_fo
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import find_peers
 from pipeline.logs.writer import LogWriter
 from pipeline.report import theme
 from pipeline.simulate import simulate_case
@@ -99,118 +98,6 @@ def test_without_the_token_the_page_is_a_sentence_and_with_it_stays_open(
     look_for_trouble(chrome)
 
 
-def count_marks(figure: str, pane: str = "a") -> str:
-    """How many marked spans or points a figure shows."""
-    kinds = "path[stroke='#00b3d6'], path[fill='#00b3d6']"
-    plot = f"[data-slot={pane}] [data-figure={figure}]"
-    return f"document.querySelector('{plot}').querySelectorAll(\"{kinds}\").length"
-
-
-@pytest.mark.long
-def test_the_signature_of_an_effect_comes_goes_and_follows_its_value(
-    chrome: Chrome, workbench: Workbench, pictures: Path
-) -> None:
-    drawn = "document.querySelector('.plot.drawn[data-figure=signature] .mark-line path')"
-    gone = "!document.querySelector('[data-figure=signature]')"
-    # How far the curve stands out of its panel [px].
-    outside = (
-        "(() => { const line = document.querySelector('[data-figure=signature] .mark-line path');"
-        " const panel = line.closest('.mark-group').querySelector('.background').getBoundingClientRect();"
-        " const { top, bottom } = line.getBoundingClientRect();"
-        " return Math.max(panel.top - top, bottom - panel.bottom); })()"
-    )
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    before = cast("float", chrome.run(ERROR))
-    assert chrome.run(gone)
-    chrome.click("[data-tab=effects]")
-    chrome.wait(f"document.querySelector('.plot.drawn[data-figure=ladder]') && {SHOWN}")
-    # What stands there when the number has begun to move: the figures are still those of before.
-    chrome.run(
-        "new MutationObserver((_, watch) => { window.first ??= "
-        f"{gone}; watch.disconnect(); }}).observe(document.querySelector('.number.r .value'),"
-        " { childList: true, characterData: true, subtree: true })"
-    )
-    # No other figure is drawn anew: what a person looks at does not flicker.
-    chrome.run(
-        "window.still = document.querySelector('.plot[data-figure=paths] svg'),"
-        " window.whole = document.querySelector('figure[data-id=ladder]')"
-    )
-    chrome.click(".proposals li[data-effect=effective_track] .add")
-    chrome.wait(drawn)
-    assert chrome.run("window.first") is True
-    assert chrome.run("window.still.isConnected && window.whole.isConnected") is True
-    chrome.wait(f"{ERROR} < {0.1 * before}")
-    chrome.picture(pictures / "workbench_signature.png", whole=True)
-    assert cast("float", chrome.run(outside)) < 1.0
-
-    # While the slider is held at its end the axis grows with the curve; at the neutral value there is none.
-    shape = f"{drawn}.getAttribute('d')"
-    ticks = "document.querySelector('.plot[data-figure=signature]').textContent"
-    fitted = f"{json.dumps(chrome.run(shape))} + {json.dumps(chrome.run(ticks))}"
-    slide = (
-        "(() => {{ const input = document.querySelector('.slider input'); input.step = 'any';"
-        " input.value = {}; for (const kind of {}) input.dispatchEvent(new Event(kind)); }})()"
-    )
-    chrome.run(slide.format("input.min", "['input']"))
-    chrome.wait(f"{drawn} && {shape} + {ticks} !== {fitted}")
-    assert cast("float", chrome.run(outside)) < 1.0
-    chrome.run(slide.format("1", "['input']"))
-    chrome.wait(f"{drawn}.getBBox().height === 0")
-    look_for_trouble(chrome)
-    chrome.run(slide.format("1", "['change']"))
-    chrome.wait(gone)
-    chrome.click(".undo")
-    chrome.wait(drawn)
-    chrome.click(".switch")
-    chrome.wait(gone)
-    chrome.click(".switch")
-    chrome.wait(drawn)
-    look_for_trouble(chrome)
-
-
-@pytest.mark.long
-def test_a_stretch_that_is_brushed_shows_on_the_map_and_in_command_space(
-    chrome: Chrome, workbench: Workbench, pictures: Path
-) -> None:
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    chrome.wait(SHOWN)
-    chrome.wait(
-        "document.querySelectorAll('.plot.drawn').length === document.querySelectorAll('.plot').length"
-    )
-    before = {name: chrome.run(count_marks(name)) for name in ("trajectory", "command_space", "reach")}
-    chrome.drag("[data-figure=reach] svg", (0.3, 0.5), (0.5, 0.5))
-    chrome.wait("!document.querySelector('.marked').hidden")
-    assert "highest slip" in str(chrome.run("document.querySelector('.marked').textContent"))
-    for name, count in before.items():
-        chrome.wait(f"{count_marks(name)} > {count}")
-    chrome.picture(pictures / "workbench_brushed.png", whole=True)
-    # The mark outlives a change of the model.
-    chrome.click(".proposals .add")
-    chrome.wait(
-        "document.querySelector('.card') && !document.querySelector('.pane').classList.contains('busy')"
-    )
-    chrome.wait(f"{count_marks('trajectory')} > {before['trajectory']}")
-
-    # A box on the map marks the times the vehicle was there; beside it the same run follows.
-    chrome.click("#compare")
-    chrome.wait("document.querySelector('[data-slot=b]')?.dataset.drawn")
-    chrome.drag("[data-slot=a] [data-figure=trajectory] svg", (0.3, 0.3), (0.8, 0.8))
-    chrome.wait(f"{count_marks('reach', 'b')} > {before['reach']}")
-    chrome.press("Escape", 27)
-    chrome.wait("[...document.querySelectorAll('.marked')].every((bar) => bar.hidden)")
-    chrome.wait(f"{count_marks('trajectory')} === {before['trajectory']}")
-
-    # And by numbers.
-    chrome.run("document.querySelector('.mark-from').value = '10'")
-    chrome.run("document.querySelector('.mark-to').value = '20'")
-    chrome.click(".mark-set")
-    chrome.wait("document.querySelector('.marked').textContent.includes('20.0 s: 10.0 s, highest slip')")
-    look_for_trouble(chrome)
-
-
 @pytest.mark.long
 def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path) -> None:
     log = tmp_path / "field" / "late.mcap"
@@ -257,42 +144,6 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     assert chrome.run("document.querySelector('select.catalogue').selectedIndex") == 0
     errors = [text for text in chrome.errors if "422" not in text]
     assert errors == []
-
-
-@pytest.mark.long
-def test_a_run_stands_beside_those_that_its_report_does(chrome: Chrome, workbench: Workbench) -> None:
-    store = Store(workbench.results)
-    manifest = store.manifest(RUN)
-    assert manifest is not None
-    own = json.loads(manifest.path("summary.json").read_text()) | {"terrain": "ice", "dataset": "husky_ice"}
-    manifest.path("summary.json").write_text(json.dumps(own))
-    doubtful = [{"id": "not_moving", "severity": "error", "text": "it does not move"}]
-    others: list[dict[str, object]] = [
-        {"median_modulus": 0.0, "log": {"sha256": "low"}},
-        {"median_modulus": 9.0, "log": {"sha256": "high"}},
-        {"median_modulus": 9.0, "log": {"sha256": "high"}},
-        {"median_modulus": 0.0, "log": own["log"]},
-        {"median_modulus": 0.0, "log": {"sha256": "still"}, "findings": doubtful},
-        {"median_modulus": 0.0, "log": {"sha256": "scaled"}, "length_scale_m": 0.5},
-        {"median_modulus": 0.0, "log": {"sha256": "grass"}, "dataset": "husky_grass"},
-    ]
-    for number, other in enumerate(others):
-        summary = {**own, "findings": [], "run": f"field/other_{number}", **other}
-        with store.open_generation(f"field/other_{number}", "0" * 16) as generation:
-            generation.write_text("summary.json", json.dumps(summary))
-            generation.commit({"dataset": summary["dataset"], "log": summary["log"]})
-    assert len(find_peers(store, own)[own["leading_input"]]) == 2
-    chrome.size(LAPTOP, 900)
-    chrome.open(workbench.address)
-    # Runs that cannot be fitted are passed over.
-    chrome.wait(SHOWN)
-    chrome.errors.clear()
-    chrome.run(f"location.hash = 'a={RUN}'")
-    chrome.run("location.reload()")
-    chrome.wait(f"document.querySelector('.title h2')?.textContent === '{RUN}' && {SHOWN}")
-    facts = str(chrome.run("document.querySelector('.hero .facts').textContent"))
-    assert "vs 2 runs of husky_ice: more slip than 1" in facts
-    look_for_trouble(chrome)
 
 
 @pytest.mark.parametrize(

@@ -5,18 +5,14 @@ from __future__ import annotations
 import http.client
 import json
 import secrets
-import socket
 from typing import TYPE_CHECKING
 
 import pytest
-from workbench_server import LIMITS, RUN, TOKEN
+from workbench_server import RUN, TOKEN
 
-from pipeline.web import Guard, WorkbenchError, make_token, strip_port
-from pipeline.web.server import serve
+from pipeline.web import Guard, make_token
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
     from workbench_server import Workbench
 
 
@@ -187,30 +183,6 @@ def test_a_body_that_is_too_long_is_not_read_to_its_end(workbench: Workbench) ->
     assert workbench.refuse("/api/session", run=RUN, formula="x" * 200_000)["code"] == "bad_request"
 
 
-def test_ports_are_stripped_from_hosts() -> None:
-    assert strip_port("LocalHost:80") == "localhost"
-    assert strip_port("[::1]:8321") == "[::1]"
-    assert strip_port("127.0.0.1") == "127.0.0.1"
-
-
-def test_a_taken_port_is_named(tmp_path: Path) -> None:
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(WorkbenchError, match="--port") as caught:
-            serve(tmp_path, host="127.0.0.1", port=port, notify=lambda *_: None, limits=LIMITS)
-    assert caught.value.code == "port_taken"
-
-
-@pytest.mark.parametrize("port", [99999, -1])
-def test_a_port_that_cannot_be_is_named(tmp_path: Path, port: int) -> None:
-    with pytest.raises(WorkbenchError, match="0 to 65535") as caught:
-        serve(tmp_path, host="127.0.0.1", port=port, notify=lambda *_: None, limits=LIMITS)
-    assert caught.value.code == "no_such_port"
-    assert str(port) in caught.value.where
-
-
 def test_the_cookie_that_follows_links_opens_stored_pages_and_nothing_else(workbench: Workbench) -> None:
     path = workbench.address.removeprefix(workbench.origin)
     _, headers, _ = workbench.request("GET", path, known=False)
@@ -235,15 +207,3 @@ def test_the_cookie_that_follows_links_opens_stored_pages_and_nothing_else(workb
     status, _, body = workbench.request("GET", "/runs/../../report.html", known=False, headers=cookie)
     assert status >= 400
     assert b"not of the results" not in body
-
-
-@pytest.mark.parametrize(
-    "name",
-    ["runs/%00", "runs/a%00/report.html", "plans/%00/plan.html", "runs/%0a/report.html", "runs//report.html",
-     "runs/%2e%2e/%2e%2e/report.html", "runs/%5c../report.html", f"runs/{'x' * 300}/report.html",
-     f"runs/{'x/' * 3000}report.html", "runs/%ff/report.html", "runs/%ed%a0%80/report.html", "runs/nowhere"],
-    ids=lambda name: name[:30],
-)  # fmt: skip
-def test_a_page_that_no_results_can_have_is_not_found(workbench: Workbench, name: str) -> None:
-    status, _, _ = workbench.request("GET", f"/{name}")
-    assert status == 404

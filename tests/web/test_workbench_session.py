@@ -10,7 +10,6 @@ from typing import cast
 import pytest
 from workbench_server import RUN, TRACK, Workbench
 
-from pipeline.core import SlipError
 from pipeline.models import read_model
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
@@ -45,17 +44,6 @@ def test_the_hidden_effect_makes_the_error_fall_and_undo_brings_it_back(workbenc
     assert errors(workbench.session(RUN, "redo")) == errors(added)
 
 
-def test_the_ladder_has_a_rung_for_each_effect_in_the_order_of_adding(workbench: Workbench) -> None:
-    workbench.session(RUN, "add", effect="drive_lag", anyway=True)
-    workbench.session(RUN, "add", effect="effective_track")
-    drawn = workbench.post("/api/rows", run=RUN)
-    ladder = cast("dict[str, dict[str, dict[str, object]]]", drawn["rows"])["ladder"]
-    assert ladder["step"]["levels"] == ["ideal", "+ drive_lag", "+ effective_track"]
-
-    dropped = workbench.session(RUN, "drop", effect="drive_lag")
-    assert [effect["id"] for effect in effects(dropped)] == ["effective_track"]
-
-
 def test_an_effect_that_is_switched_off_and_on_again_has_the_same_errors(workbench: Workbench) -> None:
     workbench.session(RUN, "add", effect="drive_lag", anyway=True)
     added = workbench.session(RUN, "add", effect="effective_track")
@@ -64,15 +52,6 @@ def test_an_effect_that_is_switched_off_and_on_again_has_the_same_errors(workben
 
     assert errors(switched_off)["r"] > 2.0 * errors(added)["r"]
     assert errors(switched_on) == errors(added)
-
-
-def test_a_value_set_by_hand_is_scored_and_not_fitted(workbench: Workbench) -> None:
-    added = workbench.session(RUN, "add", effect="effective_track")
-    wrong = workbench.session(RUN, "set", effect="effective_track", parameter="k", value=1.2)
-    assert value(wrong) == 1.2
-    assert errors(added)["r"] < errors(wrong)["r"] < errors(wrong, "ideal")["r"]
-
-    assert value(workbench.session(RUN, "fit")) == pytest.approx(TRACK, rel=0.01)
 
 
 def test_everything_is_there_again_after_the_server_was_started_anew(results: Path) -> None:
@@ -93,31 +72,6 @@ def test_a_damaged_session_is_begun_anew(workbench: Workbench, content: bytes) -
     (workbench.results / "workbench/desks/a/field/hidden.json").write_bytes(content)
     assert workbench.refuse("/api/save", run=RUN)["code"] == "no_such_desk"
     assert effects(workbench.session(RUN)) == []
-
-
-@pytest.mark.parametrize("folder", ["models", "desks/a", "uploads"])
-def test_no_link_in_the_results_leads_what_is_kept_outside(
-    results: Path, tmp_path: Path, folder: str
-) -> None:
-    """The results may be a stranger's: no link in them chooses which file a model takes the place of."""
-    victim = tmp_path / "victim"
-    victim.mkdir()
-    for name in ("hidden.toml", "hidden.json"):
-        (victim / name).write_text("precious")
-    link = results / "workbench" / (folder if folder == "uploads" else f"{folder}/field")
-    link.parent.mkdir(parents=True)
-    link.symlink_to(victim, target_is_directory=True)
-    if folder == "uploads":
-        with pytest.raises(SlipError, match="leads out of its folder"):
-            Workbench(results)
-    else:
-        server = Workbench(results)
-        assert server.refuse("/api/session", run=RUN, action="open")["code"] == "path_outside"
-        server.close()
-    assert {path.name: path.read_text() for path in victim.iterdir()} == {
-        "hidden.toml": "precious",
-        "hidden.json": "precious",
-    }
 
 
 def test_working_on_a_model_leaves_the_run_byte_for_byte(workbench: Workbench) -> None:
