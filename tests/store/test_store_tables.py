@@ -18,7 +18,7 @@ from pipeline.store import Store, StoreError
 from pipeline.store.parquet_tables import check_table, encode_parquet, schema_of
 from schemas import Contract, Table, list_contracts
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "fixtures"
 
 
 class Everything(Table):
