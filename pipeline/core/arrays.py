@@ -201,12 +201,6 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
     return np.stack([np.interp(at, times, column) for column in values.T], axis=-1)
 
 
-def fit_rising(values: Floats) -> Floats:
-    """Least squares fit that never falls, shape (n,)."""
-    fitted: Floats = scipy.optimize.isotonic_regression(values).x
-    return fitted
-
-
 def integrate_rate(times: Floats, rate: Floats) -> Floats:
     """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
     return np.asarray(scipy.integrate.cumulative_trapezoid(rate, times, initial=0.0))
@@ -344,11 +338,6 @@ def student_quantile(level: float, freedom: float) -> float:
     return float(scipy.special.stdtrit(freedom, (1.0 + level) / 2.0)) if freedom > 0.0 else math.nan
 
 
-def normal_tail(deviations: Floats) -> Floats:
-    """Upper tail probability of the standard normal distribution, shape (n,)."""
-    return np.asarray(scipy.special.ndtr(-deviations))
-
-
 def jackknife_deviation(without: Floats) -> float:
     """Standard error of an estimate by the delete-one jackknife.
 
@@ -368,8 +357,5 @@ def solve_banded(matrix: Floats, right: Floats) -> Floats:
             i < k; shape (1 + bandwidth, n).
         right: right-hand side, shape (n,).
     """
-    count = right.size
-    lower = np.zeros((min(matrix.shape[0], count), count))
-    for below, diagonal in enumerate(matrix[:count]):
-        lower[below, : count - below] = diagonal[below:]
-    return np.asarray(scipy.linalg.solveh_banded(lower, right, lower=True))
+    # Lower diagonals by row are upper diagonals by column.
+    return np.asarray(scipy.linalg.solveh_banded(matrix[: right.size][::-1], right))

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import nnls
+from scipy.optimize import isotonic_regression, nnls
 
-from pipeline.core.arrays import Flags, Floats, Ints, fit_rising, guarded_spreads
+from pipeline.core.arrays import Flags, Floats, Ints, guarded_spreads
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.parts import CLIP, average_lags, find_live
@@ -433,7 +433,9 @@ def _smooth_falling(shares: Floats) -> Floats:
     known = np.flatnonzero(np.isfinite(shares))
     if not known.size:
         return np.ones(shares.size)
-    smooth: Floats = np.interp(np.arange(shares.size), known, -fit_rising(-shares[known]))
+    smooth: Floats = np.interp(
+        np.arange(shares.size), known, isotonic_regression(shares[known], increasing=False).x
+    )
     return smooth
 
 

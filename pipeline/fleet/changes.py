@@ -20,8 +20,9 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+from scipy.special import ndtr
 
-from pipeline.core.arrays import Flags, Floats, normal_tail
+from pipeline.core.arrays import Flags, Floats
 from pipeline.fleet.levels import weigh_run_spreads
 
 CHANCE = 0.02
@@ -164,7 +165,7 @@ class Asked:
 
     def weigh_tail(self, size: float) -> float:
         """Probability of a difference above a size."""
-        return float(self.chances @ normal_tail(size / self.deviations))
+        return float(self.chances @ ndtr(-size / self.deviations))
 
     @property
     def p(self) -> float:

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.optimize import isotonic_regression
 
 from pipeline.core.arrays import (
     ROUNDING_S,
@@ -14,7 +15,6 @@ from pipeline.core.arrays import (
     Flags,
     Floats,
     Ints,
-    fit_rising,
     join_parts,
     robust_spread,
     solve_banded,
@@ -480,7 +480,7 @@ def _list_terms(track: Track) -> Floats:
 def _take_off(track: Track, ages: Floats) -> Floats:
     """Stamps minus the ages, changed as little as their order and the way between poses require."""
     least = np.append(0.0, np.cumsum(_find_least_waits(track)))
-    ordered: Floats = fit_rising(track.times - ages - least) + least
+    ordered: Floats = isotonic_regression(track.times - ages - least).x + least
     return ordered
 
 
