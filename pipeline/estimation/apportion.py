@@ -127,8 +127,8 @@ def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[Sli
     known[frozenset()] = judgement.ideal.held_out
     # Models with the same first effects are adjacent, so that their common prediction is computed once.
     asked = sorted(list_subsets(players) - known.keys(), key=lambda one: [p in one for p in players])
-    models = [fitted.state.drop([name for name in players if name not in one]) for one in asked]
-    known |= {one: score(problem, model) for one, model in zip(asked, models, strict=True)}
+    for one in asked:
+        known[one] = score(problem, fitted.state.drop([name for name in players if name not in one]))
     stretches = _find_stretches(problem)
     losses = {one: _sum_stretches(problem, stretches, held, length_scale_m) for one, held in known.items()}
     split = share_out(players, losses)

@@ -217,11 +217,10 @@ def hold_out(problem: Problem, fitted: Fitted, learn: Learn | None = None) -> He
         fitted: the fit.
         learn: given the fitted state and the training windows, the effects to add to each run by its number.
     """
-    scored = [_score_fold(problem, fitted, learn, fold) for fold in range(len(problem.training))]
     residuals = np.full((problem.whole.run.size, 3), np.nan)
     errors = [np.full((2, c.horizons.number.size), np.nan) for c in problem.comparisons]
-    for fold, (held, reached) in zip(problem.folds, scored, strict=True):
-        residuals[fold.test] = held
+    for number, fold in enumerate(problem.folds):
+        residuals[fold.test], reached = _score_fold(problem, fitted, learn, number)
         for run, (rows, near) in enumerate(reached):
             errors[run][:, rows] = near
     return summarize(problem, residuals, [one[0] for one in errors], [one[1] for one in errors])

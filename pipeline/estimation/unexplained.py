@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.core.arrays import Bytes, Flags, Floats, student_quantile
+from pipeline.core.arrays import Flags, Floats, student_quantile
 from pipeline.estimation.acceptance import DECIDED_T, LEAST_TURN_RAD, LEAST_WAY_SHARE, compare_rivals
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.diagnosis import Json, Unexplained
@@ -203,21 +203,16 @@ def measure_asked(selection: Selection) -> Floats:
 
 def _boost(part: Part, rest: Floats, features: Floats, channels: Sequence[int]) -> Floats:
     """What trees that have not seen a stretch predict of residuals there, shape (n, 3)."""
-    asked = [(fold, channel) for fold in range(_FOLDS) for channel in channels]
-    bins = bin_features(features)
-    stretch, predicted = part.number_stretches(_STRETCH_S), np.zeros(rest.shape)
-    for fold, channel in asked:
-        predicted[stretch % _FOLDS == fold, channel] = _boost_fold(part, rest, bins, (fold, channel))
+    bins, stretch = bin_features(features), part.number_stretches(_STRETCH_S)
+    predicted = np.zeros(rest.shape)
+    for fold in range(_FOLDS):
+        test = stretch % _FOLDS == fold
+        train = ~test & ~find_near(part, part, test)
+        if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
+            continue
+        for channel in channels:
+            predicted[test, channel] = boost(bins[train], rest[train, channel], bins[test])
     return predicted
-
-
-def _boost_fold(part: Part, rest: Floats, bins: Bytes, asked: tuple[int, int]) -> Floats:
-    """What is predicted in one fold of one channel, which are asked for in this order."""
-    test = part.number_stretches(_STRETCH_S) % _FOLDS == asked[0]
-    train = ~test & ~find_near(part, part, test)
-    if not test.any() or train.sum() < 50:  # noqa: PLR2004 - too few to learn from
-        return np.zeros(int(test.sum()))
-    return boost(bins[train], rest[train, asked[1]], bins[test])
 
 
 def is_explainable(explainable: Explainable) -> bool:
