@@ -132,9 +132,9 @@ def _write_mcap(plan: Plan, path: Path) -> None:
         schema = writer.register_msgdef(plan.type_name, definition)
         for number, row in enumerate(zip(plan.commands.times, *_list_values(plan), strict=True)):
             at = _START_NS + round(float(row[0]) * _SECOND)
+            header = {"header": {"stamp": {"sec": at // _SECOND, "nanosec": at % _SECOND}}}
             for topic, message in zip(topics, row[1:], strict=True):
-                stamped = {"header": {"stamp": _split_time(at)}, **message}
-                writer.write_message(topic, schema, stamped, at, at, number)
+                writer.write_message(topic, schema, header | message, at, at, number)
         writer.add_metadata("safety", {"text": " ".join(SAFETY)})
 
 
@@ -157,10 +157,6 @@ def _nest(values: Mapping[str, float]) -> dict[str, object]:
             inner = inner.setdefault(key, {})
         inner[name] = value
     return message
-
-
-def _split_time(at_ns: int) -> dict[str, int]:
-    return {"sec": at_ns // _SECOND, "nanosec": at_ns % _SECOND}
 
 
 def _format_csv(plan: Plan) -> str:
