@@ -7,41 +7,19 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 from verbs import run_program, run_verb
 
-from pipeline.logs.writer import LogWriter
 from pipeline.simulate import simulate_case
-
-START = 1_700_000_000_000_000_000
 
 
 @pytest.fixture(scope="module")
 def field(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of good and bad logs."""
+    """A folder with a whole log and one that was cut."""
     folder = tmp_path_factory.mktemp("field")
     simulate_case("husky_tile", out=folder / "good.mcap", duration_s=30.0)
     whole = (folder / "good.mcap").read_bytes()
     (folder / "truncated.mcap").write_bytes(whole[: len(whole) * 2 // 3])
-    (folder / "empty.mcap").write_bytes(b"")
-    (folder / "text.mcap").write_text("this is no recording\n" * 100)
-    stamps = START + np.arange(200, dtype=np.int64) * 50_000_000
-    pose = {"pose.pose.position.x": np.arange(200) * 0.02, "pose.pose.orientation.w": np.ones(200)}
-    with LogWriter(folder / "no_pose.mcap") as log:
-        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
-        log.write_columns("/cmd_vel", "geometry_msgs/msg/Twist", stamps, {"linear.x": np.ones(200)})
-    with LogWriter(folder / "no_command.mcap") as log:
-        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile"})
-        log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
-    with LogWriter(folder / "only_images.mcap") as log:
-        log.write_columns("/camera", "std_msgs/msg/String", stamps, {"data": "an image"})
-    with LogWriter(folder / "no_vehicle.mcap") as log:
-        for side in ("left", "right"):
-            log.write_columns(f"/{side}_drive/velocity", "std_msgs/msg/Float64", stamps, {"data": 0.0})
-        log.write_columns("/odom", "nav_msgs/msg/Odometry", stamps, pose, header_time=stamps)
-    with LogWriter(folder / "no_messages.mcap") as log:
-        log.metadata("deployment", {"vehicle": "husky_a200", "terrain": "tile", "note": "one:\n  - two"})
     return folder
 
 
