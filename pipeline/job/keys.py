@@ -89,6 +89,8 @@ def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> L
     _require_messages(index)
     chosen = choose(index, configuration, options.overrides)
     _require_sources(chosen.sources, index, options)
+    if chosen.recording is not None:
+        configuration = chosen.recording.configuration
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"

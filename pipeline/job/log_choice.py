@@ -16,7 +16,9 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 
+from pipeline.core import format_share
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -61,11 +63,13 @@ from pipeline.sources.candidates import LOCALIZED
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
-from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.extract import Extracted
 from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
+from pipeline.sources.configuration import RANGES
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
+    from pipeline.recording import Geometry, Recording
     from pipeline.stages.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
@@ -152,6 +156,7 @@ class Choice:
         findings: findings on the choice.
         data: data read for the choice; None if names were sufficient.
         extracted: tables of the stage `extract`, if the choice needed them; ``data`` then has no columns.
+        recording: what the signals show; None without a pose.
     """
 
     vehicle: Vehicle
@@ -161,6 +166,7 @@ class Choice:
     findings: tuple[Finding, ...] = ()
     data: LogData | None = None
     extracted: Extracted | None = None
+    recording: Recording | None = None
 
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
         """The documented keys ``choices`` and ``vehicle_source``.
@@ -248,12 +254,12 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
     fits = (
         problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
     )
-    if rivals or fits or _may_be_odometry(sources.pose):
+    if sources.pose is not None:
         chosen = _compare(chosen, index, configuration, rivals)
     # Missing data are reported before an unknown vehicle.
     if problem is None or not fits:
         return _release_columns(chosen)
-    return _fit_vehicle(chosen, configuration, problem, known, where)
+    return _fit_vehicle(chosen, configuration, problem, known)
 
 
 MOST_POSES = 40
@@ -414,26 +420,52 @@ def _list_contradictions(
 def _compare(
     chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
-    from pipeline.stages.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - where several compete
+    """Choose among the poses by their content, then the other roles by the motion of the pose."""
+    from pipeline.recording import examine  # noqa: PLC0415 - heavy
+    from pipeline.stages.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
-    data = read_topics(index, list_wanted(chosen.sources, index.types, rivals))
-    ratings = rate_poses(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
-    findings = chosen.findings
-    if ratings and ratings[0].from_wheels:
-        text = (
-            "the pose comes from the wheels, so forward slip is not observable: "
-            f"{ratings[0].source} is computed from them, and the log has no other pose"
-        )
-        findings += (Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)),)
-    sources = replace_pose(chosen.sources, ratings)
-    if sources.wheels != chosen.sources.wheels:
-        # The topic that is no pose after all measures the wheels, by fields that were not read of it.
-        data = read_topics(index, list_wanted(sources, index.types, rivals))
-    # Candidates are rated without intervals, and with the wheels that were chosen by name.
-    as_rated = sources.interval is None and sources.wheels == chosen.sources.wheels
+    drives = [
+        one
+        for role in ("command", "wheels")
+        for one in chosen.sources.others.get(role, ())
+        if isinstance(one, DriveSource)
+    ]
+    data = read_topics(index, list_wanted(chosen.sources, index.types, [*rivals, *drives]))
+    sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
+    if rivals or _may_be_odometry(sources.pose):
+        ratings = rate_poses(data, sources, configuration, chosen.vehicle, where=str(index.path))
+        if ratings and ratings[0].from_wheels:
+            text = (
+                "the pose comes from the wheels, so forward slip is not observable: "
+                f"{ratings[0].source} is computed from them, and the log has no other pose"
+            )
+            findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
+        sources = replace_pose(sources, ratings)
+    recording = examine(
+        data,
+        sources,
+        configuration,
+        chosen.vehicle,
+        is_known=chosen.vehicle.id != UNKNOWN_VEHICLE,
+        where=str(index.path),
+    )
+    # Candidates are rated as recorded, without intervals, and with the wheels that were chosen by name.
+    roles = recording.sources.command, recording.sources.wheels
+    as_rated = (
+        recording.configuration == configuration
+        and sources.interval is None
+        and roles == (chosen.sources.command, chosen.sources.wheels)
+    )
     made = ratings[0].made if ratings and as_rated else None
-    ratings = tuple(replace(rating, made=None) for rating in ratings)
-    return replace(chosen, sources=sources, ratings=ratings, findings=findings, data=data, extracted=made)
+    return replace(
+        chosen,
+        sources=recording.sources,
+        ratings=tuple(replace(rating, made=None) for rating in ratings),
+        findings=(*findings, *recording.findings),
+        data=data,
+        extracted=made,
+        recording=recording,
+    )
 
 
 def _release_columns(chosen: Choice) -> Choice:
@@ -448,83 +480,167 @@ def _fit_vehicle(
     configuration: Configuration,
     problem: ConfigurationError,
     recorded: Mapping[str, float],
-    where: str,
 ) -> Choice:
-    """Estimate the geometry of an unidentified vehicle from command, wheels and pose.
+    """Geometry of an unidentified vehicle: what is given, else recorded, else what its signals show.
 
     Args:
-        chosen: choice with a placeholder of unit geometry, and the columns that were read.
+        chosen: choice with a placeholder of unit geometry, and the recording.
         configuration: configuration of the user.
-        problem: error to raise if the data are insufficient.
-        recorded: geometry recorded in the log, which has priority.
-        where: the log.
+        problem: error to raise if wheels have no known radius, and nothing else drives the vehicle.
+        recorded: geometry recorded in the log.
     """
-    sources, vehicle, data = chosen.sources, chosen.vehicle, chosen.data
-    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
-    values: dict[str, float] = {}
-    # Body motion does not depend on the wheels.
-    drive = next((one for one in drives if one.form is not DriveForm.BODY), None)
-    if not drives or data is None:
+    recording, sources = chosen.recording, chosen.sources
+    if recording is None or chosen.data is None:
         raise problem
-    if configuration.vehicle.kind is None and find_sideways_share(data.topics, sources.command):
+    given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
+    kind = str(given.get("kind") or recording.kind or chosen.vehicle.kind)
+    if "kind" not in given and find_sideways_share(chosen.data.topics, sources.command):
         # The arrangement of the rollers is unknown: only body motion can be evaluated.
-        vehicle, drive = msgspec.structs.replace(vehicle, kind="omni"), None
-    if drive is None:
-        name = "fitted_body"
+        kind = "omni"
+    known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
+    fitted = _list_lengths(recording.geometry, kind)
+    values = {key: value for key, value in {**fitted, **known}.items() if key in _LENGTHS}
+    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    is_body = all(drive.form is DriveForm.BODY for drive in drives)
+    findings = list(chosen.findings)
+    if not is_body and kind == "differential" and "wheel_radius_m" not in values:
+        if sources.command is None or sources.command.form is not DriveForm.BODY:
+            raise problem
+        text = (
+            f"not used: {sources.wheels}: the vehicle is not known, and its motion does not show the radius of its "
+            "wheels (--wheel-radius gives it)"
+        )
+        findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
+        sources, is_body = replace(sources, wheels=None), True
+    if kind == "ackermann" and "wheelbase_m" not in values:
+        raise problem
+    assumed = {key: value for key, value in _STAND_INS.items() if key not in values}
+    if kind == "ackermann":
+        assumed.pop("track_width_m", None)
+    name, text = _describe_vehicle(recording.geometry, kind, values, [*known], assumed, is_body=is_body)
+    bare = {"name": "fitted vehicle", "track_width_m": None, "wheelbase_m": None}
+    vehicle = msgspec.structs.replace(
+        chosen.vehicle,
+        **{**bare, "id": name, "kind": kind, **assumed, **values, **given},
+        stand_ins=[*assumed],
+    )
+    findings.append(Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    findings += _compare_lengths(recording.geometry, known, kind)
+    extracted = None
+    return replace(
+        chosen,
+        vehicle=vehicle,
+        vehicle_source="fitted",
+        sources=sources,
+        findings=tuple(findings),
+        extracted=extracted,
+    )
+
+
+_LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
+_OFF = 0.26
+"""Absolute logarithm of a ratio of lengths above which it is no error of a data sheet: 1.3, or .77."""
+
+
+def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
+    """Lengths that an analysis of this kind of vehicle takes from its signals [m]: the controller's first."""
+    if kind == "ackermann":
+        lengths = {"wheelbase_m": seen.wheelbase}
+    elif seen.radius is not None:
+        lengths = {"wheel_radius_m": seen.radius, "track_width_m": seen.track}
+    else:
+        lengths = {"wheel_radius_m": seen.rolled, "track_width_m": seen.effective}
+    return {
+        key: length.value
+        for key, length in lengths.items()
+        if length is not None and RANGES[key][0] < length.value < RANGES[key][1]
+    }
+
+
+def _compare_lengths(seen: Geometry, known: Mapping[str, object], kind: str) -> list[Finding]:
+    """Findings on lengths that the motion contradicts by more than a data sheet errs."""
+    rolled = seen.rolled
+    given = known.get("wheel_radius_m")
+    of, whose = (float(given), "given") if isinstance(given, float) else (None, "")
+    if of is None and seen.radius is not None:
+        of, whose = seen.radius.value, "the controller's"
+    if kind != "differential" or rolled is None or of is None or abs(np.log(rolled.value / of)) < _OFF:
+        return []
+    share = rolled.value / of
+    text = (
+        f"the vehicle covers {format_share(share)} of the distance that its wheels turn with a radius of {of:.3g} m "
+        f"({whose}): by the motion the radius is {rolled.value:.3g} m, k = {share:.2g}; correct the radius (or its "
+        "multiplier) in the controller, or the unit of the wheels"
+    )
+    return [Finding("radius_contradicted", "warning", text, where="vehicle", value=rolled.value)]
+
+
+def _describe_vehicle(
+    seen: Geometry,
+    kind: str,
+    values: Mapping[str, object],
+    given: Sequence[str],
+    assumed: Mapping[str, float],
+    *,
+    is_body: bool,
+) -> tuple[str, str]:
+    """A name that depends only on the geometry, and the text of the finding."""
+    if is_body and kind != "ackermann":
         text = (
             "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
             "whose slip does not depend on wheel radius and track width"
         )
-        if vehicle.kind == "omni":
+        if kind == "omni":
             text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
-    else:
-        asked = sources.command if drive is not sources.command else None
-        measured = replace(sources, wheels=drive, command=asked, imu=None, interval=None)
-        made = extract_tables(data, measured, configuration, vehicle, where=where)
-        from pipeline.stages.pose_choice import fit_controller, fit_geometry  # noqa: PLC0415 - seldom needed
-
-        fitted = fit_geometry(made.tables["wheels"], made.tables["poses"], vehicle.kind)
-        if fitted is None:
-            raise problem
-        controller = fit_controller(made.tables["commands"], made.tables["wheels"], fitted)
-        framed = read_frames(TransformBuffer(data.topics))[1]
-        recorded_values = {key: value for key, value in {**framed, **recorded}.items() if key in fitted}
-        values = {**fitted, **(controller or {}), **recorded_values}
-        name, text = _format_fit(values, by_controller=controller is not None)
-        if recorded_values:
-            text += f"; {' and '.join(recorded_values)} as recorded"
-    given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
-    assumed: Mapping[str, float] = _STAND_INS if drive is None else {}
-    if vehicle.kind == "ackermann":
-        assumed = {"wheel_radius_m": _STAND_INS["wheel_radius_m"]}
-    bare = {"name": "fitted vehicle", "id": name, "track_width_m": None, "wheelbase_m": None}
-    stand_ins = [key for key in assumed if key not in given]
-    vehicle = msgspec.structs.replace(vehicle, **{**bare, **values, **assumed, **given}, stand_ins=stand_ins)
-    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
-    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings, extracted=None)
-
-
-def _format_fit(fitted: Mapping[str, float], *, by_controller: bool) -> tuple[str, str]:
-    """A name that depends only on the geometry, and the text of the finding."""
-    if "wheelbase_m" in fitted:
-        return f"fitted_{1e3 * fitted['wheelbase_m']:.0f}", (
-            "the log does not identify the vehicle: a wheelbase of "
-            f"{fitted['wheelbase_m']:.3g} m was fitted; vehicle.wheelbase_m in run.toml gives the true one"
+        return "fitted_body", text
+    lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
+    errors = _list_errors(seen, kind)
+    words = {
+        "wheel_radius_m": "a wheel radius of",
+        "track_width_m": "a track of",
+        "wheelbase_m": "a wheelbase of",
+    }
+    if kind == "differential" and seen.radius is None:
+        words["track_width_m"] = "an effective track of"
+    parts = {
+        key: f"{words[key]} {lengths[key]:.3g} m"
+        + (f" (+- {format_share(errors[key] / lengths[key])})" if key not in given and errors.get(key, 0.0) > 2e-3 * lengths[key] else "")
+        for key in _LENGTHS
+        if key in lengths
+    }
+    own = " and ".join(text for key, text in parts.items() if key in given)
+    shown = " and ".join(text for key, text in parts.items() if key not in given)
+    text = "the log does not identify the vehicle"
+    if own:
+        text += f": {own} as given or recorded"
+    if shown and kind == "differential" and seen.radius is not None:
+        text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
+    elif shown:
+        text += f"; {shown} fits the motion, so that it is not reported as an effect"
+    if "track_width_m" in assumed:
+        text += "; there is too little turning for a track: give --track-width"
+    if kind == "ackermann":
+        return (
+            f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
+            f"{text} (wheelbase_m under [vehicle] gives another)",
         )
-    radius, track = fitted["wheel_radius_m"], fitted["track_width_m"]
-    alike = find_alike(radius, track)
+    radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
+    alike = None if track is None else find_alike(radius, track)
     guess = (
         f"a {alike.name}? then --vehicle {alike.id}"
         if alike
         else "--wheel-radius and --track-width give others"
     )
-    name = alike.id if alike else f"{1e3 * radius:.0f}_{1e3 * track:.0f}"
-    if by_controller:
-        return f"fitted_{name}", (
-            "the log does not identify the vehicle: its controller turns commands into wheel speeds by "
-            f"a wheel radius of {radius:.3g} m and a track of {track:.3g} m, which are used ({guess})"
-        )
-    return f"fitted_{name}", (
-        f"the log does not identify the vehicle: a wheel radius of {radius:.3g} m and an effective "
-        f"track of {track:.3g} m were fitted, so neither is reported as an effect ({guess})"
-    )
+    name = alike.id if alike else f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
+    return f"fitted_{name}", f"{text} ({guess})"
+
+
+def _list_errors(seen: Geometry, kind: str) -> dict[str, float]:
+    """Standard errors of the lengths of `_list_lengths` [m]."""
+    if kind == "ackermann":
+        pairs = [("wheelbase_m", seen.wheelbase)]
+    elif seen.radius is not None:
+        pairs = [("wheel_radius_m", seen.radius), ("track_width_m", seen.track)]
+    else:
+        pairs = [("wheel_radius_m", seen.rolled), ("track_width_m", seen.effective)]
+    return {key: length.error for key, length in pairs if length is not None}

@@ -38,7 +38,9 @@ else:
     Kind = Literal[list_kinds()]
     KindWord = Literal[(*list_kinds(), *KIND_WORDS)]
 Clock = Literal["header", "log", "publish"]
-Unit = Literal["rad/s", "rpm", "deg/s", "m/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"]
+Unit = Literal[
+    "rad/s", "mrad/s", "rpm", "deg/s", "m/s", "km/h", "cm/s", "mm/s", "rad", "deg", "ticks", "erpm", "duty"
+]
 
 
 StandIn = Literal["wheel_radius_m", "track_width_m"]
@@ -116,7 +118,10 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         steering_joint: joint of ``topic`` whose position is the steering angle.
         unit: unit of wheel speeds, or of wheel angles; by default that of the message type.
         per_turn: ticks per turn of the wheel.
+        yaw_unit: unit of the yaw rate of a body command; by default that of the message type.
         sign: -1 if forward is recorded as negative.
+        reversed: side that counts backward.
+        exchanged: whether left and right are exchanged.
         scale: factor on recorded speeds, where an encoder counts low or high.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
@@ -134,7 +139,10 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     steering_joint: str | None = None
     unit: Unit | None = None
     per_turn: Positive | None = None
+    yaw_unit: Literal["rad/s", "deg/s", "mrad/s"] | None = None
     sign: Literal[1, -1] = 1
+    reversed: Literal["left", "right"] | None = None
+    exchanged: bool = False
     scale: Positive | None = None
     time: Clock | None = None
     hold_s: Positive | None = None
@@ -148,6 +156,9 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
         axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
+        up: axis of the poses' frames that points up, where it is not as ``axes`` says: ``y`` of motion capture,
+            ``-y`` of a camera's optical frame.
+        heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
         time: which of the message's times to use.
     """
 
@@ -155,6 +166,8 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
     axes: Literal["enu", "ned"] = "enu"
+    up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
+    heading_deg: Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)] | None = None
     time: Clock | None = None
 
 
@@ -457,18 +470,22 @@ _KNOWN: Final[Mapping[str, tuple[float, str]]] = {
     "deg/s": (math.pi / 180.0, "rad/s"),
     "m/s": (1.0, "m/s"),
     "mm/s": (1e-3, "m/s"),
+    "cm/s": (1e-2, "m/s"),
+    "km/h": (1.0 / 3.6, "m/s"),
+    "mrad/s": (1e-3, "rad/s"),
     "rad": (1.0, "rad"),
     "deg": (math.pi / 180.0, "rad"),
 }
 
 
 def list_factors(*made: str) -> dict[str, float]:
-    """Factors from other units to SI units.
+    """Factors from other units that encoders have to SI units.
 
     Args:
         made: SI units of the result.
     """
-    return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit != si}
+    rest = {"cm/s", "km/h", "mrad/s"}
+    return {unit: factor for unit, (factor, si) in _KNOWN.items() if si in made and unit not in {si, *rest}}
 
 
 def convert_unit(unit: str, own: Mapping[str, OwnUnit], *, where: str) -> tuple[float, float, str]:

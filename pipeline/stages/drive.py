@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import polars as pl
@@ -72,6 +72,14 @@ class Drive:
         series = {name: getattr(self, name) for name in self.list_signals()}
         taken = {name: None if values is None else values[order] for name, values in series.items()}
         return Drive(**taken, findings=self.findings)
+
+    def rewire(self, section: DriveSection) -> Drive:
+        """The signals with the sides as a configuration says that they are wired."""
+        made = self
+        if section.reversed is not None:
+            side = getattr(made, section.reversed)
+            made = replace(made, **{section.reversed: None if side is None else -side})
+        return replace(made, left=made.right, right=made.left) if section.exchanged else made
 
 
 def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
@@ -342,7 +350,7 @@ def read_signal(
         per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn))) or None
     if per_turn is not None:
         own["ticks"] = OwnUnit(per_turn / (2.0 * np.pi), "rad")
-    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else None
+    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else section.yaw_unit
     unit = asked or signal.unit or _USUAL_UNITS[source.form][number]
     if unit == "ticks":
         raw = unwrap_counter(raw)

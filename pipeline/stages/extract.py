@@ -86,11 +86,14 @@ def extract_tables(
     Raises:
         StageError: a role's topic contains no usable data.
     """
-    return _Extraction(data, sources, configuration, vehicle, where).run()
+    return Extraction(data, sources, configuration, vehicle, where).run()
 
 
-class _Extraction:
-    """One log's extraction: columns, common clocks, and findings."""
+class Extraction:
+    """One log's extraction: columns, common clocks, and findings.
+
+    `examine` reads every candidate of a log by it; a run reads the chosen sources.
+    """
 
     def __init__(
         self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
@@ -122,10 +125,10 @@ class _Extraction:
 
     def run(self) -> Extracted:
         """All tables."""
-        tables = {"poses": self._poses(), "commands": self._commands, "wheels": self._wheels}
+        tables = {"poses": self.poses(), "commands": self._commands, "wheels": self._wheels}
         power, findings = tabulate_power(self.sources.power, self._ordered, self._seconds, tables["poses"])
         self.findings += findings
-        tables |= {"imu": self._imu()} | ({} if power.is_empty() else {"power": power})
+        tables |= {"imu": self.imu()} | ({} if power.is_empty() else {"power": power})
         clocks: dict[str, dict[str, str | float]] = {
             clock.topic: {"clock": clock.clock, "latency_s": round(clock.latency_s, 6)}
             for clock in self.clocks.values()
@@ -242,15 +245,13 @@ class _Extraction:
             )
         return spans
 
-    def _poses(self) -> pl.DataFrame:
+    def poses(self) -> pl.DataFrame:
         source, spans = self.sources.pose, self._spans
         if source is None:
             return pl.DataFrame()
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
-        # Half a turn about the x axis puts z and the vehicle upright.
-        upright = np.array([1.0, -1.0, -1.0]) if self.configuration.pose.axes == "ned" else np.ones(3)
-        position, quaternion = arrays.position * upright, arrays.quaternion * np.append(upright, 1.0)
+        position, quaternion = reading.put_upright(arrays, self.configuration.pose)
         track = pose_topics.cut_track(
             times, position, quaternion, breaks, self.configuration.velocity, source.topic
         )
@@ -375,7 +376,7 @@ class _Extraction:
 
     @cached_property
     def _commands(self) -> pl.DataFrame:
-        table = self._drive_table(self.sources.command, self.configuration.command, held=True)
+        table = self.read_drive(self.sources.command, self.configuration.command, held=True)
         beside = self.sources.body_beside
         if beside is None or table.is_empty():
             return table
@@ -393,7 +394,7 @@ class _Extraction:
             pl.Series(name, np.where(at >= 0, value, np.nan)).fill_nan(None) for name, value in values.items()
         )
 
-    def _drive_table(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
+    def read_drive(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
         if source is None:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
@@ -410,6 +411,7 @@ class _Extraction:
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
         self.findings += drive.findings
+        drive = drive.rewire(section)
         if not held and section.scale is not None:
             text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
             self.findings.append(
@@ -436,7 +438,7 @@ class _Extraction:
         source = self.sources.wheels
         section = self.configuration.wheels
         try:
-            return self._drive_table(source, section, held=False)
+            return self.read_drive(source, section, held=False)
         except SlipError as error:
             if source is None or section != DriveSection():
                 raise
@@ -511,7 +513,7 @@ class _Extraction:
         at = [np.searchsorted(stamps, union, side="right") - 1 for stamps in (first, second)]
         return union, log_time, (a[at[0]], b[at[1]])
 
-    def _imu(self) -> pl.DataFrame:
+    def imu(self) -> pl.DataFrame:
         source = self.sources.imu
         ordered = self._ordered(source.topic) if source else None
         if ordered is None:

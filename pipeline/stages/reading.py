@@ -24,7 +24,7 @@ from pipeline.sources import (
     Signal,
     Sources,
 )
-from pipeline.sources.configuration import IntervalSection
+from pipeline.sources.configuration import IntervalSection, PoseSection
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
@@ -356,6 +356,35 @@ class PoseArrays:
         return replace(
             self, position=self.position[rows], quaternion=self.quaternion[rows], corrected=corrected
         )
+
+
+_UPRIGHT: Mapping[str, NDArray[np.float64]] = {
+    "z": np.eye(3),
+    "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
+    "x": np.array([[0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 0.0, 0.0]]),
+}
+"""Rotation that takes each axis to z."""
+_HALF_TURN = np.array([1.0, -1.0, -1.0])
+
+
+def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Floats]:
+    """Positions and quaternions with z up and the vehicle's x axis ahead, as a configuration says.
+
+    Args:
+        arrays: poses as recorded.
+        section: its ``axes``, ``up`` and ``heading_deg``.
+    """
+    up = section.up or ("-z" if section.axes == "ned" else "z")
+    position, quaternion = arrays.position, arrays.quaternion
+    if up != "z":
+        turn = _UPRIGHT[up.removeprefix("-")] * (_HALF_TURN[:, None] if up.startswith("-") else 1.0)
+        position = position @ turn.T
+        quaternion = np.column_stack([quaternion[:, :3] @ turn.T, quaternion[:, 3]])
+    if section.heading_deg:
+        half = 0.5 * np.radians(section.heading_deg)
+        ahead = np.tile([0.0, 0.0, np.sin(half), np.cos(half)], (quaternion.shape[0], 1))
+        quaternion = rigid.multiply_quaternions(quaternion, ahead)
+    return position, quaternion
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,273 @@
+"""Which reading of a log's signals makes one rigid body move as it was asked to, and whether another is as likely.
+
+The pose gives increments of the body. Every other signal is a reading of them with free gains and a free delay. All
+questions - role, sign, side, unit, frame of the pose, geometry - are answered by one likelihood, with names and types as
+priors in the same unit (nats).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Literal
+
+import numpy as np
+
+from pipeline.core.arrays import Floats
+from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.readings import Explained, Reading
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Steps, compare, fit
+from pipeline.sources.candidates import COMMANDED, MEASURED
+
+# Frame of the pose.
+
+_USUAL_DEG = 12.0
+"""Angle between heading and course within which it is that of a mounting, and not of another axis."""
+_CONCENTRATED = 0.6
+"""Concentration of the course above which its angle means anything."""
+
+
+def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, float]:
+    """The sense and the offset of the heading with which the body moves ahead as the best reading says.
+
+    Half a turn is left to `find_reversed`: it reverses signs only.
+
+    Args:
+        motion: the motion as recorded.
+        readings: readings that were fitted to it.
+
+    Returns:
+        The motion in its likeliest frame, and Vuong's statistic against the recorded one; zero where that one stays.
+    """
+    fitted = [one for one in readings if one.form != "gyro" and one.explained is not None]
+    known = [one for one in fitted if one.explained is not None and one.explained.is_sure]
+    if not known:
+        return motion, 0.0
+    best = max(known, key=lambda one: one.explained.moves if one.explained else 0.0)
+    explained = best.explained
+    assert explained is not None  # noqa: S101 - chosen for it
+    course, concentration = motion.find_course_deg()
+    angles = {0.0, 90.0}
+    if concentration > _CONCENTRATED and abs(course - 90.0 * round(course / 90.0)) > _USUAL_DEG:
+        angles.add(course)
+    part = explained.motion
+    ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
+    scores: dict[tuple[bool, float], Floats] = {}
+    for flip in (False, True):
+        for angle in angles:
+            turned = part.turn(flip=flip, offset_deg=angle)
+            body, yaw = turned.body, turned.yaw
+            scores[flip, angle] = (
+                fit(body.real, np.column_stack([ahead, yaw]), part.steps).blocks
+                + fit(body.imag, yaw[:, None], part.steps).blocks
+            )
+    usual = (False, 0.0)
+    likeliest = max(scores, key=lambda key: float(scores[key].sum()))
+    margin = compare(scores[likeliest], scores[usual])
+    gain = float((scores[likeliest] - scores[usual]).sum()) / part.moved.size
+    if likeliest == usual or margin < CLEAR or gain < LEAST_NATS:
+        return motion, 0.0
+    return motion.turn(flip=likeliest[0], offset_deg=likeliest[1]), margin
+
+
+# Signs: the fewest faults that explain which signals go the other way.
+
+Axis = Literal["ahead", "turned"]
+AXES: tuple[Axis, Axis] = ("ahead", "turned")
+_FAULTS: Mapping[str, tuple[frozenset[tuple[str, Axis]], float]] = {
+    "pose_backward": (frozenset({("pose", "ahead")}), 2.0),
+    "pose_mirrored": (frozenset({("pose", "turned")}), 2.0),
+    "command_ahead": (frozenset({("command", "ahead")}), 2.0),
+    "command_turned": (frozenset({("command", "turned")}), 2.0),
+    "command_both": (frozenset({("command", "ahead"), ("command", "turned")}), 2.0),
+    "wheels_both": (frozenset({("wheels", "ahead"), ("wheels", "turned")}), 2.0),
+    "wheels_exchanged": (frozenset({("wheels", "turned")}), 2.0),
+    "wheels_exchanged_both": (frozenset({("wheels", "ahead")}), 3.0),
+    "gyro": (frozenset({("gyro", "turned")}), 1.0),
+}
+"""Faults with what each reverses, and its surprise in nats; a gyro is often mounted upside down."""
+
+
+@dataclass(frozen=True)
+class Reversal:
+    """What goes the other way.
+
+    Attributes:
+        faults: names of the faults; the likeliest explanation.
+        rivals: other explanations that are as likely.
+    """
+
+    faults: tuple[str, ...] = ()
+    rivals: tuple[tuple[str, ...], ...] = ()
+
+
+def find_reversed(signs: Mapping[tuple[str, Axis], int]) -> Reversal:
+    """The least surprising faults that give these signs against the pose.
+
+    Args:
+        signs: by signal and axis: 1, -1, or 0 where it is not clear.
+    """
+    known = {key: sign for key, sign in signs.items() if sign}
+    if all(sign > 0 for sign in known.values()):
+        return Reversal()
+    there = {signal for signal, _ in known}
+    usable = [name for name in _FAULTS if name.split("_")[0] in {"pose", *there}]
+    found: list[tuple[float, tuple[str, ...]]] = []
+    for count in (1, 2, 3):
+        for names in combinations(usable, count):
+            parts = [_FAULTS[name][0] for name in names]
+            if all(_sign_of(key, parts) == sign for key, sign in known.items()):
+                found.append((sum(_FAULTS[name][1] for name in names), names))
+    if not found:
+        return Reversal()
+    least = min(cost for cost, _ in found)
+    best = [names for cost, names in found if cost < least + 0.5]
+    return Reversal(best[0], tuple(best[1:]))
+
+
+def _sign_of(key: tuple[str, Axis], parts: Iterable[frozenset[tuple[str, Axis]]]) -> int:
+    """Sign that a signal would have against the pose with these faults."""
+    parts = list(parts)
+    count = sum(key in part for part in parts) + sum(("pose", key[1]) in part for part in parts)
+    return -1 if count % 2 else 1
+
+
+# Units.
+
+SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mm/s": 1e-3, "cm/s": 1e-2}
+RATES = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mrad/s": 1e-3}
+WHEELS = {"rad/s": 1.0, "rpm": np.pi / 30.0, "deg/s": np.pi / 180.0}
+_STRANGE = 4.0
+"""Surprise of a unit that a message type does not have [nats]."""
+_WIN = 5.0
+"""Least gain of another unit [nats]."""
+
+
+def find_body_units(ahead: float | None, turned: float | None) -> tuple[str, str]:
+    """Units of a body command by its gains, which slip and a wrong radius change by a factor of two at most.
+
+    Args:
+        ahead, turned: motion over command; None where it is not excited.
+    """
+    costs = {}
+    for speed, of_speed in SPEEDS.items():
+        for rate, of_rate in RATES.items():
+            logs = [np.log(abs(gain) / of) for gain, of in ((ahead, of_speed), (turned, of_rate)) if gain]
+            common = float(np.mean(logs)) if logs else 0.0
+            costs[speed, rate] = (
+                common**2 / (2 * 0.6**2)
+                + sum((one - common) ** 2 for one in logs) / (2 * 0.35**2)
+                + _STRANGE * ((speed != "m/s") + (rate != "rad/s"))
+            )
+    best = min(costs, key=lambda key: costs[key])
+    return best if costs["m/s", "rad/s"] - costs[best] > _WIN else ("m/s", "rad/s")
+
+
+def find_wheel_unit(gain: float, name: str) -> str:
+    """Unit of wheel speeds by the radius that each would mean, about .12 m within a factor of two.
+
+    Args:
+        gain: path over the wheels' angle.
+        name: of the signals, which may name the unit.
+    """
+    named = {"rpm": "rpm", "deg": "deg/s"}
+    for word, unit in named.items():
+        if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower()):
+            return unit
+    costs = {
+        unit: np.log(abs(gain) / factor / 0.12) ** 2 / (2 * 0.7**2) + _STRANGE * (unit != "rad/s")
+        for unit, factor in WHEELS.items()
+    }
+    best = min(costs, key=lambda unit: costs[unit])
+    return best if costs["rad/s"] - costs[best] > _WIN else "rad/s"
+
+
+# Roles.
+
+_LEAD_S = 0.05
+_USUAL = 3.0
+"""Nats of a name that says what a topic is."""
+
+
+def rate_command(one: Reading, place: int, earliest: float) -> float:
+    """How likely a reading is the command, in nats.
+
+    A command is followed late, and it is held: numbers that equal the motion at once measure it.
+
+    Args:
+        one: a reading that the motion follows.
+        place: its place by type and name.
+        earliest: least delay of all readings [s].
+    """
+    explained = one.explained
+    assert explained is not None  # noqa: S101 - given so
+    name = one.name.lower()
+    is_commanded = bool(COMMANDED.search(name))
+    named = _USUAL * is_commanded - _USUAL * (bool(MEASURED.search(name)) and not is_commanded)
+    lead = explained.lag + explained.delay - earliest
+    held = float(np.mean([one.held_share for one in one.inputs]))
+    return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * place
+
+
+# Geometry.
+
+
+@dataclass(frozen=True)
+class Length:
+    """A length with its standard error, both [m]."""
+
+    value: float
+    error: float
+
+
+def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
+    """Wheel radius and track by which a controller turns body commands into wheel speeds.
+
+    Args:
+        command: speed [m/s] and yaw rate [rad/s].
+        wheels: speeds of both sides [rad/s].
+
+    Returns:
+        Radius and track, each None where it is not excited; None if the wheels do not follow the command.
+    """
+    left, right = wheels.first, wheels.second
+    if left is None or right is None or not (left.moves and right.moves) or command.form != "body":
+        return None
+    start, end = max(left.times[0], right.times[0]), min(left.times[-1], right.times[-1])
+    if end - start < FEWEST_STEPS * STEP_S:
+        return None
+    edges = np.arange(start, end, STEP_S)
+    steps = Steps(edges[:-1], edges[1:])
+    steps = steps.take(left.is_there(steps) & right.is_there(steps))
+    if steps.start.size < FEWEST_STEPS:
+        return None
+    rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
+    turned = rolled[1] - rolled[0]
+    motion = Motion(steps, 0.5 * (rolled[0] + rolled[1]) + 0j, np.zeros(turned.size), turned, "z")
+    made = Reading("body", command.name, command.first, command.second).explain(motion)
+    if made is None or not made.is_sure or made.crossed:
+        return None
+    ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
+    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
+    radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
+    track = (
+        Length(bent / ahead, bent / ahead * float(np.hypot(*errors)))
+        if radius is not None and bent > 0.0 and 1.0 / errors[1] > CLEAR
+        else None
+    )
+    return radius, track
+
+
+def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
+    """Wheel radius and effective track by the motion, each None where it is not excited."""
+    ahead, bent = abs(float(wheels.ahead.gains[0])), abs(float(wheels.turned.gains[0]))
+    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (wheels.ahead, wheels.turned)]
+    radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
+    track = (
+        Length(ahead / bent, ahead / bent * float(np.hypot(*errors)))
+        if radius is not None and wheels.sign("turned")
+        else None
+    )
+    return radius, track

@@ -1,0 +1,666 @@
+"""Examination of a log: from the columns of its candidates to a `Recording`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from pipeline.core import SlipError
+from pipeline.core.arrays import Floats
+from pipeline.logs import LogData
+from pipeline.recording.evidence import (
+    Axis,
+    Length,
+    Reversal,
+    find_body_units,
+    find_frame,
+    find_reversed,
+    find_wheel_unit,
+    measure_controller,
+    measure_geometry,
+    rate_command,
+)
+from pipeline.recording.motion import Motion, measure_motion
+from pipeline.recording.readings import Bent, Held, Reading
+from pipeline.recording.score import CLEAR
+from pipeline.sources import (
+    CONFIGURED,
+    Configuration,
+    DriveForm,
+    DriveSection,
+    DriveSource,
+    PoseContent,
+    Sources,
+    Vehicle,
+)
+from pipeline.sources.candidates import COMMANDED, MEASURED
+from pipeline.stages import Finding
+from pipeline.stages.extract import Extraction
+from pipeline.stages.reading import find_sideways_share
+
+FAULTS = (
+    "signs_contradict",
+    "command_reversed",
+    "motor_reversed",
+    "wheel_dead",
+    "wheels_reversed",
+    "pose_flipped",
+)
+"""Findings of an examination each of which makes every fit meaningless."""
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Lengths of a vehicle that its signals show; None where they do not.
+
+    Attributes:
+        radius, track: by which the controller turns commands into wheel speeds.
+        rolled: wheel radius by the motion.
+        effective: track by the motion.
+        wheelbase: of a car, by the motion.
+    """
+
+    radius: Length | None = None
+    track: Length | None = None
+    rolled: Length | None = None
+    effective: Length | None = None
+    wheelbase: Length | None = None
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What is in a log.
+
+    Attributes:
+        sources: topic of every role.
+        configuration: the user's, completed by what the log shows.
+        findings: what was decided, and why.
+        kind: kind of vehicle that the signals show; empty if they show none.
+        geometry: lengths by the signals.
+        evidence: a line on every signal that was tried.
+        moves: whether the motion follows any of them.
+    """
+
+    sources: Sources
+    configuration: Configuration
+    findings: tuple[Finding, ...] = ()
+    kind: str = ""
+    geometry: Geometry = Geometry()
+    evidence: tuple[str, ...] = ()
+    moves: bool = False
+
+
+def examine(
+    data: LogData,
+    sources: Sources,
+    configuration: Configuration,
+    vehicle: Vehicle,
+    *,
+    is_known: bool,
+    where: str,
+) -> Recording:
+    """Decide which reading of a log's signals makes its pose move as it does.
+
+    Args:
+        data: columns of the chosen pose, the gyro and every candidate for a command and for wheels.
+        sources: the pose, and candidates by type and name, the likeliest first.
+        configuration: the user's; what it gives is not decided here.
+        vehicle: the log's, or any of its kind.
+        is_known: whether its geometry is known.
+        where: the log, for error messages.
+    """
+    sideways = any(find_sideways_share(data.topics, one) for one in _list_candidates(sources))
+    if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
+        # A body that moves sideways has no course.
+        return Recording(sources, configuration)
+    return _Examination(data, sources, configuration, vehicle, is_known=is_known, where=where).run()
+
+
+def _list_candidates(sources: Sources) -> list[DriveSource]:
+    every = [
+        sources.command,
+        *sources.others.get("command", ()),
+        sources.wheels,
+        *sources.others.get("wheels", ()),
+    ]
+    return list(dict.fromkeys(one for one in every if isinstance(one, DriveSource)))
+
+
+@dataclass
+class _Drive:
+    """A candidate for a command or for wheels.
+
+    Attributes:
+        source: its topics.
+        reading: its signals.
+        place: its place by type and name among those of its role.
+        is_measured: whether type and name say that it is measured.
+    """
+
+    source: DriveSource
+    reading: Reading
+    place: int
+    is_measured: bool
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the motion follows it."""
+        return self.reading.explained is not None and self.reading.explained.is_sure
+
+    def sign(self, axis: Axis) -> int:
+        """Sign against the pose; zero where it is not clear."""
+        return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
+
+
+class _Examination:
+    """One log: its motion, its candidates, and what was decided so far."""
+
+    def __init__(
+        self,
+        data: LogData,
+        sources: Sources,
+        configuration: Configuration,
+        vehicle: Vehicle,
+        *,
+        is_known: bool,
+        where: str,
+    ) -> None:
+        self.is_known = is_known
+        self.sources, self.configuration, self.vehicle = sources, configuration, vehicle
+        alone = replace(sources, command=None, wheels=None, power=None)
+        self.extraction = Extraction(data, alone, configuration, vehicle, where)
+        self.findings: list[Finding] = []
+        self.changes: dict[str, dict[str, object]] = {}
+
+    def run(self) -> Recording:
+        """See `examine`."""
+        try:
+            motion = measure_motion(self.extraction.poses())
+            imu = self.extraction.imu()
+        except SlipError:
+            motion = None
+        if motion is None:
+            return Recording(self.sources, self.configuration)
+        gyro = (
+            Reading("gyro", str(self.sources.imu), None, Held(*_column(imu, "rate_z")))
+            if imu.height
+            else None
+        )
+        drives = self._read_drives()
+        readings = [drive.reading for drive in drives] + ([gyro] if gyro else [])
+        for one in readings:
+            one.explain(motion)
+        motion = self._turn(motion, readings)
+        command, wheels = self._choose_roles(drives)
+        kind = self._find_kind(wheels, motion)
+        if not self._tell_sides(command, wheels):
+            self._tell_signs(motion, command, wheels, gyro)
+        self._find_units(command, wheels)
+        return Recording(
+            replace(
+                self.sources,
+                command=None if command is None else command.source,
+                wheels=None if wheels is None else wheels.source,
+            ),
+            self._complete(),
+            tuple(self.findings),
+            kind,
+            self._measure(command, wheels),
+            tuple(_describe(one) for one in readings),
+            any(drive.is_sure for drive in drives),
+        )
+
+    # Signals.
+
+    def _read_drives(self) -> list[_Drive]:
+        commands = [self.sources.command, *self.sources.others.get("command", ())]
+        wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
+        drives, taken = [], set()
+        for is_measured, sources in ((False, commands), (True, wheels)):
+            for place, source in enumerate(one for one in sources if isinstance(one, DriveSource)):
+                key = (source.form, source.signals)
+                reading = None if key in taken else self._read(source, is_measured=is_measured)
+                taken.add(key)
+                if reading is not None:
+                    drives.append(_Drive(source, reading, place, is_measured))
+        return drives
+
+    def _read(self, source: DriveSource, *, is_measured: bool, kind: str = "differential") -> Reading | None:
+        """The signals of a source with unit lengths; None if they cannot be read."""
+        section = DriveSection()
+        if source.reason == CONFIGURED:
+            section = self.configuration.wheels if is_measured else self.configuration.command
+        if source.form is DriveForm.STEERING:
+            kind = "ackermann"
+        lengths = dict.fromkeys(("wheel_radius_m", "track_width_m", "wheelbase_m"), 1.0)
+        self.extraction.vehicle = Vehicle(
+            id="unit", name="unit", kind=kind, units=self.vehicle.units, **lengths
+        )
+        try:
+            table = self.extraction.read_drive(source, section, held=True)
+        except SlipError:
+            return None
+        if source.form is DriveForm.BODY:
+            return Reading(
+                "body", str(source), *(Held(*_column(table, name)) for name in ("body_x", "body_w"))
+            )
+        if kind == "ackermann":
+            speed = Held(*_column(table, "speed"))
+            bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
+            return Reading("steering", str(source), speed, bent)
+        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
+
+    # Frame of the pose.
+
+    def _turn(self, motion: Motion, readings: Sequence[Reading]) -> Motion:
+        """The motion in the frame in which the readings explain it, and the readings fitted to it."""
+        source, section = self.sources.pose, self.configuration.pose
+        if source is None or source.content is not PoseContent.POSE or section.heading_deg is not None:
+            return motion
+        turned, margin = find_frame(motion, readings)
+        if not margin:
+            return motion
+        if turned.flip:
+            text = (
+                f"the headings of {source} turn against its own path: its frame is of the other hand; correct what "
+                "publishes it"
+            )
+            self.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
+        for one in readings:
+            one.explain(turned)
+        return turned
+
+    # Roles.
+
+    def _choose_roles(self, drives: Sequence[_Drive]) -> tuple[_Drive | None, _Drive | None]:
+        """Command and wheels: those by type and name, unless the motion says otherwise."""
+        sure = [one for one in drives if one.is_sure]
+        earliest = min(
+            (
+                one.reading.explained.lag + one.reading.explained.delay
+                for one in sure
+                if one.reading.explained
+            ),
+            default=0.0,
+        )
+        command = self._find(drives, self.sources.command)
+        rivals = [one for one in sure if not one.is_measured]
+        if rivals and (command is None or command.source.reason != CONFIGURED):
+            best = max(rivals, key=lambda one: rate_command(one.reading, one.place, earliest))
+            if command is not None and best is not command:
+                self._tell_role("command", best, command)
+            command = best
+        wheels = self._find(drives, self.sources.wheels)
+        if wheels is None and self.sources.wheels is None:
+            # A pair of sides that is no command measures the wheels.
+            spare = [one for one in rivals if one is not command and one.reading.form == "sides"]
+            spare = [
+                one
+                for one in spare
+                if command is None or _is_measured(one) or one.source.form is DriveForm.SIDES
+            ]
+            wheels = max(spare, key=lambda one: -one.place, default=None)
+            if wheels is not None and command is not None and command.reading.form == "sides":
+                wheels = wheels if _is_measured(wheels) else None
+        return command, wheels
+
+    def _find(self, drives: Sequence[_Drive], source: DriveSource | None) -> _Drive | None:
+        return next(
+            (one for one in drives if source is not None and one.source.signals == source.signals), None
+        )
+
+    def _tell_role(self, role: str, chosen: _Drive, other: _Drive) -> None:
+        text = (
+            f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the first later, and "
+            f"the second measures it or is not followed; [{role}] in run.toml names another"
+        )
+        self.findings.append(Finding("role_by_motion", "info", text, where=role))
+
+    def _find_kind(self, wheels: _Drive | None, motion: Motion) -> str:
+        """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
+        if wheels is None or wheels.source.form is not DriveForm.JOINTS or self.configuration.vehicle.kind:
+            return ""
+        reading = self._read(wheels.source, is_measured=True, kind="ackermann")
+        made = None if reading is None or len(reading.inputs) < 2 else reading.explain(motion)  # noqa: PLR2004
+        if reading is None or made is None or not made.sign("turned"):
+            return ""
+        wheels.reading = reading
+        return "ackermann"
+
+    # Sides and signs.
+
+    def _tell_sides(self, command: _Drive | None, wheels: _Drive | None) -> bool:
+        """A side that is dead or counts backward; whether one was found."""
+        if wheels is not None and wheels.reading.form == "sides" and self._tell_dead(wheels):
+            return True
+        of_wheels = wheels is not None and wheels.is_sure and _is_crossed(wheels)
+        of_command = command is not None and command.is_sure and _is_crossed(command)
+        if of_wheels and wheels is not None and wheels.reading.explained is not None and not of_command:
+            side = "right" if wheels.reading.explained.ahead.gains[0] > 0.0 else "left"
+            margin = wheels.reading.explained.sign_margin
+            self._correct(
+                "wheels",
+                f"the {side} wheels' encoder counts backward",
+                f'reversed = "{side}"',
+                {"reversed": side},
+                margin,
+            )
+            return True
+        if of_command and command is not None and command.reading.explained is not None:
+            explained = command.reading.explained
+            # A body command reaches the right side as speed plus turn.
+            is_right = (
+                (explained.ahead.gains[0] < 0.0)
+                if command.reading.form == "body"
+                else explained.ahead.gains[0] > 0
+            )
+            side = "right" if is_right else "left"
+            also = (
+                "and its encoder with it"
+                if of_wheels
+                else "and its encoder counts what it does"
+                if wheels is not None
+                else "as far as commands and poses tell"
+            )
+            text = (
+                f"the {side} side of the drive runs backward against its command, {also}: the polarity of its motor "
+                "is wrong; exchange its wires, or turn its sign in the driver"
+            )
+            self.findings.append(
+                Finding("motor_reversed", "error", text, where="command", value=explained.sign_margin)
+            )
+            return True
+        return False
+
+    def _tell_dead(self, wheels: _Drive) -> bool:
+        sides = dict(zip(("left", "right"), (wheels.reading.first, wheels.reading.second), strict=True))
+        moves = {name: side is not None and side.moves for name, side in sides.items()}
+        if any(moves.values()) == all(moves.values()):
+            return False
+        dead, other = sorted(moves, key=lambda name: moves[name])
+        text = (
+            f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: it is dead (take "
+            f"--input command, or correct [wheels] {dead})"
+        )
+        self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
+        return True
+
+    def _tell_signs(
+        self, motion: Motion, command: _Drive | None, wheels: _Drive | None, gyro: Reading | None
+    ) -> None:
+        signs: dict[tuple[str, Axis], int] = {}
+        for name, drive in (("command", command), ("wheels", wheels)):
+            if drive is not None:
+                signs |= {(name, "ahead"): drive.sign("ahead"), (name, "turned"): drive.sign("turned")}
+        if gyro is not None and gyro.explained is not None:
+            signs["gyro", "turned"] = gyro.explained.sign("turned")
+        up, offset = motion.up, motion.offset_deg
+        if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
+            # Neither way along another axis is usual.
+            up = f"-{up}"
+            signs = {key: -sign if key[1] == "turned" else sign for key, sign in signs.items()}
+        if offset and -1 in {sign for (_, axis), sign in signs.items() if axis == "ahead"}:
+            offset += 180.0
+            signs = {key: -sign if key[1] == "ahead" else sign for key, sign in signs.items()}
+        made = find_reversed(signs)
+        if made.rivals:
+            self._tell_either(made, signs)
+        else:
+            for fault in made.faults:
+                if fault == "pose_backward":
+                    offset += 180.0
+                elif fault == "pose_mirrored":
+                    up = up.removeprefix("-") if up.startswith("-") else f"-{up}"
+                else:
+                    self._tell_fault(fault, command, wheels)
+        self._tell_frame(up, (offset + 180.0) % 360.0 - 180.0, signs)
+
+    def _tell_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
+        source = self.sources.pose
+        if not offset and up == "z":
+            return
+        agree = [
+            name
+            for name in ("command", "wheels", "gyro")
+            if any(key[0] == name and sign for key, sign in signs.items())
+        ]
+        words = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
+        who = " and ".join(words[name] for name in agree) or "the other signals"
+        lines: dict[str, object] = {}
+        if up != "z":
+            lines["up"] = up
+            what = (
+                "their z axis points down (north, east, down)"
+                if up == "-z"
+                else f"the {up.removeprefix('-')} axis of their frame points {'down' if up.startswith('-') else 'up'}, as "
+                "of motion capture or of a camera's optical frame: the body turns about it"
+            )
+            self._correct(
+                "pose", f"in the poses of {source} {what}, as {who} show", f'up = "{up}"', {"up": up}
+            )
+        if offset:
+            lines["heading_deg"] = offset
+            what = (
+                f"the poses of {source} look to the rear where {who} drive ahead (a sensor mounted backward, or "
+                "base_link points to the rear)"
+                if abs(offset) == 180.0  # noqa: PLR2004 - half a turn
+                else f"the heading of {source} is {abs(offset):.0f} degrees to the "
+                f"{'right' if offset > 0.0 else 'left'} of the course on which {who} drive"
+            )
+            self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
+
+    def _tell_fault(self, fault: str, command: _Drive | None, wheels: _Drive | None) -> None:
+        if fault == "gyro":
+            return
+        if fault.startswith("command"):
+            axes = {"command_ahead": "ahead", "command_turned": "turned"}.get(fault, "both")
+            what = {
+                "ahead": "backward where the vehicle drives forward: the sign of linear.x, or of both motors, is wrong",
+                "turned": "the other way than the vehicle turns: the sign of angular.z or of the steering is inverted, or "
+                "left and right are exchanged after it",
+                "both": "the other way in everything: both motors are wired backward, or the sign of the command is wrong",
+            }[axes]
+            name = "" if command is None else str(command.source)
+            text = f"the commands of {name} point {what}"
+            self.findings.append(Finding("command_reversed", "error", text, where="command"))
+            return
+        if wheels is not None and wheels.reading.form == "sides":
+            change: dict[str, object] = {}
+            what = "left and right encoders are exchanged"
+            if fault == "wheels_both":
+                change, what = {"sign": -1}, "both encoders count backward"
+            elif fault == "wheels_exchanged":
+                change = {"exchanged": True}
+            else:
+                change, what = (
+                    {"sign": -1, "exchanged": True},
+                    "both encoders count backward, and are exchanged",
+                )
+            line = ", ".join(f"{key} = {str(value).lower()}" for key, value in change.items())
+            self._correct("wheels", what, line, change)
+            return
+        name = "the wheels" if wheels is None else str(wheels.source)
+        text = f"{name} runs the other way than commands and poses: its sign is wrong"
+        self.findings.append(Finding("wheels_reversed", "error", text, where="wheels"))
+
+    def _tell_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
+        """Two signals that contradict each other, with what mends the one and the other."""
+        words = {
+            "pose_backward": "the frame of the poses points to the rear, as that of a sensor that is mounted backward: "
+            "heading_deg = 180 under [pose] in run.toml",
+            "pose_mirrored": 'the poses\' frame is of the other hand, as north, east, down: up = "-z" under [pose] in '
+            "run.toml",
+            "command_ahead": "the sign of linear.x is wrong where it is sent",
+            "command_turned": "the sign of angular.z or of the steering is inverted where it is sent",
+            "command_both": "the sign of the command is wrong, or both motors are wired backward",
+            "wheels_both": "both encoders count backward: sign = -1 under [wheels] in run.toml",
+            "wheels_exchanged": "left and right encoders are exchanged: exchanged = true under [wheels] in run.toml",
+            "wheels_exchanged_both": "both encoders count backward and are exchanged",
+            "gyro": "the gyro is mounted upside down",
+        }
+        against = sorted({name for (name, _), sign in signs.items() if sign < 0})
+        verbs = {"ahead": "drive", "turned": "turn"}
+        axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
+        options = "; or ".join(
+            " and ".join(words[name] for name in names) for names in (made.faults, *made.rivals)
+        )
+        text = (
+            f"the {' and the '.join(_PLURAL[name] for name in against)} and the poses "
+            f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of them is "
+            f"wrong: either {options}"
+        )
+        self.findings.append(Finding("signs_contradict", "error", text, where=f"{against[0]}, pose"))
+
+    # Units.
+
+    def _find_units(self, command: _Drive | None, wheels: _Drive | None) -> None:
+        if command is not None and command.reading.form == "body" and self._is_usable(command):
+            explained = command.reading.explained
+            ahead, turned = (
+                (
+                    abs(float(one.gains[0])) if command.sign(axis) else None
+                    for axis, one in (("ahead", explained.ahead), ("turned", explained.turned))
+                )
+                if explained
+                else (None, None)
+            )
+            speed, rate = find_body_units(ahead, turned)
+            if speed != "m/s":
+                self._correct(
+                    "command",
+                    f"the speed of {command.source} is in {speed}",
+                    f'unit = "{speed}"',
+                    {"unit": speed},
+                )
+            if rate != "rad/s":
+                self._correct(
+                    "command",
+                    f"the yaw rate of {command.source} is in {rate}",
+                    f'yaw_unit = "{rate}"',
+                    {"yaw_unit": rate},
+                )
+        if wheels is not None and wheels.reading.form == "sides" and self._is_usable(wheels) and not self.is_known:
+            signal = wheels.source.signals[0]
+            explained = wheels.reading.explained
+            if explained is None or signal.unit or not wheels.sign("ahead"):
+                return
+            unit = find_wheel_unit(float(explained.ahead.gains[0]), str(wheels.source))
+            if unit != "rad/s":
+                self._correct(
+                    "wheels",
+                    f"the wheel speeds of {wheels.source} are in {unit}",
+                    f'unit = "{unit}"',
+                    {"unit": unit},
+                )
+
+    def _is_usable(self, drive: _Drive) -> bool:
+        return drive.is_sure and not _is_crossed(drive)
+
+    # Geometry.
+
+    def _measure(self, command: _Drive | None, wheels: _Drive | None) -> Geometry:
+        made = Geometry()
+        car = next(
+            (one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None
+        )
+        if car is not None and car.reading.explained is not None and car.sign("turned"):
+            explained = car.reading.explained
+            ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
+            scale = ahead if car is wheels else 1.0
+            error = scale / bent / abs(float(explained.turned.t[0]))
+            return Geometry(wheelbase=Length(scale / bent, error))
+        if wheels is None or wheels.reading.form != "sides":
+            sides = command if command is not None and command.reading.form == "sides" else None
+        else:
+            sides = wheels
+        if (
+            sides is not None
+            and sides.is_sure
+            and not _is_crossed(sides)
+            and sides.reading.explained is not None
+        ):
+            rolled, effective = measure_geometry(sides.reading.explained)
+            factor = self._wheel_factor()
+            made = replace(made, rolled=_scale(rolled, factor), effective=effective)
+        if (
+            command is not None
+            and wheels is not None
+            and wheels.reading.form == "sides"
+            and command.reading.form == "body"
+        ):
+            found = measure_controller(command.reading, wheels.reading)
+            if found is not None:
+                made = replace(made, radius=_scale(found[0], self._wheel_factor()), track=found[1])
+        return made
+
+    def _wheel_factor(self) -> float:
+        """Factor from the radius of raw wheel speeds to that of rad/s."""
+        unit = self.changes.get("wheels", {}).get("unit")
+        return {"rpm": 30.0 / np.pi, "deg/s": 180.0 / np.pi}.get(str(unit), 1.0)
+
+    # What the user reads, and what the stages read.
+
+    def _correct(
+        self, section: str, what: str, line: str, change: dict[str, object], margin: float | None = None
+    ) -> None:
+        """Apply a correction, or tell it where the user's configuration decides otherwise."""
+        default = type(getattr(self.configuration, section))()
+        given = [
+            key
+            for key in change
+            if getattr(getattr(self.configuration, section), key) != getattr(default, key)
+        ]
+        names = {"pose": "pose_turned", "wheels": "wheels_corrected", "command": "command_corrected"}
+        if given:
+            text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
+            self.findings.append(Finding("signs_contradict", "error", text, where=section))
+            return
+        self.changes.setdefault(section, {}).update(change)
+        text = f"{what}: corrected ({line} under [{section}] in run.toml; its default takes them as recorded)"
+        self.findings.append(Finding(names[section], "warning", text, where=section, value=margin))
+
+    def _complete(self) -> Configuration:
+        sections = {
+            name: msgspec.structs.replace(getattr(self.configuration, name), **change)
+            for name, change in self.changes.items()
+        }
+        return msgspec.structs.replace(self.configuration, **sections)
+
+
+_PLURAL = {"command": "commands", "wheels": "measured wheels", "gyro": "gyro"}
+
+
+def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
+    """Times and values of a column, those of inactive spans left out."""
+    return table["t"].to_numpy(), table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _is_crossed(drive: _Drive) -> bool:
+    explained = drive.reading.explained
+    if explained is None or not explained.crossed:
+        return False
+    return bool(min(abs(explained.ahead.t[0]), abs(explained.turned.t[0])) > CLEAR)
+
+
+def _is_measured(drive: _Drive) -> bool:
+    name = drive.reading.name.lower()
+    return bool(MEASURED.search(name)) and not COMMANDED.search(name)
+
+
+def _scale(length: Length | None, factor: float) -> Length | None:
+    return None if length is None else Length(length.value * factor, length.error * factor)
+
+
+def _describe(reading: Reading) -> str:
+    made = reading.explained
+    if made is None:
+        return f"{reading.name}: too few steps"
+    follows = "follows" if made.is_sure else "does not follow"
+    return (
+        f"{reading.name}: the motion {follows} it (z {made.moves:.1f}, {made.nats:.2f} nats a step), "
+        f"ahead x {made.ahead.gains[0]:.4g}, turned x {made.turned.gains[0]:.4g}, {made.lag + made.delay:.2f} s late"
+    )

@@ -1,0 +1,157 @@
+"""Motion of one rigid body by its poses: increments ahead, to the left and of the heading over short steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import polars as pl
+
+from pipeline.core import rigid
+from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.recording.score import FEWEST_STEPS, Steps
+
+STEP_S = 0.1
+_PLANES = ((1, 2), (0, 2), (0, 1))
+"""Axes of the plane across each axis, the body's own x first where it lies in the plane."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Increments of a pose.
+
+    Attributes:
+        steps: the time steps, n of them.
+        moved: displacements in the plane of motion, shape (n,), as complex numbers [m].
+        middle: recorded heading in the middle of each step [rad].
+        turned: change of the recorded heading [rad].
+        up: axis that points up, ``z`` or ``-y``, as the rotation and the path show it.
+        flip: whether the heading is read the other way round.
+        offset_deg: angle that is added to the heading.
+        rate_hz: poses per second.
+        odd: number of steps that are left out since the pose jumps.
+    """
+
+    steps: Steps
+    moved: Complex
+    middle: Floats
+    turned: Floats
+    up: str
+    flip: bool = False
+    offset_deg: float = 0.0
+    rate_hz: float = 0.0
+    odd: int = 0
+
+    @property
+    def body(self) -> Complex:
+        """Displacements in the vehicle's frame [m]: ahead + 1j * left."""
+        sense = -1.0 if self.flip else 1.0
+        return self.moved * np.exp(-1j * (sense * self.middle + np.radians(self.offset_deg)))
+
+    @property
+    def yaw(self) -> Floats:
+        """Changes of the heading [rad]."""
+        return -self.turned if self.flip else self.turned
+
+    def turn(self, *, flip: bool, offset_deg: float) -> Motion:
+        """The same poses in another frame."""
+        return replace(self, flip=flip, offset_deg=offset_deg)
+
+    def take(self, keep: Flags) -> Motion:
+        """Some of the steps."""
+        return replace(
+            self,
+            steps=self.steps.take(keep),
+            moved=self.moved[keep],
+            middle=self.middle[keep],
+            turned=self.turned[keep],
+        )
+
+    def find_course_deg(self) -> tuple[float, float]:
+        """Angle from the heading to the axis along which the body moves, modulo 180, and its concentration.
+
+        The concentration is 1 where all motion is along one axis, and 0 without one.
+        """
+        power = float((np.abs(self.moved) ** 2).sum())
+        moment = ((self.moved * np.exp(-1j * self.middle)) ** 2).sum()
+        return float(np.degrees(0.5 * np.angle(moment))), float(abs(moment)) / max(power, 1e-12)
+
+
+def measure_motion(poses: pl.DataFrame) -> Motion | None:
+    """Increments of the poses over steps of a tenth of a second or of their period.
+
+    Args:
+        poses: table `poses` as extracted.
+
+    Returns:
+        The motion; None with fewer than thirty steps.
+    """
+    fresh = poses.filter(
+        ~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite() & pl.col("active")
+    )
+    if fresh.height <= FEWEST_STEPS:
+        return None
+    time = fresh["t"].to_numpy()
+    place = fresh.select("x", "y", "z").to_numpy()
+    quaternion = fresh.select("q_x", "q_y", "q_z", "q_w").to_numpy()
+    period = float(np.median(np.diff(time)))
+    length = max(STEP_S, period)
+    rows = _choose_rows(time, 0.95 * length)
+    time, place, quaternion = time[rows], place[rows], quaternion[rows]
+    segment = fresh["segment"].to_numpy()[rows]
+    axis, up, yaw = _find_plane(place, quaternion)
+    first, second = _PLANES[axis]
+    # A positive turn about y leads from x to -z.
+    plane = place[:, first] + (-1j if axis == 1 else 1j) * place[:, second]
+    if up.startswith("-"):
+        # Seen from above, the second axis of the plane points the other way.
+        plane, yaw = plane.conj(), -yaw
+    elapsed, moved, turned = np.diff(time), np.diff(plane), np.diff(yaw)
+    whole = (elapsed > 0.3 * length) & (elapsed < 3.0 * length) & (np.diff(segment) == 0)
+    if whole.sum() < FEWEST_STEPS:
+        return None
+    speed = np.abs(moved) / np.maximum(elapsed, 1e-3)
+    fastest = 20.0 * max(float(np.quantile(speed[whole], 0.9)), 0.02)
+    sane = whole & (speed < fastest) & (np.abs(turned) < 12.0 * elapsed)
+    if sane.sum() < FEWEST_STEPS:
+        return None
+    middle = yaw[:-1] + 0.5 * turned
+    return Motion(
+        Steps(time[:-1][sane], time[1:][sane]),
+        moved[sane],
+        middle[sane],
+        turned[sane],
+        up,
+        rate_hz=1.0 / period if period > 0.0 else 0.0,
+        odd=int((whole & ~sane).sum()),
+    )
+
+
+def _choose_rows(time: Floats, length: float) -> list[int]:
+    """Rows that are at least a length apart [s]."""
+    rows = [0]
+    for row, at in enumerate(time.tolist()):
+        if at - time[rows[-1]] >= length:
+            rows.append(row)
+    return rows
+
+
+def _find_plane(place: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
+    """Index of the axis across the plane of motion, its name with the sign that points up, and the headings.
+
+    The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it least.
+    """
+    before = quaternion[:-1] * np.array([-1.0, -1.0, -1.0, 1.0])
+    change = rigid.multiply_quaternions(quaternion[1:], before)
+    rotation = 2.0 * change[:, :3] * np.sign(change[:, 3:])
+    turning = (np.clip(rotation, -0.5, 0.5) ** 2).sum(axis=0)
+    apart = min(8, place.shape[0] // 4)
+    reach = np.quantile(np.abs(place[apart:] - place[:-apart]), 0.8, axis=0)
+    axis = int(np.argmax(turning))
+    if axis != 2 and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(reach)) == axis):
+        axis = 2
+    if axis == 2:
+        yaw = rigid.euler_from_quaternions(quaternion)[2]
+    else:
+        yaw = 2.0 * np.arctan2(quaternion[:, axis], quaternion[:, 3])
+    return axis, "xyz"[axis], np.unwrap(yaw)

@@ -1,0 +1,314 @@
+"""Signals that may explain a motion: a command, the wheels or a gyro, with free gains and a free delay.
+
+A reading has two inputs: speed and yaw rate of a body, speeds of the left and the right wheels, or speed and steering
+angle. They are held on a fine grid, delayed, and integrated over the steps of the motion.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.signal import lfilter
+
+from pipeline.core.arrays import Flags, Floats
+from pipeline.recording.motion import Motion
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit
+
+GRID_S = 0.02
+_DELAYS_S = np.arange(-0.3, 0.81, 0.05)
+_LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
+_MOST_ROWS = 2000
+"""Number of steps on which delays are compared first."""
+
+
+class Held:
+    """A signal, held between its samples, and its integrals after a first-order lag and a delay.
+
+    Args:
+        times: increasing [s], shape (n,).
+        values: NaN where unknown, shape (n,).
+    """
+
+    def __init__(self, times: Floats, values: Floats) -> None:
+        known = np.isfinite(values)
+        self.times, self.values = times[known], values[known]
+        self.moves = self.values.size >= FEWEST_STEPS and bool(np.ptp(self.values) > 0.0)
+        self._sums: dict[float, Floats] = {}
+        if self.values.size < FEWEST_STEPS:
+            return
+        self._start = float(self.times[0]) - 1.0
+        grid = np.arange(self._start, self.times[-1] + 2.0, GRID_S)
+        before = np.searchsorted(self.times, grid, side="right") - 1
+        period = float(np.median(np.diff(self.times)))
+        longest = np.inf if period > 0.4 or self.times.size < 60 else max(0.6, 6.0 * period)
+        missing = (before < 0) | (grid - self.times[np.maximum(before, 0)] > longest)
+        self._missing = np.append(0.0, np.cumsum(missing))
+        self.grid = np.where(before < 0, 0.0, self.values[np.maximum(before, 0)])
+
+    @property
+    def held_share(self) -> float:
+        """Fraction of the samples of a moving signal that repeat the one before."""
+        moving = self.values[1:] != 0.0
+        return float(np.mean(np.diff(self.values)[moving] == 0.0)) if moving.any() else 1.0
+
+    def is_there(self, steps: Steps) -> Flags:
+        """Whether the signal is recorded over each step and .4 s before."""
+        place = np.arange(self._missing.size)
+        first, last = (
+            np.interp((at - self._start) / GRID_S, place, self._missing)
+            for at in (steps.start - 0.4, steps.end)
+        )
+        inside = (steps.start >= self.times[0]) & (steps.end <= self.times[-1] + 1.0)
+        return np.asarray((last - first < 2.0) & inside)
+
+    def lagged(self, lag: float) -> Floats:
+        """The signal on its grid after a first-order lag."""
+        return follow(self.grid, lag)
+
+    def integrate(self, steps: Steps, lag: float, delay: float) -> Floats:
+        """Integral over each step."""
+        if lag not in self._sums:
+            self._sums[lag] = np.append(0.0, np.cumsum(self.lagged(lag))) * GRID_S
+        total = self._sums[lag]
+        return _look_up(total, (steps.end - delay - self._start) / GRID_S) - _look_up(
+            total, (steps.start - delay - self._start) / GRID_S
+        )
+
+
+def follow(values: Floats, lag: float) -> Floats:
+    """First-order lag on the grid, without the delay of half a cell that a filter of held values has."""
+    if lag <= 0.0:
+        return values
+    gain = 1.0 - np.exp(-GRID_S / lag)
+    made = lfilter([gain], [1.0, gain - 1.0], values)
+    made[1:] = 0.5 * (made[1:] + made[:-1])
+    return np.asarray(made)
+
+
+def _look_up(total: Floats, place: Floats) -> Floats:
+    place = np.clip(place, 0.0, total.size - 1.001)
+    cell = place.astype(np.int64)
+    return np.asarray(total[cell] + (place - cell) * (total[cell + 1] - total[cell]))
+
+
+class Bent(Held):
+    """Speed times the tangent of a steering angle, each lagged before the product."""
+
+    def __init__(self, speed: Held, times: Floats, angle: Floats) -> None:
+        self._angle = Held(times, angle)
+        self.__dict__.update({key: value for key, value in vars(speed).items() if key != "_sums"})
+        self._sums = {}
+        self._speed = speed
+        self.moves = speed.moves and self._angle.moves
+        if self.moves:
+            at = np.searchsorted(
+                self._angle.times, self._start + GRID_S * np.arange(speed.grid.size), side="right"
+            )
+            self._bent = np.where(at > 0, self._angle.values[np.maximum(at - 1, 0)], 0.0)
+
+    def lagged(self, lag: float) -> Floats:
+        angle = np.clip(follow(self._bent, lag), -1.4, 1.4)
+        return np.asarray(follow(self._speed.grid, lag) * np.tan(angle))
+
+    def is_there(self, steps: Steps) -> Flags:
+        return np.asarray(super().is_there(steps) & self._angle.is_there(steps))
+
+
+@dataclass
+class Explained:
+    """A motion explained by a reading.
+
+    Attributes:
+        motion: where the reading is recorded and something moves.
+        crossed: whether one side of the drive counts backward.
+        lag, delay: [s].
+        ahead, turned: fits of both channels.
+        lever: distance of the pose to the left of the axle's middle that fits [m].
+        none: likelihoods of both channels without the reading.
+        other: likelihood with (or without) one side reversed; None where it was not tried.
+        lead: Vuong statistic of this delay against none.
+    """
+
+    motion: Motion
+    crossed: bool
+    lag: float
+    delay: float
+    ahead: Fit
+    turned: Fit
+    none: tuple[Floats, Floats]
+    other: Floats | None
+    lead: float
+
+    @property
+    def blocks(self) -> Floats:
+        """Log-likelihood of every block."""
+        return self.ahead.blocks + self.turned.blocks
+
+    @property
+    def moves(self) -> float:
+        """Vuong statistic of the reading against none."""
+        return compare(self.blocks, self.none[0] + self.none[1])
+
+    @property
+    def nats(self) -> float:
+        """Gain in log-likelihood per step."""
+        return float((self.blocks - self.none[0] - self.none[1]).sum()) / self.motion.moved.size
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the motion follows the reading."""
+        return self.moves > CLEAR and self.nats > LEAST_NATS
+
+    @property
+    def sign_margin(self) -> float:
+        """Vuong statistic of the sides' signs against one of them reversed."""
+        return np.inf if self.other is None else compare(self.blocks, self.other)
+
+    def sign(self, channel: str) -> int:
+        """Sign of the gain of ``ahead`` or ``turned`` where it is clear, else zero."""
+        one, none = (self.ahead, self.none[0]) if channel == "ahead" else (self.turned, self.none[1])
+        if not self.is_sure or abs(one.t[0]) < CLEAR or compare(one.blocks, none) < CLEAR:
+            return 0
+        return int(np.sign(one.gains[0]))
+
+
+@dataclass
+class Reading:
+    """Two inputs that may explain a motion.
+
+    Attributes:
+        form: ``body`` (speed, yaw rate), ``sides`` (left, right), ``steering`` (speed, speed times the tangent of the
+            angle) or ``gyro`` (nothing, yaw rate).
+        name: for people.
+        first, second: the inputs.
+    """
+
+    form: str
+    name: str
+    first: Held | None
+    second: Held | None
+    explained: Explained | None = field(default=None, init=False)
+
+    @property
+    def inputs(self) -> Sequence[Held]:
+        """Inputs that move."""
+        return [one for one in (self.first, self.second) if one is not None and one.moves]
+
+    def columns(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> tuple[Floats, Floats]:
+        """Increments ahead and of the heading, in the reading's own units."""
+        one, two = (
+            each.integrate(steps, lag, delay)
+            if each is not None and each.moves
+            else np.zeros(steps.start.size)
+            for each in (self.first, self.second)
+        )
+        if self.form == "sides":
+            return (0.5 * (one - two), -one - two) if crossed else (0.5 * (one + two), two - one)
+        return (two, one) if crossed and self.form == "body" else (one, two)
+
+    def explain(self, whole: Motion, live: Flags | None = None) -> Explained | None:
+        """Fit the motion; also kept as ``explained``.
+
+        Args:
+            whole: the motion.
+            live: steps that count, shape (n,).
+        """
+        self.explained = None
+        if not self.inputs:
+            return None
+        keep = np.logical_and.reduce([one.is_there(whole.steps) for one in self.inputs])
+        if live is not None:
+            keep &= live
+        busy = self._find_busy(whole)
+        if (keep & busy).sum() >= FEWEST_STEPS:
+            keep &= busy
+        if keep.sum() < FEWEST_STEPS:
+            return None
+        motion = whole.take(keep)
+        patterns = (False, True) if self.form in {"body", "sides"} and len(self.inputs) == 2 else (False,)
+        tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
+        best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
+        if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:
+            best = False
+        self.explained = tried[best]
+        if len(tried) > 1:
+            self.explained.other = tried[not best].blocks
+        return self.explained
+
+    def _find_busy(self, motion: Motion) -> Flags:
+        """Steps near which something is asked, or moves: at rest, noise would make all driving an outlier."""
+        steps = motion.steps
+        elapsed = steps.end - steps.start
+        busy = np.zeros(elapsed.size, dtype=bool)
+        for one in self.inputs:
+            busy |= _is_large(one.integrate(steps, 0.0, 0.0) / elapsed, 0.02)
+        wide = max(1, int(1.5 / float(np.median(elapsed))))
+        near = np.convolve(busy, np.ones(2 * wide + 1))[wide : wide + busy.size] > 0.5
+        ahead, yaw = motion.body.real, motion.yaw
+        return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
+
+    def _fit(self, motion: Motion, *, crossed: bool) -> Explained:
+        lag, delay = self._find_delay(motion, crossed=crossed)
+        ahead, yaw = motion.body.real, motion.yaw
+        first, second = self.columns(motion.steps, lag, delay, crossed=crossed)
+        empty = np.zeros((yaw.size, 0))
+        # The pose may be beside the axle's middle, unless its own turning is what drives it ahead.
+        lever = bool(np.dot(first, yaw) ** 2 < 0.5 * np.dot(first, first) * np.dot(yaw, yaw))
+        beside = yaw[:, None] if lever else empty
+        at_once = self.columns(motion.steps, 0.0, 0.0, crossed=crossed)
+        now = [
+            fit(ahead, np.column_stack([at_once[0], beside]), motion.steps),
+            fit(yaw, at_once[1][:, None], motion.steps),
+        ]
+        made = Explained(
+            motion,
+            crossed,
+            lag,
+            delay,
+            fit(ahead, np.column_stack([first, beside]), motion.steps),
+            fit(yaw, second[:, None], motion.steps),
+            (fit(ahead, beside, motion.steps).blocks, fit(yaw, empty, motion.steps).blocks),
+            None,
+            0.0,
+        )
+        made.lead = compare(made.blocks, now[0].blocks + now[1].blocks)
+        return made
+
+    def _find_delay(self, motion: Motion, *, crossed: bool) -> tuple[float, float]:
+        """Lag and delay [s] by the least residual, jumps of the pose limited."""
+        count = motion.moved.size
+        some = np.ones(count, dtype=bool)
+        if count > _MOST_ROWS:
+            some = np.zeros(count, dtype=bool)
+            some[np.linspace(0, count - 1, _MOST_ROWS).astype(np.int64)] = True
+        part = motion.take(some)
+        channels = [(values, float(np.quantile(values**2, 0.97))) for values in (part.body.real, part.yaw)]
+        scores: dict[tuple[float, float], float] = {}
+
+        def score(lag: float, delay: float) -> float:
+            key = (round(lag, 3), round(delay, 3))
+            if key not in scores:
+                total = 0.0
+                columns = self.columns(part.steps, *key, crossed=crossed)
+                for (values, limit), column in zip(channels, columns, strict=True):
+                    power = float(column @ column)
+                    rest = values - column * (float(column @ values) / power if power > 0.0 else 0.0)
+                    total -= 0.5 * values.size * np.log(float(np.mean(np.minimum(rest**2, limit))) + 1e-14)
+                scores[key] = total
+            return scores[key]
+
+        for lag in _LAGS_S:
+            for delay in _DELAYS_S:
+                score(lag, float(delay))
+        for step in (0.03, 0.01):
+            lag, delay = max(scores, key=lambda key: scores[key])
+            for more in (-step, 0.0, step):
+                for later in (-step, 0.0, step):
+                    score(max(0.0, lag + more), delay + later)
+        return max(scores, key=lambda key: scores[key])
+
+
+def _is_large(values: Floats, share: float) -> Flags:
+    return np.asarray(np.abs(values) > share * float(np.quantile(np.abs(values), 0.95)))

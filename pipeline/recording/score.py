@@ -1,0 +1,165 @@
+"""Likelihood of a measured motion under one reading of the other signals.
+
+Increments of a pose are a disturbance plus differences of the localization's noise: each reading is judged by the
+innovations of an ARMA(1,1) process that is fitted to its own residuals, under Student's t with four degrees of
+freedom. Likelihoods are summed in blocks of five seconds, and two readings are compared by Vuong's statistic over the
+blocks (Vuong 1989, Econometrica 57), which needs no model of what the blocks have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.machine_code import compiled
+
+BLOCK_S = 5.0
+"""Length of a block [s], longer than any correlation of the noise that is modelled."""
+CLEAR = 3.0
+"""Least Vuong statistic of a decision."""
+LEAST_NATS = 0.02
+"""Least gain in log-likelihood per step of a decision: below it a difference is certain, but of no importance."""
+FEWEST_STEPS = 30
+"""Least number of steps for a likelihood."""
+_FREEDOM = 4.0
+_NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta in (0.0, 0.3, 0.6, 0.85)
+                         if phi != theta))  # fmt: skip
+"""Grid of the noise's (phi, theta)."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Time steps of a motion, in order.
+
+    Attributes:
+        start, end: times [s], shape (n,).
+    """
+
+    start: Floats
+    end: Floats
+
+    @cached_property
+    def fresh(self) -> Flags:
+        """Whether a step does not begin where the one before ended, shape (n,)."""
+        return np.append(True, np.abs(self.start[1:] - self.end[:-1]) > 1e-6)
+
+    @cached_property
+    def block(self) -> Ints:
+        """Number of each step's block, shape (n,)."""
+        length = min(BLOCK_S, max(0.4, float(np.ptp(self.start)) / 12.0))
+        number = ((self.start - self.start.min()) // length).astype(np.int64)
+        return np.unique(number, return_inverse=True)[1]
+
+    def take(self, keep: Flags) -> Steps:
+        """Some of the steps."""
+        return Steps(self.start[keep], self.end[keep])
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Regression under correlated noise with heavy tails.
+
+    Attributes:
+        gains: coefficients, shape (k,).
+        t: their ratios to standard errors that are robust to correlation within blocks, shape (k,).
+        blocks: log-likelihood of every block, shape (m,).
+        scale: of the innovations.
+    """
+
+    gains: Floats
+    t: Floats
+    blocks: Floats
+    scale: float
+
+
+@compiled("void(float64[:, ::1], float64, float64, boolean[::1])")
+def _whiten_rows(values: Floats, phi: float, theta: float, fresh: Flags) -> None:
+    for j in range(values.shape[1]):
+        before = made = 0.0
+        for k in range(values.shape[0]):
+            value = values[k, j]
+            made = value if fresh[k] else value - phi * before + theta * made
+            values[k, j] = made
+            before = value
+
+
+@compiled("float64(float64[::1], float64)")
+def _reweigh_scale(rest: Floats, power: float) -> float:
+    for _ in range(12):
+        total = 0.0
+        for k in range(rest.size):
+            square = rest[k] * rest[k]
+            total += 5.0 * square / (4.0 + square / power)
+        power = max(total / rest.size, 1e-16)
+    return power
+
+
+def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
+    """Innovations u_k = d_k - phi d_(k-1) + theta u_(k-1) of every column, restarted at gaps."""
+    made = np.array(values, dtype=np.float64, order="C")
+    _whiten_rows(made, *noise, steps.fresh)
+    return made
+
+
+def _find_scale(rest: Floats) -> float:
+    """Scale of Student's t with four degrees of freedom by reweighting."""
+    rest = np.ascontiguousarray(rest)
+    return float(np.sqrt(_reweigh_scale(rest, max(1.5 * float(np.median(rest * rest)), 1e-16))))
+
+
+def _likelihoods(rest: Floats) -> tuple[float, Floats]:
+    """Scale and log-likelihood of every residual, up to a constant."""
+    scale = _find_scale(rest)
+    return scale, -np.log(scale) - 0.5 * (_FREEDOM + 1.0) * np.log1p((rest / scale) ** 2 / _FREEDOM)
+
+
+def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
+    """Gains, residuals and square roots of the weights by reweighted least squares."""
+    weight, gains = np.ones(values.size), np.zeros(columns.shape[1])
+    rest = values
+    for _ in range(rounds):
+        if gains.size:
+            weighted = columns * weight[:, None]
+            gains = np.linalg.lstsq(weighted.T @ weighted, weighted.T @ (values * weight), rcond=1e-12)[0]
+        rest = values - columns @ gains
+        weight = np.sqrt((_FREEDOM + 1.0) / (_FREEDOM + (rest / _find_scale(rest)) ** 2))
+        if not gains.size:
+            break
+    return gains, rest, weight
+
+
+def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
+    """Fit a channel of the motion by columns.
+
+    Args:
+        values: increments, shape (n,).
+        columns: explaining increments, shape (n, k); k may be zero.
+        steps: the time steps.
+    """
+    _, rest, _ = _solve(values, columns)
+    noise, best = _NOISES[0], -np.inf
+    for each in _NOISES:
+        score = float(_likelihoods(_whiten(rest[:, None], each, steps)[:, 0])[1].sum())
+        if score > best + 2.0:
+            noise, best = each, score
+    white = _whiten(np.column_stack([values, columns]), noise, steps)
+    design = white[:, 1:]
+    gains, rest, weight = _solve(white[:, 0], design)
+    scale, each_step = _likelihoods(rest)
+    blocks = np.bincount(steps.block, each_step)
+    if not gains.size:
+        return Fit(gains, gains, blocks, scale)
+    inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
+    pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
+    error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
+    return Fit(gains, gains / error, blocks, scale)
+
+
+def compare(one: Floats, other: Floats) -> float:
+    """Vuong's statistic of two readings by their likelihoods in blocks; positive if the first is likelier."""
+    gain = one - other
+    gain = gain[gain != 0.0]
+    return 0.0 if gain.size < 4 else float(gain.sum() / (np.sqrt(gain.size) * gain.std() + 1e-9))  # noqa: PLR2004
