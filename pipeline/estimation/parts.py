@@ -46,7 +46,8 @@ def measure_spread(residual: Floats, part: Part, measure: Measure = guarded_spre
         live = rows & part.live
         for channel in part.channels:
             size = np.abs(residual[live if live.any() else rows, channel])
-            spread[rows, channel] = measure(size, CLIP, float(part.least[channel]))
+            # A channel without any motion, as the turning of a straight drive, says nothing.
+            spread[rows, channel] = measure(size, CLIP, float(part.least[channel])) or np.inf
     return spread
 
 

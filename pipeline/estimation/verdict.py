@@ -11,8 +11,8 @@ from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors, format_excess
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
+from pipeline.recording import FAULTS
 from pipeline.run.windows import HORIZON_S
-from pipeline.stages.checks import FAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

@@ -16,7 +16,6 @@ from itertools import islice
 from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 
 from pipeline.core import format_share
 from pipeline.logs import (
@@ -60,12 +59,12 @@ from pipeline.sources import (
     resolve_vehicle,
 )
 from pipeline.sources.candidates import LOCALIZED
+from pipeline.sources.configuration import RANGES
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
 from pipeline.stages.extract import Extracted
 from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
-from pipeline.sources.configuration import RANGES
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
@@ -434,7 +433,14 @@ def _compare(
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
     if rivals or _may_be_odometry(sources.pose):
         ratings = rate_poses(data, sources, configuration, chosen.vehicle, where=str(index.path))
-        if ratings and ratings[0].from_wheels:
+        if ratings and ratings[0].same_as:
+            text = (
+                f"the pose of {ratings[0].source} is wheel odometry, not a localization: it is that of "
+                f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; record a "
+                "localization (lidar, camera, satellites, motion capture)"
+            )
+            findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
+        elif ratings and ratings[0].from_wheels:
             text = (
                 "the pose comes from the wheels, so forward slip is not observable: "
                 f"{ratings[0].source} is computed from them, and the log has no other pose"
@@ -524,28 +530,25 @@ def _fit_vehicle(
         **{**bare, "id": name, "kind": kind, **assumed, **values, **given},
         stand_ins=[*assumed],
     )
-    findings.append(Finding("vehicle_fitted", "warning", text, where="vehicle"))
-    findings += _compare_lengths(recording.geometry, known, kind)
-    extracted = None
+    is_given = all(key in known for key in values) and not is_body
+    findings.append(Finding("vehicle_fitted", "info" if is_given else "warning", text, where="vehicle"))
     return replace(
         chosen,
         vehicle=vehicle,
         vehicle_source="fitted",
         sources=sources,
         findings=tuple(findings),
-        extracted=extracted,
+        extracted=None,
     )
 
 
 _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
-_OFF = 0.26
-"""Absolute logarithm of a ratio of lengths above which it is no error of a data sheet: 1.3, or .77."""
 
 
 def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
     """Lengths that an analysis of this kind of vehicle takes from its signals [m]: the controller's first."""
     if kind == "ackermann":
-        lengths = {"wheelbase_m": seen.wheelbase}
+        lengths = {"wheelbase_m": seen.wheelbase, "wheel_radius_m": seen.rolled}
     elif seen.radius is not None:
         lengths = {"wheel_radius_m": seen.radius, "track_width_m": seen.track}
     else:
@@ -555,24 +558,6 @@ def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
         for key, length in lengths.items()
         if length is not None and RANGES[key][0] < length.value < RANGES[key][1]
     }
-
-
-def _compare_lengths(seen: Geometry, known: Mapping[str, object], kind: str) -> list[Finding]:
-    """Findings on lengths that the motion contradicts by more than a data sheet errs."""
-    rolled = seen.rolled
-    given = known.get("wheel_radius_m")
-    of, whose = (float(given), "given") if isinstance(given, float) else (None, "")
-    if of is None and seen.radius is not None:
-        of, whose = seen.radius.value, "the controller's"
-    if kind != "differential" or rolled is None or of is None or abs(np.log(rolled.value / of)) < _OFF:
-        return []
-    share = rolled.value / of
-    text = (
-        f"the vehicle covers {format_share(share)} of the distance that its wheels turn with a radius of {of:.3g} m "
-        f"({whose}): by the motion the radius is {rolled.value:.3g} m, k = {share:.2g}; correct the radius (or its "
-        "multiplier) in the controller, or the unit of the wheels"
-    )
-    return [Finding("radius_contradicted", "warning", text, where="vehicle", value=rolled.value)]
 
 
 def _describe_vehicle(
@@ -604,15 +589,20 @@ def _describe_vehicle(
         words["track_width_m"] = "an effective track of"
     parts = {
         key: f"{words[key]} {lengths[key]:.3g} m"
-        + (f" (+- {format_share(errors[key] / lengths[key])})" if key not in given and errors.get(key, 0.0) > 2e-3 * lengths[key] else "")
+        + (
+            f" (+- {format_share(errors[key] / lengths[key])})"
+            if key not in given and errors.get(key, 0.0) > 2e-3 * lengths[key]
+            else ""
+        )
         for key in _LENGTHS
         if key in lengths
     }
     own = " and ".join(text for key, text in parts.items() if key in given)
     shown = " and ".join(text for key, text in parts.items() if key not in given)
-    text = "the log does not identify the vehicle"
-    if own:
-        text += f": {own} as given or recorded"
+    if not shown:
+        text = f"the vehicle has {own}, as given or recorded"
+    else:
+        text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
     if shown and kind == "differential" and seen.radius is not None:
         text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
     elif shown:
@@ -638,7 +628,7 @@ def _describe_vehicle(
 def _list_errors(seen: Geometry, kind: str) -> dict[str, float]:
     """Standard errors of the lengths of `_list_lengths` [m]."""
     if kind == "ackermann":
-        pairs = [("wheelbase_m", seen.wheelbase)]
+        pairs = [("wheelbase_m", seen.wheelbase), ("wheel_radius_m", seen.rolled)]
     elif seen.radius is not None:
         pairs = [("wheel_radius_m", seen.radius), ("track_width_m", seen.track)]
     else:

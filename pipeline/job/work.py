@@ -343,8 +343,6 @@ class Work:
         outlier = velocities["outlier"].to_numpy()
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
         samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
-        if self.alignment.gyro is not None:
-            samples = replace(samples, gyro_sign=float(np.sign(self.alignment.gyro.signed_scale)))
         findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
         model = None if self.options.model is None else self.options.model.name
         return StageOutcome(

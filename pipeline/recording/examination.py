@@ -26,7 +26,7 @@ from pipeline.recording.evidence import (
 )
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Bent, Held, Reading
-from pipeline.recording.score import CLEAR
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.sources import (
     CONFIGURED,
     Configuration,
@@ -41,16 +41,6 @@ from pipeline.sources.candidates import COMMANDED, MEASURED
 from pipeline.stages import Finding
 from pipeline.stages.extract import Extraction
 from pipeline.stages.reading import find_sideways_share
-
-FAULTS = (
-    "signs_contradict",
-    "command_reversed",
-    "motor_reversed",
-    "wheel_dead",
-    "wheels_reversed",
-    "pose_flipped",
-)
-"""Findings of an examination each of which makes every fit meaningless."""
 
 
 @dataclass(frozen=True)
@@ -190,7 +180,7 @@ class _Examination:
             if imu.height
             else None
         )
-        drives = self._read_drives()
+        drives = self._read_drives(motion)
         readings = [drive.reading for drive in drives] + ([gyro] if gyro else [])
         for one in readings:
             one.explain(motion)
@@ -216,7 +206,7 @@ class _Examination:
 
     # Signals.
 
-    def _read_drives(self) -> list[_Drive]:
+    def _read_drives(self, motion: Motion) -> list[_Drive]:
         commands = [self.sources.command, *self.sources.others.get("command", ())]
         wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
         drives, taken = [], set()
@@ -224,14 +214,23 @@ class _Examination:
             for place, source in enumerate(one for one in sources if isinstance(one, DriveSource)):
                 key = (source.form, source.signals)
                 reading = None if key in taken else self._read(source, is_measured=is_measured)
+                if reading is None and key not in taken and is_measured and source == self.sources.wheels:
+                    reading = self._read_by_motion(source, motion)
                 taken.add(key)
                 if reading is not None:
                     drives.append(_Drive(source, reading, place, is_measured))
         return drives
 
-    def _read(self, source: DriveSource, *, is_measured: bool, kind: str = "differential") -> Reading | None:
+    def _read(
+        self,
+        source: DriveSource,
+        *,
+        is_measured: bool,
+        kind: str = "differential",
+        section: DriveSection | None = None,
+    ) -> Reading | None:
         """The signals of a source with unit lengths; None if they cannot be read."""
-        section = DriveSection()
+        section = section or DriveSection()
         if source.reason == CONFIGURED:
             section = self.configuration.wheels if is_measured else self.configuration.command
         if source.form is DriveForm.STEERING:
@@ -253,6 +252,40 @@ class _Examination:
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
         return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
+
+    def _read_by_motion(self, source: DriveSource, motion: Motion) -> Reading | None:
+        """Joints whose names show no side, each put on the side on which the motion turns it; None without."""
+        columns = self.extraction.columns.get(source.signals[0].topic)
+        if (
+            source.form is not DriveForm.JOINTS
+            or columns is None
+            or self.configuration.wheels.left is not None
+        ):
+            return None
+        times, joints = self.extraction.read_rates(source)
+        body = np.column_stack([motion.body.real, motion.yaw])
+        sides: dict[str, list[str]] = {"left": [], "right": []}
+        for name, rate in joints.items():
+            signal = Held(times, rate)
+            if not signal.moves:
+                continue
+            keep = signal.is_there(motion.steps)
+            if keep.sum() < FEWEST_STEPS:
+                continue
+            steps = motion.steps.take(keep)
+            made = fit(signal.integrate(steps, 0.0, 0.0), body[keep], steps)
+            if min(abs(made.t)) > CLEAR:
+                sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
+        if not (sides["left"] and sides["right"]):
+            return None
+        names = {side: ", ".join(found) for side, found in sides.items()}
+        what = f"the joints of {source} do not name their side; by the motion {names['left']} are left and {names['right']} right"
+        line = "; ".join(
+            f"{side} = [{', '.join(repr(one) for one in found)}]" for side, found in sides.items()
+        )
+        self._correct("wheels", what, line.replace("'", '"'), dict(sides))
+        section = self._complete().wheels
+        return self._read(source, is_measured=True, section=section)
 
     # Frame of the pose.
 
@@ -401,7 +434,7 @@ class _Examination:
         up, offset = motion.up, motion.offset_deg
         if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
             # Neither way along another axis is usual.
-            up = f"-{up}"
+            up, offset = f"-{up}", -offset
             signs = {key: -sign if key[1] == "turned" else sign for key, sign in signs.items()}
         if offset and -1 in {sign for (_, axis), sign in signs.items() if axis == "ahead"}:
             offset += 180.0
@@ -414,10 +447,10 @@ class _Examination:
                 if fault == "pose_backward":
                     offset += 180.0
                 elif fault == "pose_mirrored":
-                    up = up.removeprefix("-") if up.startswith("-") else f"-{up}"
+                    up, offset = up.removeprefix("-") if up.startswith("-") else f"-{up}", -offset
                 else:
                     self._tell_fault(fault, command, wheels)
-        self._tell_frame(up, (offset + 180.0) % 360.0 - 180.0, signs)
+        self._tell_frame(up, 180.0 - (180.0 - offset) % 360.0, signs)
 
     def _tell_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
         source = self.sources.pose
@@ -543,7 +576,12 @@ class _Examination:
                     f'yaw_unit = "{rate}"',
                     {"yaw_unit": rate},
                 )
-        if wheels is not None and wheels.reading.form == "sides" and self._is_usable(wheels) and not self.is_known:
+        if (
+            wheels is not None
+            and wheels.reading.form == "sides"
+            and self._is_usable(wheels)
+            and not self.is_known
+        ):
             signal = wheels.source.signals[0]
             explained = wheels.reading.explained
             if explained is None or signal.unit or not wheels.sign("ahead"):
@@ -572,7 +610,8 @@ class _Examination:
             ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
             scale = ahead if car is wheels else 1.0
             error = scale / bent / abs(float(explained.turned.t[0]))
-            return Geometry(wheelbase=Length(scale / bent, error))
+            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if car is wheels else None
+            return Geometry(rolled=rolled, wheelbase=Length(scale / bent, error))
         if wheels is None or wheels.reading.form != "sides":
             sides = command if command is not None and command.reading.form == "sides" else None
         else:

@@ -184,13 +184,13 @@ class Sources:
                     return one
         return None
 
-    def separated(self) -> Sources:
-        """The same, but with measured wheels from another topic than the pose."""
-        pose = None if self.pose is None else self.pose.topic
+    def separated(self, copy: str = "") -> Sources:
+        """The same, but with measured wheels from another topic than the pose, or than a copy of it."""
+        poses = {copy, *(() if self.pose is None else (self.pose.topic,))}
         ranked = [
             one for one in (self.wheels, *self.others.get("wheels", ())) if isinstance(one, DriveSource)
         ]
-        free = [one for one in ranked if {signal.topic for signal in one.signals} != {pose}]
+        free = [one for one in ranked if not {signal.topic for signal in one.signals} <= poses]
         chosen = free[0] if free else None
         if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == CONFIGURED):
             return self

@@ -1,7 +1,6 @@
-"""Checks of a whole run: wiring, scale, and consistency of encoders, command and pose."""
+"""Checks of a whole run: scale, and consistency of encoders, command and pose."""
 
-from collections.abc import Callable, Iterable, Mapping
-from itertools import combinations
+from collections.abc import Callable, Iterable
 from typing import Final
 
 import numpy as np
@@ -24,59 +23,26 @@ from pipeline.stages.trust import (
     estimate_delay,
 )
 
-# Consistency of commands, encoders and poses in left and right, ahead and back: faults of the wiring.
-#
-# Three signals describe the same motion: the command, the encoders and the localization; a gyro describes its
-# turning. If one of them contradicts two others, it is wired or mounted wrongly; no physical effect exchanges
-# left and right. With two that contradict each other, either may be wrong.
-# Only differential drives are checked, whose sides are known.
-
-FAULTS: Final = (
-    "sides_exchanged",
-    "wheel_sign",
-    "pose_mirrored",
-    "signs_contradict",
-    "wheel_dead",
-    "steering_as_yaw_rate",
-)
-"""Findings each of which makes every fit meaningless."""
-
 _LIVE: Final = 0.05
 """Speed of a side [m/s] above encoder rounding and that of a creeping vehicle; above `STILL_MPS`, since here
 the sign of the poses' noise matters."""
-_RELATED: Final = 0.5
-"""Least correlation whose sign is reliable; on recordings of snow and ice it is at least 0.6. Also the
-fraction of the samples in which a side must be commanded to move, for its wheels to be dead."""
 _USUAL: Final = 0.95
 """Fraction of the samples that are not outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
 """Smallest difference of the sides' scales that is reported: unequal tyres and motors reach 0.035."""
-_AXES: Final = ("ahead", "turning")
-_EITHER: Final = "either"
-_WORDS: Final = {
-    "wheels": "the measured wheels",
-    "command": "the commands",
-    "pose": "the poses",
-    "gyro": "the gyro",
-}
-_MIRRORED: Final = (
-    "the poses' frame is of the other hand, as north, east, down (z down, yaw clockwise): "
-    'axes = "ned" under [pose] in run.toml'
-)
-_REVERSED: Final = (
-    "the frame of the poses points to the rear, as that of a sensor that is mounted backward: correct its "
-    "transform to base_link"
-)
 
 
-def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
-    """Check for exchanged sides, a wrong sign, a dead or wrongly scaled encoder, and mirrored poses."""
+def check_side_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
+    """Check for one encoder on another scale than the other, although the vehicle follows commands evenly.
+
+    Unequal tyres show between wheels and body only, a weak motor between command and wheels only; an encoder
+    that reads low shows in both, in opposite directions.
+    """
     if vehicle.kind != "differential" or vehicle.track_width_m is None:
         return []
-    samples_by_name = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
-    signals = {name: signal for name, signal in samples_by_name.items() if signal is not None}
-    if len(signals) == 1:
+    if samples.command is None or samples.measured is None:
         return []
+    signals = {"pose": samples.velocity, "command": samples.command, "wheels": samples.measured}
     known = samples.steady & np.all([np.isfinite(signal).all(axis=1) for signal in signals.values()], axis=0)
     sides = {name: _find_sides(signal[known], vehicle.track_width_m) for name, signal in signals.items()}
     # Without turning and without a command, noise has no sign.
@@ -84,175 +50,6 @@ def check_wiring(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     if live.sum() < FEWEST_SAMPLES:
         return []
     sides = {name: side[live] for name, side in sides.items()}
-    findings = (
-        _check_dead_side(sides)
-        or _check_one_sign(sides)
-        or _check_signs(sides, samples.gyro_sign, body=samples.body_commanded)
-    )
-    return findings or _check_side_scale(sides)
-
-
-def _find_sides(velocity: Floats, track_m: float) -> Floats:
-    """Speed of the left and the right side of an ideal differential drive [m/s], shape (n, 2)."""
-    half = 0.5 * track_m * velocity[:, 2]
-    return np.column_stack((velocity[:, 0] - half, velocity[:, 0] + half))
-
-
-def _check_dead_side(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One side's encoder reads zero throughout while the other's turns, and the vehicle does not spin."""
-    if "wheels" not in sides:
-        return []
-    largest = np.abs(sides["wheels"]).max(axis=0)
-    for dead, (side, other) in enumerate((("left", "right"), ("right", "left"))):
-        reference = sides.get("command", sides["pose"])[:, dead]
-        moves = float(np.mean(np.abs(reference) > _LIVE))
-        if largest[dead] < 1e-6 and largest[1 - dead] > _LIVE and moves > _RELATED:  # noqa: PLR2004 - zero
-            text = (
-                f"the {side} wheels' encoder reads zero throughout while the {other} wheels turn and the "
-                f"{side} side moves: its encoder is dead (take --input command, or correct [wheels] {side})"
-            )
-            return [Finding("wheel_dead", "error", text, where=f"wheels {side}", value=moves)]
-    return []
-
-
-def _check_one_sign(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One side's encoder runs backward: straight motion of the other signals is a spin for it."""
-    if "wheels" not in sides:
-        return []
-    reference = sides.get("command", sides["pose"])
-    related = [_correlate(sides["wheels"][:, k], reference[:, k]) for k in (0, 1)]
-    crossed = [_correlate(sides["wheels"][:, k], reference[:, 1 - k]) for k in (0, 1)]
-    for wrong, side in enumerate(("left", "right")):
-        if related[wrong] < -_RELATED < _RELATED < related[1 - wrong] and related[wrong] < crossed[wrong]:
-            text = (
-                f"the {side} wheels' encoder counts backward (correlation {related[wrong]:.2f} with that "
-                f"side, {related[1 - wrong]:.2f} on the other): invert its sign in the recorder or the robot "
-                "description, or take --input command"
-            )
-            return [Finding("wheel_sign", "error", text, where=f"wheels {side}", value=related[wrong])]
-    return []
-
-
-def _check_signs(sides: Mapping[str, Floats], gyro_sign: float, *, body: bool) -> list[Finding]:
-    """The one of command, wheels and poses that contradicts the others, ahead or in turning."""
-    motion = {name: (side.sum(axis=1), side[:, 1] - side[:, 0]) for name, side in sides.items()}
-    least = LIVE_SHARE * max(float(np.quantile(np.abs(side), _USUAL)) for side in sides.values())
-    wrong: dict[str, list[str]] = {}
-    value = 0.0
-    for index, axis in enumerate(_AXES):
-        # The residual of one axis while the other moves is noise and lag: it has no sign.
-        axis_live = np.any([np.abs(along[index]) > least for along in motion.values()], axis=0)
-        if axis_live.sum() < FEWEST_SAMPLES:
-            continue
-        signs = {
-            frozenset(pair): _correlate(motion[pair[0]][index][axis_live], motion[pair[1]][index][axis_live])
-            for pair in combinations(motion, 2)
-        }
-        name = _find_odd(signs, list(motion), gyro_sign if axis == "turning" else 0.0)
-        if name is not None:
-            wrong.setdefault(name, []).append(axis)
-            value = min(signs.values())
-    # A gyro that names what turns the other way tells of it alone.
-    if len(wrong) == 2 and _EITHER in wrong:  # noqa: PLR2004 - what the gyro names, and the way ahead
-        wrong = {name: list(_AXES) for name in wrong if name != _EITHER}
-    other = next(name for name in sides if name != "pose")
-    if len(wrong) != 1:
-        return []
-    ((name, axes),) = wrong.items()
-    if name == _EITHER:
-        return [_report_either(other, axes, value, body=body)]
-    return [_report_sign(name, axes, value, agree=_list_agreeing(sides, name), body=body)]
-
-
-def _find_odd(signs: Mapping[frozenset[str], float], names: list[str], gyro_sign: float) -> str | None:
-    """The signal against the others, `_EITHER` of two without a third; None if all agree."""
-    if len(names) == 2:  # noqa: PLR2004 - poses, and one more
-        other = next(name for name in names if name != "pose")
-        if signs[frozenset(names)] >= -_RELATED:
-            return None
-        return _EITHER if gyro_sign == 0.0 else "pose" if gyro_sign < 0.0 else other
-    for name in names:
-        against = [value for pair, value in signs.items() if name in pair]
-        among = next(value for pair, value in signs.items() if name not in pair)
-        if max(against) < -_RELATED and among > _RELATED:
-            return name
-    return None
-
-
-def _list_agreeing(sides: Mapping[str, Floats], odd: str) -> str:
-    """The signals that agree against the odd one, in words: the gyro where there is no third one."""
-    others = [name for name in ("command", "wheels", "pose") if name in sides and name != odd]
-    return " and ".join(_WORDS[name] for name in (others if len(others) > 1 else [*others, "gyro"]))
-
-
-def _list_fields(axes: list[str]) -> str:
-    """Fields of a body command along these axes."""
-    return " and ".join({"ahead": "linear.x", "turning": "angular.z"}[axis] for axis in axes)
-
-
-def _format_remedy(name: str, axes: list[str], *, body: bool) -> str:
-    """What mends a command or wheels whose sign is wrong along these axes."""
-    if name == "command" and body:
-        return f"turn the sign of {_list_fields(axes)} in what sends it"
-    if axes == ["turning"]:
-        return f"exchange left and right under [{name}] in run.toml"
-    also = ", and left and right exchanged," if axes == ["ahead"] else ""
-    return f"sign = -1{also} under [{name}] in run.toml"
-
-
-def _report_either(name: str, axes: list[str], value: float, *, body: bool) -> Finding:
-    """Two signals that contradict each other, with what mends the one and the other."""
-    verbs = {"ahead": "drive", "turning": "turn"}
-    pose = "base_link is mirrored: correct the localization's frame"
-    if len(axes) == 1:
-        pose = _MIRRORED if axes == ["turning"] else _REVERSED
-    what = (
-        f"have the wrong sign of {_list_fields(axes)} where they are sent"
-        if name == "command" and body
-        else f"have the wrong sign: {_format_remedy(name, axes, body=body)}"
-    )
-    text = (
-        f"{_WORDS[name]} and the poses {' and '.join(verbs[axis] for axis in axes)} opposite ways "
-        f"(correlation {value:.2f}), and no third signal tells which of them is wrong: either {pose}; or "
-        f"{_WORDS[name]} {what}"
-    )
-    return Finding("signs_contradict", "error", text, where=f"{name}, pose", value=value)
-
-
-def _report_sign(name: str, axes: list[str], value: float, *, agree: str, body: bool) -> Finding:
-    turned = f"correlation {value:.2f}"
-    if name == "pose":
-        what = "move backward and turn the other way: base_link is mirrored"
-        mend = "correct the localization's frame"
-        if axes == ["turning"]:
-            what, mend = "turn the other way", _MIRRORED
-        elif axes == ["ahead"]:
-            what, mend = "move backward", _REVERSED
-        text = f"{agree} agree, and the poses {what} ({turned}): {mend}"
-        return Finding("pose_mirrored", "error", text, where="pose", value=value)
-    they, mend = _WORDS[name], _format_remedy(name, axes, body=body)
-    if axes == ["turning"]:
-        text = (
-            f"left and right are exchanged: {they} turn left where the vehicle turns right ({turned}; {mend})"
-        )
-        return Finding("sides_exchanged", "error", text, where=name, value=value)
-    also = (
-        " and left and right are exchanged" if axes == ["ahead"] and not (body and name == "command") else ""
-    )
-    text = (
-        f"{they} run backward while the vehicle drives forward ({turned}): their sign is wrong{also} ({mend})"
-    )
-    return Finding("wheel_sign", "error", text, where=name, value=value)
-
-
-def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
-    """One encoder on another scale than the other, although the vehicle follows the commands evenly.
-
-    Unequal tyres show between wheels and body only, a weak motor between command and wheels only; an encoder
-    that reads low shows in both, in opposite directions.
-    """
-    if set(sides) != {"pose", "command", "wheels"}:
-        return []
     turned = sides["pose"][:, 1] - sides["pose"][:, 0]
     (left, right), _ = fit_robustly(sides["wheels"], turned)
     (left_ratio, _), _ = fit_robustly(sides["command"], sides["wheels"][:, 0])
@@ -270,6 +67,12 @@ def _check_side_scale(sides: Mapping[str, Floats]) -> list[Finding]:
         "resolution?)"
     )
     return [Finding("wheel_scale", "warning", text, where=f"wheels {low}", value=float(np.exp(-abs(scale))))]
+
+
+def _find_sides(velocity: Floats, track_m: float) -> Floats:
+    """Speed of the left and the right side of an ideal differential drive [m/s], shape (n, 2)."""
+    half = 0.5 * track_m * velocity[:, 2]
+    return np.column_stack((velocity[:, 0] - half, velocity[:, 0] + half))
 
 
 def _correlate(one: Floats, other: Floats) -> float:
@@ -430,24 +233,21 @@ _SKEW = 0.05
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:
     """All checks; if the vehicle does not move, only those that report this.
 
-    Wheels on a wrong scale, or one side with a wrong sign, may look like no motion: scale and wiring are
-    checked first.
+    Wheels on a wrong scale may look like no motion: the scale is checked first.
     """
-    scaled, wired = check_scale(samples, vehicle), check_wiring(samples, vehicle)
-    is_faulty = any(finding.severity == "error" for finding in wired)
+    scaled = check_scale(samples, vehicle)
     stuck = check_dead_wheels(samples, vehicle)
-    stuck += [] if scaled or is_faulty else check_motion(samples, vehicle)
+    stuck += [] if scaled else check_motion(samples, vehicle)
     if stuck:
         return stuck
-    if is_faulty:
-        return scaled + wired
     checks: tuple[Callable[[Samples, Vehicle], list[Finding]], ...] = (
+        check_side_scale,
         check_live_commands,
         check_limits,
         check_delays,
         check_map_shape,
     )
-    return scaled + wired + [finding for check in checks for finding in check(samples, vehicle)]
+    return scaled + [finding for check in checks for finding in check(samples, vehicle)]
 
 
 def check_dead_wheels(samples: Samples, _vehicle: Vehicle) -> list[Finding]:

@@ -237,6 +237,20 @@ def _read_series(columns: TopicColumns) -> tuple[dict[str, Floats], dict[str, Fl
     return velocity, position
 
 
+def read_rates(columns: TopicColumns, times: Floats) -> dict[str, Floats]:
+    """Rates of all joints by name, of velocities or else of positions.
+
+    Args:
+        columns: a topic whose type has wheels by name.
+        times: time of each message [s].
+    """
+    velocity, position = _read_series(columns)
+    rates = {name: rate for name, rate in velocity.items() if _is_known(name, velocity, position)}
+    return rates | {
+        name: differentiate_angle(times, angle) for name, angle in position.items() if name not in rates
+    }
+
+
 def _read_interfaces(
     names: RaggedStrings, interfaces: RaggedStrings, values: Ragged
 ) -> dict[tuple[str, str], Floats] | None:

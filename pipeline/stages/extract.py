@@ -33,6 +33,7 @@ from pipeline.stages.drive import (
     is_angle,
     read_joints,
     read_pair,
+    read_rates,
     read_signal,
     read_speed,
 )
@@ -431,6 +432,12 @@ class Extraction:
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
         return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+
+    def read_rates(self, source: DriveSource) -> tuple[Floats, dict[str, Floats]]:
+        """Times [s] and rates [rad/s] of all joints of a topic that turn, by name."""
+        columns, clock, order = self._require(source.signals[0].topic, held=False)
+        times = self._seconds(clock.stamp)
+        return times[order], {name: rate[order] for name, rate in read_rates(columns, times).items()}
 
     @cached_property
     def _wheels(self) -> pl.DataFrame:

@@ -66,6 +66,8 @@ class PoseRating:
         reason: as text.
         refusal: why it is unusable; empty if it is usable.
         made: tables extracted for the rating, without intervals; of the best candidate only.
+        places: its positions, rounded to a micrometre.
+        same_as: wheel odometry with the same positions; empty if there is none.
     """
 
     source: PoseSource
@@ -79,6 +81,8 @@ class PoseRating:
     reason: str = ""
     refusal: str = ""
     made: Extracted | None = None
+    places: frozenset[tuple[float, float]] = frozenset()
+    same_as: str = ""
 
     def format_line(self) -> str:
         """One line."""
@@ -109,7 +113,23 @@ def rate_poses(
         ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
-    return tuple(ratings)
+    return tuple(replace(_find_copy(one, ratings), places=frozenset()) for one in ratings)
+
+
+_COPIED: Final = 0.9
+"""Share of positions that two topics have in common if one is a copy of the other."""
+
+
+def _find_copy(rating: PoseRating, ratings: Sequence[PoseRating]) -> PoseRating:
+    """The rating of a pose that an odometry of the wheels, by its name, publishes as well."""
+    if not rating.places or not _ODOMETRY_FRAME.search(rating.parent.lower()):
+        return rating
+    for other in ratings:
+        is_dead_reckoned = DEAD_RECKONED.search(str(other.source).lower()) and other is not rating
+        if is_dead_reckoned and len(rating.places & other.places) > _COPIED * len(rating.places):
+            reason = f"the same positions as {other.source}, by its name an odometry of the wheels"
+            return replace(rating, from_wheels=True, same_as=str(other.source), reason=reason)
+    return rating
 
 
 def _rate(
@@ -177,6 +197,7 @@ def _rate(
         score=score,
         reason=", ".join(reasons),
         made=made,
+        places=frozenset(map(tuple, np.round(position, 6).tolist())),
     )
 
 
@@ -315,7 +336,7 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
         **sources.others,
         "pose": tuple(replace(one.source, reason=one.refusal or one.reason) for one in ratings[1:]),
     }
-    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated()
+    return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated(best.same_as)
 
 
 _LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}

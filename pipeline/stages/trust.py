@@ -114,7 +114,6 @@ class Samples:
         command: ideal velocity of the command, shape (n, 3); None without commands.
         measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
         body_commanded: whether the command was a body command.
-        gyro_sign: sign of the gyro as recorded against the poses; zero without one that agrees with them.
     """
 
     times: Floats
@@ -128,7 +127,6 @@ class Samples:
     command: Floats | None
     measured: Floats | None
     body_commanded: bool
-    gyro_sign: float = 0.0
 
 
 def gather_samples(

@@ -40,7 +40,9 @@ class EffectiveWheelbase(KinematicEffect):
             "effective over nominal wheelbase",
             1.1,
             least=Least(0.01, Least.DATA_SHEET),
-            plausible=Plausible(0.8, 1.25, "wider than errors of data sheets, and than tyres give way"),
+            plausible=Plausible(
+                0.5, 2.0, "wider than a wheelbase that is given wrongly, and than tyres give way"
+            ),
             quantities=(Quantity.WHEELBASE,),
         ),
     )
