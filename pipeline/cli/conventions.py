@@ -197,10 +197,11 @@ def limited_memory(
     """
     from pipeline.core import limit_memory  # noqa: PLC0415 - heavy
 
-    limit = choose_limit(size)
+    limit = int(_SHARE * measure_memory()) if size is None else _parse_size(size)
 
     def give_up(held: int) -> None:
-        error = out_of_memory(held, limit, name_log(), hint)
+        what = f"it used {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
+        error = SlipError("out_of_memory", what, where=name_log(), hint=hint)
         print_error(error)
         conclude(error)
         sys.stdout.flush()
@@ -211,25 +212,10 @@ def limited_memory(
         yield
 
 
-def choose_limit(size: str | None) -> int:
-    """Bytes of memory that a verb may hold: what ``--memory`` says, else a share of the machine's.
-
-    Raises:
-        BatchError: ``bad_size``.
-    """
-    return int(_SHARE * measure_memory()) if size is None else _parse_size(size)
-
-
 def _parse_size(text: str) -> int:
     from pipeline.batch import parse_size  # noqa: PLC0415 - heavy
 
     return parse_size(text)
-
-
-def out_of_memory(held: int, limit: int, where: str, hint: str) -> SlipError:
-    """The error of work that held more memory [bytes] than it may."""
-    what = f"it used {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
-    return SlipError("out_of_memory", what, where=where, hint=hint)
 
 
 Results: TypeAlias = Annotated[Path, Parameter(help="results folder")]

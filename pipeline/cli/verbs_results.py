@@ -3,43 +3,39 @@
 from __future__ import annotations
 
 import json
-import os
 import re
-import shutil
-import subprocess
 import sys
-import threading
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
-from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
     Results,
-    choose_limit,
     format_state,
     open_results,
-    out_of_memory,
     print_result,
     show_progress,
     summarize_error,
+    tidy_line,
 )
-from pipeline.core import INPUT_WORDS, THREAD_VARIABLES, SlipError, python_command, shorten
+from pipeline.core import INPUT_WORDS, SlipError
 
 if TYPE_CHECKING:
+    import polars as pl
+
     from pipeline.batch.batch_check import Status, Verification
-    from pipeline.cli.query_process import QueryRequest
     from pipeline.store import Manifest
     from pipeline.store.names import Sample
 
-_HINT = "Ask for less at once"
+_WIDE = 200
+_ROWS_AT_ONCE = 1 << 16
+"""Rows converted to text at a time, so that the answer is not in memory a second time as text."""
 _NAMED = 8
 """Maximum number of files without a checksum that are named: those over all runs of one folder."""
 
@@ -64,9 +60,6 @@ def query(  # noqa: D417 - arguments document themselves
     dataset: str | None = None,
     day: str | None = None,
     to: Literal["table", "csv", "json"] = "table",
-    allow_files: bool = False,
-    timeout: PositiveFloat = 1800.0,
-    memory: str | None = None,
     as_json: Annotated[bool, Parameter(name="--json")] = False,
 ) -> int:
     """Query the tables of all runs with SQL.
@@ -79,100 +72,79 @@ def query(  # noqa: D417 - arguments document themselves
         dataset: only runs of this dataset.
         day: only runs of this day, 2026-07-31, or of a month, 2026-07.
         to: how to print the answer.
-        allow_files: let the query open files and addresses of its own (read_csv, read_parquet, ...).
-        timeout: longest time for the answer [s].
-        memory: memory limit, for example 2GB (default: 80 % of the machine's).
         as_json: print one JSON object: columns and rows.
     """
-    from pipeline.cli.query_process import QueryRequest  # noqa: PLC0415 - only for this verb
+    from pipeline.store import Partition  # noqa: PLC0415 - heavy
 
-    partition = {"vehicle": vehicle, "terrain": terrain, "dataset": dataset, "day": day}
-    request = QueryRequest(
-        sql=sql,
-        out=str(_fetch_results(results, sql, partition)),
-        partition=partition,
-        allow_files=allow_files,
-        to="json" if as_json else to,
-        parent=os.getpid(),
-    )
-    _answer_apart(request, timeout, choose_limit(memory))
+    partition = Partition(vehicle=vehicle, terrain=terrain, dataset=dataset, day=day)
+    opened = open_results(results)
+    store = opened.open_store()
+    if opened.mirror is not None:
+        words = re.findall(r"\w+", sql.lower())
+        opened.mirror.pull_tables(words, partition.select(store.manifests()))
+    answer = store.query(sql, partition)
+    if as_json or to == "json":
+        _print_json(answer)
+    elif to == "csv":
+        _print_csv(answer)
+    else:
+        _print_table(answer)
     return CLEAN
 
 
-def _fetch_results(results: Path, sql: str, partition: Mapping[str, str | None]) -> Path:
-    """The results folder, or that of their mirror with the tables that a query uses."""
-    opened = open_results(results)
-    if opened.mirror is not None:
-        from pipeline.store import Partition  # noqa: PLC0415 - only for results on an object store
+def _print_table(answer: pl.DataFrame) -> None:
+    import polars as pl  # noqa: PLC0415 - heavy
 
-        wanted = Partition(**partition)
-        words = re.findall(r"\w+", sql.lower())
-        opened.mirror.pull_tables(words, wanted.select(opened.open_store().manifests()))
-    return opened.root
+    with pl.Config(tbl_rows=-1, tbl_cols=-1, fmt_str_lengths=_WIDE, tbl_width_chars=_WIDE):
+        _write("".join(f"{tidy_line(line)}\n" for line in str(answer).split("\n")))
 
 
-def _answer_apart(request: QueryRequest, timeout_s: float, memory_bytes: int) -> None:
-    """Run the query in a separate process, and print its output.
+def _print_csv(answer: pl.DataFrame) -> None:
+    import polars as pl  # noqa: PLC0415 - heavy
 
-    Raises:
-        SlipError: the error that the process reports; ``timed_out``, ``out_of_memory`` or ``query_died``.
-    """
-    from pipeline.cli.query_process import STACK_BYTES  # noqa: PLC0415 - only for this verb
-    from pipeline.core import MemoryWatchdog  # noqa: PLC0415 - only for this verb
+    from pipeline.core.untrusted import format_csv  # noqa: PLC0415 - heavy
 
-    pinned = {**dict.fromkeys(THREAD_VARIABLES, "1"), "RUST_MIN_STACK": str(STACK_BYTES)}
-    watchdog, is_late = MemoryWatchdog(memory_bytes), threading.Event()
-    with subprocess.Popen(  # noqa: S603 - our own words
-        python_command("-m", "pipeline.cli.query_process"),
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, env={**pinned, **os.environ},
-    ) as process:  # fmt: skip
-        assert process.stdin is not None  # noqa: S101 - for types
-        assert process.stdout is not None  # noqa: S101
-        assert process.stderr is not None  # noqa: S101
-
-        def give_up() -> None:
-            is_late.set()
-            process.kill()
-
-        timer = threading.Timer(min(timeout_s, threading.TIMEOUT_MAX), give_up)
-        watchdog.watch(process.pid)
-        watchdog.start()
-        timer.start()
-        try:
-            # If the process has died already, the error is raised below.
-            with suppress(BrokenPipeError):
-                process.stdin.write(json.dumps(asdict(request)).encode())
-                process.stdin.close()
-            sys.stdout.flush()
-            shutil.copyfileobj(process.stdout, sys.stdout.buffer)
-            answer = process.stderr.read()
-            code = process.wait()
-        finally:
-            timer.cancel()
-            process.kill()
-            watchdog.stop()
-    if code == CLEAN:
-        return
-    where = shorten(request.sql)
-    held = watchdog.held_by(process.pid)
-    if held is not None:
-        raise out_of_memory(held, memory_bytes, where, f"Give it more with --memory, or {_HINT.lower()}")
-    if is_late.is_set():
-        what = f"there was no answer within {timeout_s:g} s"
+    try:
+        _write(format_csv(answer.clear()))
+        for part in answer.iter_slices(_ROWS_AT_ONCE):
+            _write(format_csv(part, header=False))
+    except pl.exceptions.PolarsError as error:
+        said = str(error).splitlines()[0]
         raise SlipError(
-            "timed_out", what, where=where, hint=f"Give it a longer --timeout, or {_HINT.lower()}"
-        )
-    with suppress(ValueError):
-        raise SlipError(**json.loads(answer))
-    how = f"signal {-code}" if code < 0 else f"exit code {code}"
-    last = answer.decode(errors="replace").strip().rpartition("\n")[2]
-    what = f"the process that answers it has died ({how}){f': {last}' if last else ''}"
-    raise SlipError(
-        "query_died",
-        what,
-        where=where,
-        hint=f"{_HINT}; `slip results verify` checks whether tables are damaged",
+            "no_csv", f"the answer cannot be written as CSV: {said}", hint="Use --to json, or plain columns"
+        ) from error
+
+
+def _print_json(answer: pl.DataFrame) -> None:
+    _write(f'{{"columns": {json.dumps(answer.columns)}, "rows": [')
+    for number, part in enumerate(answer.iter_slices(_ROWS_AT_ONCE)):
+        _write("," * (number > 0) + spell_bytes(part).write_json()[1:-1])
+    _write("]}\n")
+
+
+def _write(text: str) -> None:
+    sys.stdout.buffer.write(text.encode())
+
+
+def spell_bytes(answer: pl.DataFrame) -> pl.DataFrame:
+    """The same table with bytes as hexadecimal digits: JSON has no word for them."""
+    import polars as pl  # noqa: PLC0415 - heavy
+
+    return answer.with_columns(
+        pl.Series(column.name, [_spell(value) for value in column.to_list()], strict=False)
+        for column in answer
+        if "Binary" in str(column.dtype)
     )
+
+
+def _spell(value: object) -> object:
+    if isinstance(value, bytes):
+        return value.hex()
+    if isinstance(value, list):
+        return [_spell(each) for each in value]
+    if isinstance(value, dict):
+        return {name: _spell(each) for name, each in value.items()}
+    return value
 
 
 def status(  # noqa: D417 - arguments document themselves

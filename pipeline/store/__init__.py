@@ -202,24 +202,19 @@ class Store:
 
         return scan_table(table, root=self.root, manifests=self.manifests(), partition=partition)
 
-    def query(
-        self, sql: str, partition: Partition | None = None, *, allow_files: bool = False
-    ) -> pl.DataFrame:
+    def query(self, sql: str, partition: Partition | None = None) -> pl.DataFrame:
         """Answer SQL over all tables by name.
 
         Args:
             sql: the question.
             partition: the runs to look at, as for `scan`.
-            allow_files: whether the question may open files and addresses that are none of the results.
 
         Raises:
-            StoreError: ``bad_query``, ``files_not_allowed``, or a manifest is damaged.
+            StoreError: ``bad_query``, or a manifest or a table is damaged.
         """
         from pipeline.store.parquet_tables import answer_query  # noqa: PLC0415 - heavy
 
-        return answer_query(
-            sql, root=self.root, manifests=self.manifests(), partition=partition, allow_files=allow_files
-        )
+        return answer_query(sql, root=self.root, manifests=self.manifests(), partition=partition)
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""

@@ -17,16 +17,15 @@ import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from pipeline.core import shorten
 from pipeline.store.names import (
     NO_FACTS,
     QUARANTINE,
     StoreError,
     TableReport,
     date_runs,
-    file_missing,
     join_inside,
     name_damage,
-    name_disk_errors,
     table_damaged,
 )
 from schemas import Contract, contract_of, list_contracts
@@ -278,33 +277,10 @@ def _check_columns(name: str, columns: pl.Schema, wanted: pl.Schema) -> None:
         )
 
 
-_READERS = re.compile(
-    r"(?:read|scan)_(?:csv|parquet|ipc|json|ndjson|avro|delta|iceberg|excel|database|\w*(?=\W*\())"
-)
-"""Names by which SQL opens files and addresses, wherever they stand: none is ever meant as a text."""
-
-_TOKEN = re.compile(r"'[^']*'|\d[\w.]*|\w+|[^\s\w,]")
-"""A text, a number, a word or a mark."""
-
 _QUESTION = re.compile(
     r"(?>\s|\(|--[^\n]*(?:\n|$)|/\*.*?\*/)*+(?:SELECT|WITH|FROM)\b", re.IGNORECASE | re.DOTALL
 )
 """The beginning of a query, behind comments; the engine also takes FROM before SELECT."""
-
-_LONGEST = 65_536
-"""Characters of a query. Two of them make the engine recurse once (`+1`): so it does less often than where it
-crashes on the stack of `slip results query`."""
-
-_MOST_WORDS = 1_000
-"""Words and marks of a query without texts, numbers and commas: each may make the engine recurse once. On the
-usual stack of 8 MB it crashes beyond 600 chained `||`, which are 1200 marks, or 600 UNION ALL, which are 1800
-words."""
-
-_DEEPEST = 40
-"""Brackets within each other: the engine's parser itself refuses 48."""
-
-_SHOWN = 500
-"""Characters of a query or of a complaint about it in an error."""
 
 RUNS_TABLE = "runs"
 """A table that is made of the manifests: one row a run."""
@@ -374,12 +350,7 @@ def _select(manifests: Sequence[Manifest], partition: Partition | None) -> Seque
 
 
 def answer_query(
-    sql: str,
-    *,
-    root: Path,
-    manifests: Sequence[Manifest],
-    partition: Partition | None = None,
-    allow_files: bool = False,
+    sql: str, *, root: Path, manifests: Sequence[Manifest], partition: Partition | None = None
 ) -> pl.DataFrame:
     """Answer SQL over all tables and their quarantines by name.
 
@@ -388,22 +359,12 @@ def answer_query(
         root: the results folder.
         manifests: the generations, which date each other.
         partition: those of them to look at.
-        allow_files: whether the question may open files and addresses that are none of the results.
 
     Raises:
-        StoreError: ``bad_query``, with what polars says about it; ``files_not_allowed``; ``file_missing``;
-            ``table_damaged``, a table has not the rows that it should have.
+        StoreError: ``bad_query``, with what polars says about it; ``file_missing`` or ``table_damaged``, a
+            table is not what its manifest says.
     """
-    _check_size(sql)
     _check_kind(sql)
-    reader = None if allow_files else _READERS.search(sql.lower())
-    if reader is not None:
-        raise StoreError(
-            "files_not_allowed",
-            f"the query names {reader[0]}, which opens files outside the results",
-            where=_shorten(sql),
-            hint="Query the tables of the results only, or give --allow-files if the query is your own",
-        )
     names = [contract.name for contract in list_contracts()]
     known = (RUNS_TABLE, *names, *(f"{QUARANTINE}{name}" for name in names))
     # With many runs, getting every table ready takes longer than the answer: only those that are spoken of.
@@ -411,48 +372,16 @@ def answer_query(
     asked = [name for name in known if name in said]
     try:
         scan = partial(scan_table, root=root, manifests=manifests, partition=partition)
-        frames = {name: scan(name) for name in asked}
-        with name_disk_errors(root):
-            return pl.SQLContext(frames).execute(sql, eager=True)
-    except StoreError:
-        gone = [path for path in _list_files(asked, _select(manifests, partition)) if not path.exists()]
-        if gone:
-            raise file_missing(gone[0]) from None
-        raise
-    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, UnicodeEncodeError) as error:
+        return pl.SQLContext({name: scan(name) for name in asked}).execute(sql, eager=True)
+    except (pl.exceptions.PolarsError, pl.exceptions.PanicException, UnicodeEncodeError, OSError) as error:
+        what = str(error).partition("\n")[0]
+        hint = f"The tables are: {', '.join((RUNS_TABLE, *names))}"
+        if "no column named" in what:
+            columns = ((name, _RUNS_SCHEMA if name == RUNS_TABLE else schema_of(name)) for name in asked)
+            hint = "; ".join(f"Columns of {name}: {', '.join(schema)}" for name, schema in columns)
         raise StoreError(
-            "bad_query",
-            f"the query cannot be answered: {_shorten(str(error).partition(chr(10))[0])}",
-            where=_shorten(sql),
-            hint=f"The tables are: {', '.join((RUNS_TABLE, *names))}",
+            "bad_query", f"the query cannot be answered: {what}", where=shorten(sql), hint=hint
         ) from error
-
-
-def _check_size(sql: str) -> None:
-    """Refuse what the engine would overflow its stack on: it ends the process then.
-
-    Raises:
-        StoreError: ``bad_query``.
-    """
-    words = depth = deepest = 0
-    if len(sql) <= _LONGEST:
-        for match in _TOKEN.finditer(sql):
-            first = match[0][0]
-            words += not (first == "'" or first.isdigit())
-            depth += (first in "([{") - (first in ")]}")
-            deepest = max(deepest, depth)
-    for what, number, most in (
-        ("characters", len(sql), _LONGEST),
-        ("words and marks besides texts and numbers", words, _MOST_WORDS),
-        ("brackets within each other", deepest, _DEEPEST),
-    ):
-        if number > most:
-            raise StoreError(
-                "bad_query",
-                f"the query cannot be answered: it has {number} {what}, more than {most}",
-                where=_shorten(sql),
-                hint="Ask in parts, with IN (...) in place of a chain of OR",
-            )
 
 
 def _check_kind(sql: str) -> None:
@@ -465,17 +394,9 @@ def _check_kind(sql: str) -> None:
         raise StoreError(
             "bad_query",
             "the query cannot be answered: it does not begin with SELECT or WITH",
-            where=_shorten(sql),
+            where=shorten(sql),
             hint="Queries read tables and never change them: SELECT run, vehicle FROM runs",
         )
-
-
-def _list_files(tables: Sequence[str], manifests: Sequence[Manifest]) -> list[Path]:
-    return [manifest.path(table) for manifest in manifests for table in tables if table in manifest.tables]
-
-
-def _shorten(text: str) -> str:
-    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]} ..."
 
 
 def _fit(frame: pl.LazyFrame, schema: pl.Schema) -> pl.LazyFrame:

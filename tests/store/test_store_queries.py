@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
+import numpy as np
 import polars as pl
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from polars.testing import assert_frame_equal
 from store_samples import break_windows, make_slip, make_windows, write_generation
 
 from pipeline.store import Store, StoreError
+from pipeline.store.checksums import encode_manifest
+from pipeline.store.files import MANIFEST
 from pipeline.store.parquet_tables import check_table, schema_of
 from schemas import list_contracts
 
@@ -67,6 +73,43 @@ def test_query_over_a_file_that_is_gone_says_how_it_is_made_again(store: Store) 
     with pytest.raises(StoreError, match=r"slip results verify --repair") as caught:
         store.query("SELECT count(*) FROM slip")
     assert (caught.value.code, caught.value.where) == ("file_missing", str(manifest.folder / "slip.parquet"))
+
+
+def inflate(path: Path, rows: int) -> None:
+    """Put a table of so many equal rows in the place of another: it takes hardly any bytes."""
+    schema = pq.read_schema(path)
+    one = pq.read_table(path).slice(0, 1).combine_chunks()
+    piece = pa.Table.from_arrays(
+        [pa.repeat(one.column(name)[0], 1 << 20) if not pa.types.is_dictionary(one.schema.field(name).type)
+         else pa.DictionaryArray.from_arrays(
+             pa.array(np.zeros(1 << 20, dtype=np.uint32)), one.column(name).chunk(0).dictionary)
+         for name in schema.names],
+        schema=schema,
+    )  # fmt: skip
+    with pq.ParquetWriter(path, schema, compression="zstd") as writer:
+        for _ in range(rows >> 20):
+            writer.write_table(piece)
+
+
+@pytest.mark.parametrize("admits", [False, True], ids=["manifest is old", "manifest says so too"])
+def test_a_small_file_of_endless_rows_is_not_read(*, admits: bool, store: Store) -> None:
+    manifest = write_generation(store, "a", "k", 1)
+    path, rows = manifest.path("windows"), 4 << 20
+    inflate(path, rows)
+    assert path.stat().st_size < rows / 4
+    if admits:
+        entry = replace(manifest.tables["windows"], rows=rows)
+        (manifest.folder.parent / MANIFEST).write_bytes(
+            encode_manifest(replace(manifest, tables={"windows": entry}))
+        )
+    for read in (
+        lambda: store.query("SELECT sum(samples) AS n FROM windows"),
+        lambda: store.read("a", "windows"),
+        lambda: store.scan("windows"),
+    ):
+        with pytest.raises(StoreError, match=rf"{rows} rows.*--force") as caught:
+            read()
+        assert caught.value.code == "table_damaged"
 
 
 @pytest.mark.parametrize(
