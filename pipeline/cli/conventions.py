@@ -182,7 +182,6 @@ def limited_memory(
     size: str | None,
     name_log: Callable[[], str],
     conclude: Callable[[SlipError], None],
-    hint: str = "Give it more with --memory, or leave the log out",
 ) -> Iterator[None]:
     """End the program with one line when it holds too much memory.
 
@@ -190,7 +189,6 @@ def limited_memory(
         size: memory limit, for example ``2GB``; None for a share of the machine's.
         name_log: which file is being worked on.
         conclude: prints the results so far, where JSON was asked for.
-        hint: what to do then.
 
     Raises:
         BatchError: ``bad_size``.
@@ -200,7 +198,7 @@ def limited_memory(
     limit = choose_limit(size)
 
     def give_up(held: int) -> None:
-        error = out_of_memory(held, limit, name_log(), hint)
+        error = out_of_memory(held, limit, name_log(), "Give it more with --memory, or leave the log out")
         print_error(error)
         conclude(error)
         sys.stdout.flush()
