@@ -391,7 +391,7 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     forget_pools(mirror.store)
     refresh_pools(mirror.store)
     for name in ("datasets.parquet", "quarantine_datasets.parquet", FLEET, "fleet.parquet", TREND, *PAGES):
-        mirror.push_file(name)
+        mirror.push_file(mirror.store.root / name)
 
 
 def _hash_runs(store: Store) -> str:

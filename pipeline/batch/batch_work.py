@@ -118,7 +118,7 @@ class Ledger:
         if self._mirror is not None:
             # A lost entry costs one reading of the log.
             with suppress(StoreError):
-                self._mirror.push_note(entry.log.path)
+                self._mirror.push_file(self._notes.path_of(entry.log.path))
 
 
 def _as_entry(content: Mapping[str, JSON]) -> Entry | None:

@@ -318,7 +318,7 @@ def _tidy_up(store: Store, mirror: Mirror | None, request: Request) -> tuple[tup
             refresh_remote_pools(mirror)
         if request.pruning is not None:
             pruned = prune_results(store, request.pruning)
-            removed = len(pruned.removed) if mirror is None else mirror.prune(store.manifests())
+            removed = len(pruned.removed) if mirror is None else mirror.prune(pruned.removed)
             problems += pruned.problems
     except SlipError as error:
         problems.append(error)

@@ -182,7 +182,6 @@ def limited_memory(
     size: str | None,
     name_log: Callable[[], str],
     conclude: Callable[[SlipError], None],
-    hint: str = "Give it more with --memory, or leave the log out",
 ) -> Iterator[None]:
     """End the program with one line when it holds too much memory.
 
@@ -190,7 +189,6 @@ def limited_memory(
         size: memory limit, for example ``2GB``; None for a share of the machine's.
         name_log: which file is being worked on.
         conclude: prints the results so far, where JSON was asked for.
-        hint: what to do then.
 
     Raises:
         BatchError: ``bad_size``.
@@ -201,6 +199,7 @@ def limited_memory(
 
     def give_up(held: int) -> None:
         what = f"it used {held / 1e9:.2g} GB of memory, more than {limit / 1e9:.2g} GB"
+        hint = "Give it more with --memory, or leave the log out"
         error = SlipError("out_of_memory", what, where=name_log(), hint=hint)
         print_error(error)
         conclude(error)

@@ -170,7 +170,8 @@ def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
 
 
 _OWN = Path("deployments.csv")
-_FEATURES_MEMORY = "2GB"
+_PARQUET = b"PAR1"
+"""First bytes of a Parquet file."""
 
 
 def build_map() -> App:
@@ -218,6 +219,7 @@ def draw(  # noqa: D417 - arguments document themselves
         quiet: print nothing.
     """
     from pipeline.fleet.deployments import ZONES  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import read_features  # noqa: PLC0415 - heavy
     from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -237,7 +239,7 @@ def draw(  # noqa: D417 - arguments document themselves
         raise SlipError("wrong_options", "--cell is of the map of places", hint="Add --terrain.")
     # The default folder may be missing: the map then shows only the literature. Any other must exist.
     store = Store(results) if results == Path("results") else open_results(results).open_store()
-    features = None if shared is None else _read_features(shared)
+    features = None if shared is None else read_features(shared)
     drawn = draw_up_map(store, deployments, fed=fed, show=show, shared=features)
     page = write_map(store, drawn, figures)
     content = {
@@ -331,31 +333,18 @@ def merge(  # noqa: D417 - arguments document themselves
 
 
 def _are_features(*paths: Path) -> bool:
-    from pipeline.fleet.exchange import MAGIC  # noqa: PLC0415 - heavy
-
     for path in paths:
         if path.is_file():
             with path.open("rb") as file:
-                if file.read(len(MAGIC)) == MAGIC:
+                if file.read(len(_PARQUET)) == _PARQUET:
                     return True
     return False
 
 
-def _read_features(path: Path) -> pl.DataFrame:
-    """As `read_features`; end the program if an untrusted file exceeds the memory limit."""
-    from pipeline.cli.conventions import limited_memory  # noqa: PLC0415 - heavy
-    from pipeline.fleet.exchange import read_features  # noqa: PLC0415 - heavy
-
-    with limited_memory(_FEATURES_MEMORY, lambda: str(path), lambda _: None, "Do not trust this file"):
-        return read_features(path)
-
-
 def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
-    from pipeline.fleet.exchange import merge_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.fleet.exchange import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
 
-    merged, twice = merge_features(
-        [_read_features(path) for path in (first, second)], f"{first} and {second}"
-    )
+    merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
     write_features(merged, path)
     runs = merged["sha256"].n_unique()
     content = {"file": str(path), "runs": runs, "rows": merged.height, "twice": twice}

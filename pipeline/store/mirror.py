@@ -1,34 +1,45 @@
-"""Results on an object store, through a mirror of them in a local folder.
+"""Results on an object store: copies of finished generations, through a folder that mirrors them.
+
+A run is copied up as it is published on a disk: its files first, its manifest last, in one request that takes
+place as a whole or not at all. Readers therefore see whole runs, the old or the new. What is missing in the
+mirror, or another than on the store, is copied down. There are no locks between machines: of two that write
+one run at the same time the later manifest stays, and the files of both; share the logs with ``--shard``
+instead.
 
 Names of objects are given by whoever may write to the store: each becomes a path in the mirror or an error.
-
-Generations never change, so what was fetched once is never fetched again. A run is published as on a disk:
-its files first, its manifest last, in one request that takes place as a whole or not at all. Readers
-therefore see whole runs, the old or the new. There are no locks between machines: of two that write one run
-at the same time the later manifest stays; share the logs with ``--shard`` instead.
 """
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import tempfile
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from glob import escape
+from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.core.untrusted import MOST_BYTES, TOO_LARGE
 from pipeline.store import RUNS, Store
-from pipeline.store.checksums import LOG_NOTES, decode_checked, encode_checked, encode_manifest, load_manifest
-from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_bytes, make_folder, replace_file
+from pipeline.store.checksums import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
+from pipeline.store.files import (
+    MANIFEST,
+    MARKER,
+    Manifest,
+    hash_bytes,
+    hash_file,
+    make_folder,
+)
 from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
-from pipeline.store.verification import ABSENT, SEEN, Examination, examine_files
+from pipeline.store.verification import ABSENT, Examination, examine_files
 
 if TYPE_CHECKING:
     from fsspec import AbstractFileSystem
 
-_TOGETHER = 200
-"""Objects fetched by one call: bounds the memory that waits to be written."""
+_OF_THE_DISK = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+"""Errors that only the disk of the mirror has."""
 
 
 class Mirror:
@@ -47,6 +58,7 @@ class Mirror:
         self.store = Store(folder or _default_folder(self.address))
         self._objects = _open_objects(self.address)
         self._prefix = self.address.partition("://")[2]
+        self._listed: Mapping[str, Mapping[str, object]] = {}
 
     def pull_index(self) -> None:
         """Fetch what tells what there is: manifests, notes on logs, tables over all runs.
@@ -54,33 +66,31 @@ class Mirror:
         Raises:
             StoreError: ``store_unreachable``, or the mirror cannot be written.
         """
-        with self._name_errors():
-            self._objects.invalidate_cache()
-            listed = self._list()
-        wanted = [name for name in listed if _is_index(name)]
-        self._forget_gone(listed)
-        self._fetch_changed({name: listed[name] for name in wanted})
+        there = self._list()
+        notes = (self.store.root / LOG_NOTES).glob("*/*.json")
+        for name in map(self._name_of, (*(home / MANIFEST for home in self.store.run_dirs()), *notes)):
+            if name not in there:
+                self._hold(name).unlink(missing_ok=True)
+        self._fetch({name: "" for name in there if _is_index(name) and not self._is_same(name)})
 
     def pull_run(self, run: str) -> None:
         """Fetch the current generation of a run, if there is one.
 
         Raises:
-            StoreError: as `pull_index`.
+            StoreError: as `pull_index`; ``file_damaged``.
         """
         home = f"{RUNS}/{encode_run(run)}"
-        data = self.read(f"{home}/{MANIFEST}")
-        if data is None:
-            return
-        self._put(f"{home}/{MANIFEST}", data)
-        manifest = load_manifest(self.store.root / home)
-        if manifest is not None:
-            self._fetch(self._list_missing(manifest, manifest.names()))
+        if f"{home}/{MANIFEST}" in self._list(home):
+            self._fetch({f"{home}/{MANIFEST}": ""})
+            manifest = load_manifest(self.store.root / home)
+            if manifest is not None:
+                self._fetch(self._list_missing(manifest, manifest.names()))
 
     def pull_tables(self, names: Iterable[str], manifests: Iterable[Manifest]) -> None:
-        """Fetch tables of the given generations that are not here yet.
+        """Fetch tables of the given generations that are not here yet, after `pull_index`.
 
         Raises:
-            StoreError: as `pull_index`.
+            StoreError: as `pull_run`.
         """
         wanted = set(names)
         missing: dict[str, str] = {}
@@ -95,61 +105,51 @@ class Mirror:
         Raises:
             StoreError: as `pull_index`.
         """
-        home = manifest.folder.parent.relative_to(self.store.root).as_posix()
+        self._list(self._name_of(manifest.folder))
+        marker = manifest.folder / MARKER
+        paths = [*map(manifest.path, manifest.names()), *([marker] if marker.exists() else [])]
+        changed = [path for path in paths if not self._is_same(self._name_of(path))]
         with self._name_errors():
-            there = self._list(f"{home}/{manifest.folder.name}")
-            marker = manifest.folder / MARKER
-            paths = [manifest.path(name) for name in manifest.names()]
-            for path in [*paths, marker] if marker.exists() else paths:
-                locate = path.relative_to(self.store.root).as_posix()
-                if there.get(locate, {}).get("size") != path.stat().st_size:
-                    self._objects.pipe_file(self._address_of(locate), path.read_bytes())
-            self._objects.pipe_file(self._address_of(f"{home}/{MANIFEST}"), encode_manifest(manifest))
+            self._objects.put([str(path) for path in changed], [self._address_of(path) for path in changed])
+        self._publish(manifest)
 
-    def push_file(self, name: str) -> None:
-        """Publish a file over all runs, if the mirror has it.
+    def push_file(self, path: Path) -> None:
+        """Publish a file of the mirror that belongs to no generation, if it is there.
 
         Raises:
             StoreError: as `pull_index`.
         """
-        path = join_inside(self.store.root, name)
         if path.exists():
             with self._name_errors():
-                self._objects.pipe_file(self._address_of(name), path.read_bytes())
+                self._objects.put_file(str(path), self._address_of(path))
 
-    def push_note(self, name: str) -> None:
-        """Publish a note on a log.
+    def prune(self, removed: Iterable[Path]) -> int:
+        """Remove generations that were removed from the mirror; first, the manifests forget them.
 
-        Raises:
-            StoreError: as `pull_index`.
-        """
-        path = self.store.notes(LOG_NOTES).path_of(name)
-        if path.exists():
-            with self._name_errors():
-                locate = self._address_of(path.relative_to(self.store.root).as_posix())
-                self._objects.pipe_file(locate, path.read_bytes())
-
-    def prune(self, manifests: Iterable[Manifest]) -> int:
-        """Publish shorter manifests, then remove the generations that they no longer name.
+        A run that another machine has published since is left to that one, and so is what no manifest names:
+        somebody may be about to publish it.
 
         Returns:
             How many generations were removed.
 
         Raises:
-            StoreError: as `pull_index`.
+            StoreError: as `pull_index`, or a manifest is damaged.
         """
-        removed: set[str] = set()
-        for manifest in manifests:
-            home = manifest.folder.parent.relative_to(self.store.root).as_posix()
-            named = {manifest.folder.name, *manifest.earlier}
-            with self._name_errors():
-                self._objects.pipe_file(self._address_of(f"{home}/{MANIFEST}"), encode_manifest(manifest))
-                inside = [(name, name.removeprefix(f"{home}/").split("/")) for name in self._list(home)]
-                doomed = [name for name, parts in inside if len(parts) > 1 and parts[0] not in named]
-                if doomed:
-                    self._objects.rm([self._address_of(name) for name in doomed])
-            removed |= {name.rpartition("/")[0] for name in doomed}
-        return len(removed)
+        count = 0
+        for home, folders in groupby(sorted(removed), key=lambda folder: folder.parent):
+            ours, theirs = load_manifest(home), self.read(self._name_of(home / MANIFEST))
+            published = None if theirs is None else parse_manifest(theirs, home)
+            if ours is None or published is None or published.folder != ours.folder:
+                continue
+            self._publish(ours)
+            old = [folder for folder in folders if folder.name in published.earlier]
+            doomed = [name for folder in old for name in self._list(self._name_of(folder))]
+            if doomed:
+                with self._name_errors():
+                    # Names are no patterns, even with brackets in them.
+                    self._objects.rm([escape(self._address_of(name)) for name in doomed])
+            count += len(old)
+        return count
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Fetch and hash everything, or a sample; what is not what was written, and what cannot be judged.
@@ -166,7 +166,7 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         with self._name_errors(), suppress(FileNotFoundError):
-            self._objects.rm([self._address_of(name)])
+            self._objects.rm_file(self._address_of(name))
         self._hold(name).unlink(missing_ok=True)
 
     def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
@@ -176,20 +176,16 @@ class Mirror:
             StoreError: as `pull_index`.
         """
         del skip
-        with self._name_errors():
-            self._objects.invalidate_cache()
-            return self._list()
+        return self._list()
 
     def read(self, name: str) -> bytes | None:
         """The content of a small object, such as a manifest or a note; None when there is none.
 
         Raises:
-            StoreError: as `pull_index`; ``too_large``.
+            StoreError: as `pull_index`.
         """
         with self._name_errors():
             try:
-                if self._objects.size(self._address_of(name)) > MOST_BYTES:
-                    raise self._too_large(name)
                 content: bytes = self._objects.cat_file(self._address_of(name))
             except FileNotFoundError:
                 return None
@@ -201,100 +197,74 @@ class Mirror:
         Raises:
             StoreError: as `pull_index`.
         """
-        with self._name_errors():
-            try:
-                return hash_bytes(self._objects.cat_file(self._address_of(name)))
-            except FileNotFoundError:
-                return ABSENT
+        content = self.read(name)
+        return ABSENT if content is None else hash_bytes(content)
 
     def locate(self, name: str) -> Path:
         """Where an object stands, or would stand, in the mirror."""
         return self.store.root / name
 
-    def _list(self, under: str = "") -> dict[str, Mapping[str, object]]:
+    def _list(self, under: str = "") -> Mapping[str, Mapping[str, object]]:
         """What the store says of the objects under a prefix, by their names in the results."""
-        try:
-            listed = self._objects.find(self._address_of(under) if under else self.address, detail=True)
-        except FileNotFoundError:
-            return {}
-        return {self._name_of(locate): info for locate, info in listed.items()}
+        self._listed = {}
+        with self._name_errors(), suppress(FileNotFoundError):
+            self._objects.invalidate_cache()
+            listed = self._objects.find(f"{self.address}/{under}".rstrip("/"), detail=True)
+            start = f"{self._prefix}/"
+            self._listed = {name.lstrip("/").removeprefix(start): info for name, info in listed.items()}
+        return self._listed
 
-    def _name_of(self, locate: str) -> str:
-        """Name in the results of an object, by the store's own name or by its address."""
-        plain = locate.partition("://")[2] or locate
-        return plain.removeprefix("/").removeprefix(f"{self._prefix}/")
+    def _name_of(self, path: Path) -> str:
+        return path.relative_to(self.store.root).as_posix()
 
-    def _address_of(self, name: str) -> str:
-        return f"{self.address}/{name}"
+    def _address_of(self, name: str | Path) -> str:
+        return f"{self.address}/{name if isinstance(name, str) else self._name_of(name)}"
 
-    def _fetch_changed(self, listed: Mapping[str, Mapping[str, object]]) -> None:
-        seen_file = self.store.root / SEEN
-        try:
-            seen = decode_checked(seen_file.read_bytes())
-        except (OSError, ValueError):
-            seen = {}
-        tags = {
-            name: f"{info.get('ETag')} {info.get('size')} {info.get('created')}"
-            for name, info in listed.items()
-        }
-        changed = [
-            name for name, tag in tags.items() if seen.get(name) != tag or not self._hold(name).exists()
-        ]
-        for name in changed:
-            if name.endswith(".json") and int(str(listed[name].get("size") or 0)) > MOST_BYTES:
-                raise self._too_large(name)
-        if changed or set(seen) - {""} != set(tags):
-            self._fetch(dict.fromkeys(changed, ""))
-            with name_disk_errors(seen_file):
-                make_folder(self.store.root)
-                replace_file(seen_file, encode_checked({"": "", **tags}))
+    def _is_same(self, name: str) -> bool:
+        """Whether an object is what the mirror holds: the tag of most objects is the MD5 of their content.
 
-    def _forget_gone(self, listed: Mapping[str, object]) -> None:
-        """Runs and notes that are not on the store any more, or not yet, are not in the mirror either."""
-        notes = (self.store.root / LOG_NOTES).glob("*/*.json")
-        for path in (*(home / MANIFEST for home in self.store.run_dirs()), *notes):
-            name = path.relative_to(self.store.root).as_posix()
-            if name not in listed:
-                self._hold(name).unlink(missing_ok=True)
+        What has another tag, such as an encrypted object, is copied again, which costs time only.
+        """
+        path, tag = self._hold(name), self._listed.get(name, {}).get("ETag")
+        if tag is None or not path.is_file():
+            return False
+        return hashlib.md5(path.read_bytes(), usedforsecurity=False).hexdigest() == str(tag).strip('"')
 
     def _list_missing(self, manifest: Manifest, names: Iterable[str]) -> dict[str, str]:
-        """Files of a generation that the mirror has not, and their hashes."""
-        hashes = manifest.hashes()
-        paths = {name: manifest.path(name) for name in names}
-        return {
-            path.relative_to(self.store.root).as_posix(): hashes[path.relative_to(manifest.folder).as_posix()]
-            for path in paths.values()
-            if not path.exists()
-        }
+        """Files of a generation that the mirror has not, or not whole, and their hashes."""
+        sizes = {entry.file: entry.bytes for entry in manifest.tables.values()}
+        sizes |= {name: entry.bytes for name, entry in manifest.files.items()}
+        hashes, missing = manifest.hashes(), {}
+        for path in map(manifest.path, names):
+            name = path.relative_to(manifest.folder).as_posix()
+            if not path.is_file() or path.stat().st_size != sizes[name]:
+                missing[self._name_of(path)] = hashes[name]
+        return missing
 
     def _fetch(self, wanted: Mapping[str, str]) -> None:
-        """Fetch objects by name; those with a hash must have it."""
-        names = list(wanted)
-        for start in range(0, len(names), _TOGETHER):
-            some = names[start : start + _TOGETHER]
+        """Fetch objects by name, those that are there; those with a hash must have it."""
+        paths = {name: self._hold(name) for name in wanted if name in self._listed}
+        if not paths:
+            return
+        with name_disk_errors(self.store.root):
+            make_folder(self.store.root)
+            # An interrupted copy never stands under its name.
+            scratch = tempfile.TemporaryDirectory(prefix=".copies-", dir=self.store.root)
+        with scratch as folder:
+            copies = [Path(folder, str(number)) for number in range(len(paths))]
             with self._name_errors():
-                contents = self._objects.cat([self._address_of(name) for name in some], on_error="return")
-            for locate, data in contents.items():
-                name = self._name_of(locate)
-                # What was removed between the listing and now is simply not there.
-                if isinstance(data, FileNotFoundError):
-                    continue
-                if isinstance(data, Exception):
-                    raise self._unreachable(data)
-                if wanted.get(name) not in {"", hash_bytes(data)}:
+                self._objects.get([self._address_of(name) for name in paths], [str(copy) for copy in copies])
+            for (name, path), copy in zip(paths.items(), copies, strict=True):
+                if wanted[name] not in {"", hash_file(copy)}:
                     raise StoreError(
                         "file_damaged",
                         "an object of the results has changed since it was written",
                         where=self._address_of(name),
                         hint="Look with `slip results verify` for what else is damaged",
                     )
-                self._put(name, data)
-
-    def _put(self, name: str, data: bytes) -> None:
-        path = self._hold(name)
-        with name_disk_errors(path):
-            make_folder(path.parent)
-            replace_file(path, data)
+                with name_disk_errors(path):
+                    make_folder(path.parent)
+                    copy.replace(path)
 
     def _hold(self, name: str) -> Path:
         """The path of an object in the mirror.
@@ -312,23 +282,28 @@ class Mirror:
                 hint="Nothing was written; remove that object, and find out who put it there",
             ) from None
 
+    def _publish(self, manifest: Manifest) -> None:
+        address = self._address_of(manifest.folder.parent / MANIFEST)
+        with self._name_errors():
+            self._objects.pipe_file(address, encode_manifest(manifest))
+
     @contextmanager
     def _name_errors(self) -> Iterator[None]:
         try:
             yield
         except (OSError, ImportError) as error:
+            if isinstance(error, OSError) and error.errno in _OF_THE_DISK:
+                with name_disk_errors(self.store.root):
+                    raise
             raise self._unreachable(error) from error
-
-    def _too_large(self, name: str) -> StoreError:
-        hint = "It is not fetched: look at who wrote it, and remove it"
-        return StoreError("too_large", TOO_LARGE, where=self._address_of(name), hint=hint)
 
     def _unreachable(self, error: Exception) -> StoreError:
         return StoreError(
             "store_unreachable",
             f"the store of the results refuses a request: {' '.join(str(error).split())}",
             where=self.address,
-            hint="Check the network, the bucket and your rights, then run the same command again",
+            hint="Check the network, the bucket, your rights to it and your credentials (AWS_PROFILE, "
+            "AWS_ACCESS_KEY_ID, AWS_ENDPOINT_URL), then run the same command again",
         )
 
 
@@ -336,7 +311,7 @@ def _is_index(name: str) -> bool:
     """Whether an object tells what there is; a store may hold others, which are none of ours."""
     is_note = name.startswith(f"{LOG_NOTES}/")
     looks_like_a_run = name.startswith(f"{RUNS}/") and name.endswith(f"/{MANIFEST}")
-    return is_note or looks_like_a_run or (is_file_name(name) and "/" not in name and name != SEEN)
+    return is_note or looks_like_a_run or (is_file_name(name) and "/" not in name)
 
 
 def _default_folder(address: str) -> Path:

@@ -185,7 +185,13 @@ def check_table(name: str, frame: pl.DataFrame, facts: Mapping[str, float] = NO_
         hint = "Declare it in FACTS of the table in schemas/"
         raise StoreError("wrong_columns", f"the table {name} declares no {', '.join(unknown)}", hint=hint)
     schema = schema_of(name)
-    _check_columns(name, frame.schema, schema)
+    if complaints := list_complaints(frame.schema, schema):
+        raise StoreError(
+            "wrong_columns",
+            f"table {name!r} does not fit its contract: {'; '.join(complaints)}",
+            where=f"schemas/{name}.py",
+            hint="Correct the code that makes the table, or its contract",
+        )
     valid, failure = contract.schema.filter(frame.select(schema.names()))
     report = TableReport(
         rows=valid.height, quarantined=len(failure), rules=dict(sorted(failure.counts().items()))
@@ -260,7 +266,8 @@ def _annotate(contract: Contract, schema: pa.Schema, facts: Mapping[str, float])
     return pa.schema(fields, metadata=about | {name: repr(float(value)) for name, value in facts.items()})
 
 
-def _check_columns(name: str, columns: pl.Schema, wanted: pl.Schema) -> None:
+def list_complaints(columns: Mapping[str, object], wanted: Mapping[str, object]) -> list[str]:
+    """In which columns a table differs from the one that is wanted; types by name of the column."""
     complaints = [f"column {column} is missing" for column in wanted if column not in columns]
     complaints += [f"column {column} is unknown" for column in columns if column not in wanted]
     complaints += [
@@ -268,13 +275,7 @@ def _check_columns(name: str, columns: pl.Schema, wanted: pl.Schema) -> None:
         for column, kind in wanted.items()
         if column in columns and columns[column] != kind
     ]
-    if complaints:
-        raise StoreError(
-            "wrong_columns",
-            f"table {name!r} does not fit its contract: {'; '.join(complaints)}",
-            where=f"schemas/{name}.py",
-            hint="Correct the code that makes the table, or its contract",
-        )
+    return complaints
 
 
 _QUESTION = re.compile(

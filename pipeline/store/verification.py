@@ -19,13 +19,12 @@ if TYPE_CHECKING:
     from pipeline.store.mirror import Mirror
 
 RUNS = "runs"
-SEEN = "mirror.json"
 ABSENT = ""
 """Stands for the hash of a file that is not there."""
 _RUN_DEPTHS = (1, 2)
 """Slashes in the folder of a run, ``runs/stem`` or ``runs/folder/stem``."""
-_OF_BEFORE = ("listed.json", "sealed.json")
-"""Files over all runs of versions that listed and sealed them; nothing reads them any more."""
+_OF_BEFORE = ("listed.json", "sealed.json", "mirror.json")
+"""Files over all runs of earlier versions; nothing reads them any more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -135,7 +134,7 @@ class _Examiner:
         of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
         return Examination(
             problems=tuple(problems),
-            unchecked=(*sorted(of_all - {SEEN, *_OF_BEFORE}), *self._unchecked),
+            unchecked=(*sorted(of_all - {*_OF_BEFORE}), *self._unchecked),
             files=self._tally,
         )
 

@@ -187,11 +187,18 @@ class FailingStore:
     def __getattr__(self, name: str) -> object:
         return getattr(self.objects, name)
 
-    def pipe_file(self, path: str, value: bytes) -> None:
+    def put(self, paths: list[str], addresses: list[str]) -> None:
+        for path, address in zip(paths, addresses, strict=True):
+            self.put_file(path, address)
+
+    def put_file(self, path: str, address: str) -> None:
+        self.pipe_file(address, Path(path).read_bytes())
+
+    def pipe_file(self, address: str, value: bytes) -> None:
         self.left -= 1
         if self.left < 0:
             raise OSError("the network is gone")
-        self.objects.pipe_file(path, value)  # type: ignore[attr-defined]
+        self.objects.pipe_file(address, value)  # type: ignore[attr-defined]
 
 
 def test_a_run_is_published_whole_or_not_at_all(
@@ -223,6 +230,35 @@ def test_a_bucket_that_is_not_there_is_said(
     assert caught.value.code == "no_object_store"
     outcome = batch(season / "a.mcap", tmp_path / "mirror", address="s3://nowhere/results")
     assert outcome.lines[0].code == "store_unreachable"
+
+
+def test_a_store_without_credentials_or_out_of_reach_is_said_in_one_line(
+    bucket: fsspec.AbstractFileSystem, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name, value, why in (
+        ("AWS_ENDPOINT_URL", "http://127.0.0.1:9", "Could not connect"),
+        ("AWS_ACCESS_KEY_ID", "", "credentials"),
+    ):
+        monkeypatch.setenv(name, value)
+        monkeypatch.setenv("AWS_EC2_METADATA_DISABLED", "true")
+        type(bucket).clear_instance_cache()
+        with pytest.raises(StoreError, match=why) as caught:
+            Mirror(f"{BUCKET}/results", tmp_path).pull_index()
+        assert caught.value.code == "store_unreachable"
+        assert len(str(caught.value).splitlines()) == 1
+        assert "AWS_ACCESS_KEY_ID" in caught.value.hint
+
+
+def test_what_has_not_changed_is_not_fetched_again(bucket: fsspec.AbstractFileSystem, tmp_path: Path) -> None:
+    upload(bucket, {"results/index.html": b"old", "results/map.html": b"old"})
+    mirror = Mirror(f"{BUCKET}/results", tmp_path)
+    mirror.pull_index()
+    before = {path.name: path.stat().st_ino for path in tmp_path.iterdir()}
+    upload(bucket, {"results/map.html": b"new"})
+    mirror.pull_index()
+    after = {path.name: path.stat().st_ino for path in tmp_path.iterdir()}
+    assert {name for name in before if before[name] == after[name]} == {"index.html"}
+    assert (tmp_path / "map.html").read_bytes() == b"new"
 
 
 def test_a_bucket_of_a_stranger_writes_nothing_outside_of_its_mirror(

@@ -46,7 +46,6 @@ OTHERS = [
     "..",
     ".bashrc",
     ".lock",
-    "mirror.json",
     "C:",
     "\uff0e\uff0e",
     "latest\\x",
