@@ -145,16 +145,24 @@ _WIN = 5.0
 """Least gain of another unit [nats]."""
 
 
-def find_body_units(ahead: float | None, turned: float | None) -> tuple[str, str]:
+def find_body_units(gains: Sequence[float | None], shares: Sequence[float]) -> tuple[str, str]:
     """Units of a body command by its gains, which slip and a wrong radius change by a factor of two at most.
 
+    A poor fit attenuates: the true gain is between the fitted one and that divided by the share explained.
+
     Args:
-        ahead, turned: motion over command; None where it is not excited.
+        gains: motion over command, ahead and turning; None where it is not excited.
+        shares: part of the motion that is explained, of both.
     """
     costs = {}
     for speed, of_speed in SPEEDS.items():
         for rate, of_rate in RATES.items():
-            logs = [np.log(abs(gain) / of) for gain, of in ((ahead, of_speed), (turned, of_rate)) if gain]
+            # A gain is the motion in SI units over the command in its own unit.
+            logs = [
+                _shrink(float(np.log(abs(gain) / of)), share)
+                for gain, share, of in zip(gains, shares, (of_speed, of_rate), strict=True)
+                if gain
+            ]
             common = float(np.mean(logs)) if logs else 0.0
             costs[speed, rate] = (
                 common**2 / (2 * 0.6**2)
@@ -163,6 +171,11 @@ def find_body_units(ahead: float | None, turned: float | None) -> tuple[str, str
             )
     best = min(costs, key=lambda key: costs[key])
     return best if costs["m/s", "rad/s"] - costs[best] > _WIN else ("m/s", "rad/s")
+
+
+def _shrink(log: float, share: float) -> float:
+    """Logarithm of a gain, as near to one as the share that is explained allows."""
+    return min(0.0, log - np.log(max(share, 1e-6))) if log < 0.0 else log
 
 
 def find_wheel_unit(gain: float, name: str) -> str:

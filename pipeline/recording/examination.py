@@ -84,6 +84,16 @@ class Recording:
     moves: bool = False
 
 
+_STILL = 0.1
+"""Gain of the motion on the drive below which a body stands: on ice it is .13 to .26 of the wheels."""
+_EXPLAINED = 0.9
+"""Share of the motion that a signal in a strange unit explains, and vibration does not."""
+_SMALLEST_M = 0.1
+"""Radius of a wheel [m] that counts as small."""
+_MARGIN = 4.0
+"""Gain of another command over the one by type and name that decides [nats]."""
+
+
 def examine(
     data: LogData,
     sources: Sources,
@@ -311,6 +321,9 @@ class _Examination:
 
     def _choose_roles(self, drives: Sequence[_Drive]) -> tuple[_Drive | None, _Drive | None]:
         """Command and wheels: those by type and name, unless the motion says otherwise."""
+        if self._is_still(drives):
+            for one in drives:
+                one.reading.explained = None
         sure = [one for one in drives if one.is_sure]
         earliest = min(
             (
@@ -323,10 +336,12 @@ class _Examination:
         command = self._find(drives, self.sources.command)
         rivals = [one for one in sure if not one.is_measured]
         if rivals and (command is None or command.source.reason != CONFIGURED):
-            best = max(rivals, key=lambda one: rate_command(one.reading, one.place, earliest))
-            if command is not None and best is not command:
-                self._tell_role("command", best, command)
-            command = best
+            rates = {id(one): rate_command(one.reading, one.place, earliest) for one in rivals}
+            best = max(rivals, key=lambda one: rates[id(one)])
+            if command is None or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
+                if command is not None:
+                    self._tell_role("command", best, command)
+                command = best
         wheels = self._find(drives, self.sources.wheels)
         if wheels is None and self.sources.wheels is None:
             # A pair of sides that is no command measures the wheels.
@@ -340,6 +355,17 @@ class _Examination:
             if wheels is not None and command is not None and command.reading.form == "sides":
                 wheels = wheels if _is_measured(wheels) else None
         return command, wheels
+
+    def _is_still(self, drives: Sequence[_Drive]) -> bool:
+        """Whether the body hardly moves where the drive does: it is stuck, lifted, or another body."""
+        first = self._find(drives, self.sources.command) or self._find(drives, self.sources.wheels)
+        made = None if first is None else first.reading.explained
+        if first is None or made is None or first.reading.form == "steering":
+            return False
+        scale = self.vehicle.wheel_radius_m if self.is_known and first.reading.form == "sides" else 1.0
+        least = _STILL * scale if self.is_known or first.reading.form == "body" else _STILL * _SMALLEST_M
+        gains = max(abs(float(made.ahead.gains[0])), abs(float(made.turned.gains[0])))
+        return gains < least and max(made.shares) < _EXPLAINED
 
     def _find(self, drives: Sequence[_Drive], source: DriveSource | None) -> _Drive | None:
         return next(
@@ -501,7 +527,9 @@ class _Examination:
             text = f"the commands of {name} point {what}"
             self.findings.append(Finding("command_reversed", "error", text, where="command"))
             return
-        if wheels is not None and wheels.reading.form == "sides":
+        if wheels is not None and (
+            wheels.reading.form == "sides" or (wheels.reading.form == "steering" and fault == "wheels_both")
+        ):
             change: dict[str, object] = {}
             what = "left and right encoders are exchanged"
             if fault == "wheels_both":
@@ -553,15 +581,16 @@ class _Examination:
     def _find_units(self, command: _Drive | None, wheels: _Drive | None) -> None:
         if command is not None and command.reading.form == "body" and self._is_usable(command):
             explained = command.reading.explained
-            ahead, turned = (
-                (
-                    abs(float(one.gains[0])) if command.sign(axis) else None
-                    for axis, one in (("ahead", explained.ahead), ("turned", explained.turned))
+            if explained is None:
+                return
+            gains = [
+                abs(float(one.gains[0])) if drive_sign else None
+                for drive_sign, one in (
+                    (command.sign("ahead"), explained.ahead),
+                    (command.sign("turned"), explained.turned),
                 )
-                if explained
-                else (None, None)
-            )
-            speed, rate = find_body_units(ahead, turned)
+            ]
+            speed, rate = find_body_units(gains, explained.shares)
             if speed != "m/s":
                 self._correct(
                     "command",

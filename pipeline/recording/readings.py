@@ -10,11 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.signal import lfilter
 
 from pipeline.core.arrays import Flags, Floats
+from pipeline.core.machine_code import compiled
 from pipeline.recording.motion import Motion
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
 
 GRID_S = 0.02
 _DELAYS_S = np.arange(-0.3, 0.81, 0.05)
@@ -77,14 +77,22 @@ class Held:
         )
 
 
+@compiled("void(float64[::1], float64)")
+def _follow(values: Floats, gain: float) -> None:
+    state = 0.0
+    for k in range(values.size):
+        state += gain * (values[k] - state)
+        values[k] = state
+
+
 def follow(values: Floats, lag: float) -> Floats:
     """First-order lag on the grid, without the delay of half a cell that a filter of held values has."""
     if lag <= 0.0:
         return values
-    gain = 1.0 - np.exp(-GRID_S / lag)
-    made = lfilter([gain], [1.0, gain - 1.0], values)
+    made = np.array(values, dtype=np.float64)
+    _follow(made, 1.0 - float(np.exp(-GRID_S / lag)))
     made[1:] = 0.5 * (made[1:] + made[:-1])
-    return np.asarray(made)
+    return made
 
 
 def _look_up(total: Floats, place: Floats) -> Floats:
@@ -128,7 +136,7 @@ class Explained:
         lever: distance of the pose to the left of the axle's middle that fits [m].
         none: likelihoods of both channels without the reading.
         other: likelihood with (or without) one side reversed; None where it was not tried.
-        lead: Vuong statistic of this delay against none.
+        shares: of both channels, the part of their size that is explained, from 0 to 1.
     """
 
     motion: Motion
@@ -139,7 +147,7 @@ class Explained:
     turned: Fit
     none: tuple[Floats, Floats]
     other: Floats | None
-    lead: float
+    shares: tuple[float, float] = (0.0, 0.0)
 
     @property
     def blocks(self) -> Floats:
@@ -257,11 +265,6 @@ class Reading:
         # The pose may be beside the axle's middle, unless its own turning is what drives it ahead.
         lever = bool(np.dot(first, yaw) ** 2 < 0.5 * np.dot(first, first) * np.dot(yaw, yaw))
         beside = yaw[:, None] if lever else empty
-        at_once = self.columns(motion.steps, 0.0, 0.0, crossed=crossed)
-        now = [
-            fit(ahead, np.column_stack([at_once[0], beside]), motion.steps),
-            fit(yaw, at_once[1][:, None], motion.steps),
-        ]
         made = Explained(
             motion,
             crossed,
@@ -271,9 +274,11 @@ class Reading:
             fit(yaw, second[:, None], motion.steps),
             (fit(ahead, beside, motion.steps).blocks, fit(yaw, empty, motion.steps).blocks),
             None,
-            0.0,
         )
-        made.lead = compare(made.blocks, now[0].blocks + now[1].blocks)
+        made.shares = (
+            measure_share(ahead, float(made.ahead.gains[0]) * first),
+            measure_share(yaw, float(made.turned.gains[0]) * second),
+        )
         return made
 
     def _find_delay(self, motion: Motion, *, crossed: bool) -> tuple[float, float]:

@@ -30,6 +30,10 @@ _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta 
 """Grid of the noise's (phi, theta)."""
 
 
+_MOST_ROWS = 3000
+"""Number of steps above which the noise is fitted to some of the blocks."""
+
+
 @dataclass(frozen=True)
 class Steps:
     """Time steps of a motion, in order.
@@ -141,8 +145,11 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     """
     _, rest, _ = _solve(values, columns)
     noise, best = _NOISES[0], -np.inf
+    # Whole blocks of a long run show its noise.
+    some = steps.block % max(1, rest.size // _MOST_ROWS) == 0
+    part, few = rest[some][:, None], steps.take(some)
     for each in _NOISES:
-        score = float(_likelihoods(_whiten(rest[:, None], each, steps)[:, 0])[1].sum())
+        score = float(_likelihoods(_whiten(part, each, few)[:, 0])[1].sum())
         if score > best + 2.0:
             noise, best = each, score
     white = _whiten(np.column_stack([values, columns]), noise, steps)
@@ -156,6 +163,11 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
     error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
     return Fit(gains, gains / error, blocks, scale)
+
+
+def measure_share(values: Floats, model: Floats) -> float:
+    """Part of the size of some increments that a model explains, outliers discounted, from 0 to 1."""
+    return 1.0 - min(1.0, (_find_scale(values - model) / _find_scale(values)) ** 2)
 
 
 def compare(one: Floats, other: Floats) -> float:
