@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from pipeline.job.analyze import Outcome
     from pipeline.job.keys import Inspection, TopicHealth
     from pipeline.job.watch import Watch
+    from pipeline.recording import Recording
     from pipeline.stages.pose_choice import PoseRating
 
     Content = Mapping[str, object]
@@ -249,6 +250,7 @@ def _format_log(seen: Inspection) -> list[str]:
         lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
     if seen.choice is not None:
         lines += _format_ratings(seen.choice.ratings)
+        lines += _format_evidence(seen.choice.recording)
         lines += [f"note      {finding.text}" for finding in seen.choice.findings]
     if seen.problem:
         why = f"{seen.problem.what}. {seen.problem.hint.rstrip('.')}."
@@ -281,6 +283,30 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
             "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[5]])
             for row in rows
         ),
+    ]
+
+
+def _format_evidence(recording: Recording | None) -> list[str]:
+    """Table of the signals, and how the motion of the pose follows each."""
+    if recording is None or not recording.evidence:
+        return []
+    rows = [("signals", "used as", "z", "ahead x", "turning x", "late", "")]
+    for one in recording.evidence:
+        used = (one.name, one.role or "not used")
+        if one.margin is None:
+            rows.append((*used, "-", "-", "-", "-", one.reason))
+            continue
+        gains = (f"{one.ahead:.4g}" if one.ahead else "-", f"{one.turned:.4g}" if one.turned else "-")
+        rows.append((*used, f"{one.margin:.1f}", *gains, f"{one.late_s:.2f} s", one.reason))
+    widths = [max(len(row[column]) for row in rows) for column in range(6)]
+    about = "          z: how much likelier the motion is with the signal than without it; above 3 it follows"
+    return [
+        "",
+        *(
+            "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[6]]).rstrip()
+            for row in rows
+        ),
+        about,
     ]
 
 

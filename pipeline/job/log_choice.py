@@ -168,7 +168,7 @@ class Choice:
     recording: Recording | None = None
 
     def to_json(self, types: Mapping[str, str]) -> dict[str, JSON]:
-        """The documented keys ``choices`` and ``vehicle_source``.
+        """The documented keys ``choices``, ``vehicle_source`` and ``signals``.
 
         Args:
             types: message type by topic.
@@ -191,7 +191,10 @@ class Choice:
                     ],
                 }
             )
-        return {"choices": choices, "vehicle_source": self.vehicle_source}
+        signals: list[JSON] = []
+        if self.recording is not None:
+            signals = [dict(vars(one)) for one in self.recording.evidence]
+        return {"choices": choices, "vehicle_source": self.vehicle_source, "signals": signals}
 
 
 def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str, object]) -> Choice:

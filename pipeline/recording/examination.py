@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import msgspec
@@ -62,6 +62,29 @@ class Geometry:
 
 
 @dataclass(frozen=True)
+class Evidence:
+    """How the motion follows a signal.
+
+    Attributes:
+        name: its topics.
+        role: ``command``, ``wheels``, ``gyro``, or empty if it is not used.
+        reason: why it is not used; empty if it is.
+        margin: Vuong's statistic of the motion with it against the motion alone; None if too little of it is
+            recorded.
+        ahead, turned: motion over signal, in the signal's units; zero where it is not excited.
+        late_s: delay of the motion [s].
+    """
+
+    name: str
+    role: str
+    reason: str = ""
+    margin: float | None = None
+    ahead: float = 0.0
+    turned: float = 0.0
+    late_s: float = 0.0
+
+
+@dataclass(frozen=True)
 class Recording:
     """What is in a log.
 
@@ -71,7 +94,7 @@ class Recording:
         findings: what was decided, and why.
         kind: kind of vehicle that the signals show; empty if they show none.
         geometry: lengths by the signals.
-        evidence: a line on every signal that was tried.
+        evidence: on every signal that was tried.
         moves: whether the motion follows any of them.
     """
 
@@ -80,7 +103,7 @@ class Recording:
     findings: tuple[Finding, ...] = ()
     kind: str = ""
     geometry: Geometry = Geometry()
-    evidence: tuple[str, ...] = ()
+    evidence: tuple[Evidence, ...] = ()
     moves: bool = False
 
 
@@ -196,10 +219,20 @@ class _Examination:
             one.explain(motion)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
+        is_told = self._tell_sides(command, wheels)
+        if (
+            wheels is not None
+            and wheels.source.form is DriveForm.JOINTS
+            and "reversed" in self.changes.get("wheels", {})
+        ):
+            self._read_again(wheels, motion)
         kind = self._find_kind(wheels, motion)
-        if not self._tell_sides(command, wheels):
+        if not is_told:
             self._tell_signs(motion, command, wheels, gyro)
         self._find_units(command, wheels)
+        used = (("command", command), ("wheels", wheels))
+        roles = {id(one.reading): role for role, one in used if one is not None}
+        roles |= {id(gyro): "gyro"} if gyro is not None else {}
         return Recording(
             replace(
                 self.sources,
@@ -210,7 +243,7 @@ class _Examination:
             tuple(self.findings),
             kind,
             self._measure(command, wheels),
-            tuple(_describe(one) for one in readings),
+            tuple(_describe(one, roles) for one in readings),
             any(drive.is_sure for drive in drives),
         )
 
@@ -379,16 +412,23 @@ class _Examination:
         )
         self.findings.append(Finding("role_by_motion", "info", text, where=role))
 
+    def _read_again(self, wheels: _Drive, motion: Motion, kind: str = "differential") -> bool:
+        """Read the wheels as corrected so far, or of another kind of vehicle; whether the body turns by them."""
+        section = self._complete().wheels if "wheels" in self.changes else None
+        reading = self._read(wheels.source, is_measured=True, kind=kind, section=section)
+        made = None if reading is None else reading.explain(motion)
+        if reading is None or made is None or (kind == "ackermann" and not made.sign("turned")):
+            return False
+        wheels.reading = reading
+        return True
+
     def _find_kind(self, wheels: _Drive | None, motion: Motion) -> str:
         """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
-        if wheels is None or wheels.source.form is not DriveForm.JOINTS or self.configuration.vehicle.kind:
+        given = self.configuration.vehicle.list_values().get("kind")
+        kind = str(given or (self.vehicle.kind if self.is_known else "ackermann"))
+        if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
-        reading = self._read(wheels.source, is_measured=True, kind="ackermann")
-        made = None if reading is None or len(reading.inputs) < 2 else reading.explain(motion)  # noqa: PLR2004
-        if reading is None or made is None or not made.sign("turned"):
-            return ""
-        wheels.reading = reading
-        return "ackermann"
+        return "ackermann" if self._read_again(wheels, motion, kind) else ""
 
     # Sides and signs.
 
@@ -534,6 +574,8 @@ class _Examination:
             what = "left and right encoders are exchanged"
             if fault == "wheels_both":
                 change, what = {"sign": -1}, "both encoders count backward"
+                if wheels.reading.form == "steering":
+                    what = f"the speed of {wheels.source} counts backward"
             elif fault == "wheels_exchanged":
                 change = {"exchanged": True}
             else:
@@ -723,12 +765,17 @@ def _scale(length: Length | None, factor: float) -> Length | None:
     return None if length is None else Length(length.value * factor, length.error * factor)
 
 
-def _describe(reading: Reading) -> str:
-    made = reading.explained
+def _describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
+    made, role = reading.explained, roles.get(id(reading), "")
     if made is None:
-        return f"{reading.name}: too few steps"
-    follows = "follows" if made.is_sure else "does not follow"
-    return (
-        f"{reading.name}: the motion {follows} it (z {made.moves:.1f}, {made.nats:.2f} nats a step), "
-        f"ahead x {made.ahead.gains[0]:.4g}, turned x {made.turned.gains[0]:.4g}, {made.lag + made.delay:.2f} s late"
+        return Evidence(reading.name, role, "" if role else "too little of it is recorded beside the poses")
+    reason = "" if role else "another is likelier" if made.is_sure else "the motion does not follow it"
+    return Evidence(
+        reading.name,
+        role,
+        reason,
+        made.moves,
+        float(made.ahead.gains[0]),
+        float(made.turned.gains[0]),
+        made.lag + made.delay,
     )

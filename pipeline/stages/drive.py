@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
@@ -73,14 +73,6 @@ class Drive:
         taken = {name: None if values is None else values[order] for name, values in series.items()}
         return Drive(**taken, findings=self.findings)
 
-    def rewire(self, section: DriveSection) -> Drive:
-        """The signals with the sides as a configuration says that they are wired."""
-        made = self
-        if section.reversed is not None:
-            side = getattr(made, section.reversed)
-            made = replace(made, **{section.reversed: None if side is None else -side})
-        return replace(made, left=made.right, right=made.left) if section.exchanged else made
-
 
 def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, vehicle: Vehicle) -> Drive:
     """Joint states: wheels by joint name, averaged per side.
@@ -103,6 +95,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     ]
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
+    if section.exchanged:
+        left, right = right, left
     findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
     if missing:
@@ -126,6 +120,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
                 'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
             )
             findings.append(Finding("unit_wrong", "warning", text, where=columns.topic))
+    for joint in {"left": left, "right": right}.get(section.reversed or "", ()):
+        velocity[joint] = -velocity[joint]
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
@@ -418,7 +414,11 @@ def read_pair(
         StageError: the drive of this kind of vehicle has other inputs.
     """
     if form is DriveForm.SIDES:
-        return read_sides(first * section.sign, second * section.sign, vehicle)
+        left, right = (second, first) if section.exchanged else (first, second)
+        signs = (section.sign * (-1 if section.reversed == side else 1) for side in ("left", "right"))
+        return read_sides(
+            *(values * sign for values, sign in zip((left, right), signs, strict=True)), vehicle
+        )
     if form is DriveForm.STEERING:
         return read_steering(first * section.sign, second, vehicle)
     if nominal:

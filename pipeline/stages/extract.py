@@ -412,7 +412,6 @@ class Extraction:
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
         self.findings += drive.findings
-        drive = drive.rewire(section)
         if not held and section.scale is not None:
             text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
             self.findings.append(

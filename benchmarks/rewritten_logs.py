@@ -1,0 +1,421 @@
+"""Logs that are written anew with one thing changed, by the libraries of MCAP alone.
+
+What the change does to the answer is known beforehand: nothing, or it is to be told. Nothing here knows how the
+program reads a log or what it looks for.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from mcap_ros2.writer import Writer
+
+TWIST = """std_msgs/Header header
+geometry_msgs/Twist twist
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Twist
+Vector3 linear
+Vector3 angular
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+_NUMBERS = {"type": "object", "properties": {axis: {"type": "number"} for axis in "xyzw"}}
+IN_FRAME = {
+    "title": "foxglove.PoseInFrame",
+    "type": "object",
+    "properties": {
+        "timestamp": {
+            "type": "object",
+            "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+        },
+        "frame_id": {"type": "string"},
+        "pose": {"type": "object", "properties": {"position": _NUMBERS, "orientation": _NUMBERS}},
+    },
+}
+
+
+@dataclass(frozen=True)
+class Message:
+    """A decoded message, of a topic with its type."""
+
+    topic: str
+    kind: str
+    content: Any
+    log_time: int
+    publish_time: int
+
+
+@dataclass
+class Log:
+    """A log in memory.
+
+    Attributes:
+        messages: in the order of the file.
+        definitions: text of every type.
+        metadata: records by name.
+    """
+
+    messages: list[Message]
+    definitions: dict[str, str]
+    metadata: dict[str, dict[str, str]]
+
+    @property
+    def length(self) -> tuple[int, int]:
+        """First and last log time [ns]."""
+        times = [one.log_time for one in self.messages]
+        return min(times), max(times)
+
+
+def read(path: Path) -> Log:
+    """All messages of a ROS 2 log."""
+    messages, definitions = [], {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message, content in reader.iter_decoded_messages(log_time_order=False):
+            definitions[schema.name] = schema.data.decode()
+            messages.append(
+                Message(channel.topic, schema.name, content, message.log_time, message.publish_time)
+            )
+        metadata = {one.name: dict(one.metadata) for one in reader.iter_metadata()}
+    return Log(messages, definitions, metadata)
+
+
+def write(log: Log, path: Path) -> Path:
+    """Write a log; messages of the type `foxglove.PoseInFrame` are JSON."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        schemas = {name: writer.register_msgdef(name, text) for name, text in log.definitions.items()}
+        inner = writer._writer  # noqa: SLF001 - the library's writer of ROS 2 has no other encoding
+        channels: dict[str, int] = {}
+        for one in log.messages:
+            if one.kind in schemas:
+                writer.write_message(one.topic, schemas[one.kind], one.content, one.log_time, one.publish_time)
+                continue
+            if one.topic not in channels:
+                schema = inner.register_schema(one.kind, "jsonschema", json.dumps(IN_FRAME).encode())
+                channels[one.topic] = inner.register_channel(one.topic, "json", schema)
+            inner.add_message(
+                channels[one.topic], one.log_time, json.dumps(one.content).encode(), one.publish_time
+            )
+        for name, content in log.metadata.items():
+            writer.add_metadata(name, content)
+        writer.finish()
+    return path
+
+
+@dataclass(frozen=True)
+class Roles:
+    """Topics of a log, as the unchanged one was read.
+
+    Attributes:
+        pose: topic of odometry or of poses.
+        wheels: topics of the measured wheels: one of joints, or left and right.
+        command: topics of the command.
+    """
+
+    pose: str
+    wheels: tuple[str, ...]
+    command: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Change:
+    """A change of a log.
+
+    Attributes:
+        name: in the table.
+        make: the changed log; None where the log has nothing to change.
+        told: pattern of a finding that names it; empty where the answer must stay as it was.
+        moves: whether the answer may change where it is told.
+    """
+
+    name: str
+    make: Callable[[Log, Roles], Log | None]
+    told: str = ""
+
+
+def list_changes() -> list[Change]:
+    """All changes: of the layout, and faults."""
+    return [
+        Change("written again", lambda log, _: log),
+        Change("an arm beside the wheels", _add_arm),
+        Change("20 s not recorded", _cut, "gap|too short|segment|paus|silen"),
+        Change("poses turned by 90 degrees", _turn_poses, "heading_deg"),
+        Change("right wheels reversed", lambda log, roles: _scale_wheels(log, roles, right=-1.0), "right wheels' encoder counts backward"),
+        Change("base_link renamed", _rename),
+        Change("poses in JSON", _to_json),
+        Change("a measured twist beside", _add_twist),
+        Change("clock back by 10 s", _step_clock, "put back|clock"),
+        Change("sides exchanged", _exchange, "exchanged"),
+        Change("both encoders backward", lambda log, roles: _scale_wheels(log, roles, -1.0, -1.0), "both encoders count backward"),
+        Change("left encoder dead", lambda log, roles: _scale_wheels(log, roles, left=0.0), "left wheels' encoder"),
+        Change("wheels in rpm", lambda log, roles: _scale_wheels(log, roles, *(30.0 / math.pi,) * 2), "rpm"),
+        Change("wheels x 3", lambda log, roles: _scale_wheels(log, roles, 3.0, 3.0), "radius|unit"),
+        Change("command reversed", lambda log, roles: _scale_command(log, roles, -1.0, 1.0), "linear.x|sign"),
+        Change("command's turn reversed", lambda log, roles: _scale_command(log, roles, 1.0, -1.0), "angular.z|exchanged|sign"),
+        Change("yaw rate in degrees", lambda log, roles: _scale_command(log, roles, 1.0, 180.0 / math.pi), "deg/s"),
+    ]  # fmt: skip
+
+
+def _each(log: Log, change: Callable[[Message], Message | None]) -> Log:
+    made = [change(one) for one in log.messages]
+    return replace(log, messages=[one for one in made if one is not None])
+
+
+def _copy(content: Any) -> Any:
+    """A message as nested dictionaries, which the library writes as well."""
+    if hasattr(content, "__slots__"):
+        return {name: _copy(getattr(content, name)) for name in content.__slots__}
+    if isinstance(content, list | tuple):
+        return [_copy(one) for one in content]
+    return content
+
+
+def _joints(log: Log, roles: Roles) -> str | None:
+    """The topic of joints among the wheels."""
+    kinds = {one.topic: one.kind for one in log.messages}
+    return next((topic for topic in roles.wheels if kinds.get(topic, "").endswith("JointState")), None)
+
+
+def _add_arm(log: Log, roles: Roles) -> Log | None:
+    topic = _joints(log, roles)
+    if topic is None:
+        return None
+    kind = next(one.kind for one in log.messages if one.topic == topic)
+    made: list[Message] = []
+    for index, one in enumerate(log.messages):
+        made.append(one)
+        if one.topic == topic and index % 2:
+            content = _copy(one.content) | {
+                "name": ["arm_joint_1", "gripper"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [],
+            }  # fmt: skip
+            made.append(Message(topic, kind, content, one.log_time + 1_000_000, one.publish_time + 1_000_000))
+    return replace(log, messages=made)
+
+
+def _cut(log: Log, _: Roles) -> Log | None:
+    first, last = log.length
+    if last - first < 60e9:  # noqa: PLR2004 - the rest must be long enough
+        return None
+    start = first + 0.4 * (last - first)
+    return _each(log, lambda one: None if start <= one.log_time < start + 20e9 else one)
+
+
+def _find_pose(content: Any) -> Any:
+    """The dictionary with position and orientation."""
+    while isinstance(content, dict) and "orientation" not in content:
+        content = content.get("pose")
+    return content
+
+
+def _turn_poses(log: Log, roles: Roles) -> Log | None:
+    half = math.sqrt(0.5)
+
+    def change(one: Message) -> Message:
+        if one.topic != roles.pose:
+            return one
+        content = _copy(one.content)
+        pose = _find_pose(content)
+        x, y, z, w = (pose["orientation"][axis] for axis in "xyzw")
+        turned = (half * (x + y), half * (y - x), half * (z + w), half * (w - z))
+        pose["orientation"] = dict(zip("xyzw", turned, strict=True))
+        return replace(one, content=content)
+
+    return _each(log, change) if _has_pose(log, roles) else None
+
+
+def _has_pose(log: Log, roles: Roles) -> bool:
+    first = next((one for one in log.messages if one.topic == roles.pose), None)
+    return first is not None and _find_pose(_copy(first.content)) is not None
+
+
+def _scale_wheels(log: Log, roles: Roles, left: float = 1.0, right: float = 1.0) -> Log | None:
+    return _map_sides(log, roles.wheels, lambda values: (left * values[0], right * values[1]))
+
+
+def _exchange(log: Log, roles: Roles) -> Log | None:
+    """Joint states with their names exchanged, or topics."""
+    joints = _joints(log, roles)
+    words = {"left": "right", "right": "left"}
+
+    def swap(text: str) -> str:
+        return re.sub("left|right", lambda found: words[found[0]], text)
+
+    def change(one: Message) -> Message:
+        if one.topic == joints:
+            content = _copy(one.content)
+            content["name"] = [swap(name) for name in content["name"]]
+            return replace(one, content=content)
+        return replace(one, topic=swap(one.topic)) if one.topic in roles.wheels else one
+
+    if joints is None and len(roles.wheels) != 2:  # noqa: PLR2004 - two sides
+        return None
+    return _each(log, change)
+
+
+def _map_sides(
+    log: Log, topics: tuple[str, ...], change: Callable[[tuple[float, float]], tuple[float, float]]
+) -> Log | None:
+    """Speeds (and positions) of the sides: of joints by name, or of two topics of one number."""
+    joints = _joints(log, Roles("", topics, ()))
+    if joints is None and len(topics) != 2:  # noqa: PLR2004 - two sides
+        return None
+    factors = change((1.0, 1.0))
+
+    def scale(one: Message) -> Message:
+        if one.topic == joints:
+            content = _copy(one.content)
+            by_name = [
+                factors[0] if "left" in name else factors[1] if "right" in name else 1.0 for name in content["name"]
+            ]
+            for field in ("velocity", "position"):
+                if len(content[field]) == len(by_name):
+                    content[field] = [value * by for value, by in zip(content[field], by_name, strict=True)]
+            return replace(one, content=content)
+        if one.topic in topics:
+            factor = factors[0] if "left" in one.topic else factors[1]
+            return replace(one, content={"data": one.content.data * factor})
+        return one
+
+    if joints is None and not all(hasattr(one.content, "data") for one in log.messages if one.topic in topics):
+        return None
+    return _each(log, scale)
+
+
+def _scale_command(log: Log, roles: Roles, ahead: float, turn: float) -> Log | None:
+    """A body command of Twist or TwistStamped."""
+    kinds = {one.topic: one.kind for one in log.messages}
+    topics = [topic for topic in roles.command if "Twist" in kinds.get(topic, "")]
+    if not topics:
+        return None
+
+    def change(one: Message) -> Message:
+        if one.topic != topics[0]:
+            return one
+        content = _copy(one.content)
+        twist = content.get("twist", content)
+        twist["linear"]["x"] *= ahead
+        twist["angular"]["z"] *= turn
+        return replace(one, content=content)
+
+    return _each(log, change)
+
+
+def _rename(log: Log, _: Roles) -> Log | None:
+    def rename(content: Any) -> Any:
+        if isinstance(content, dict):
+            return {name: rename(value) for name, value in content.items()}
+        if isinstance(content, list):
+            return [rename(value) for value in content]
+        return content.replace("base_link", "chassis") if isinstance(content, str) else content
+
+    framed = ("Odometry", "TFMessage", "PoseStamped", "PoseWithCovarianceStamped")
+
+    def change(one: Message) -> Message:
+        return replace(one, content=rename(_copy(one.content))) if one.kind.endswith(framed) else one
+
+    return _each(log, change)
+
+
+def _to_json(log: Log, roles: Roles) -> Log | None:
+    if not _has_pose(log, roles):
+        return None
+
+    def change(one: Message) -> Message:
+        if one.topic != roles.pose:
+            return one
+        content = _copy(one.content)
+        stamp = content["header"]["stamp"]
+        made = {
+            "timestamp": {"sec": stamp["sec"], "nsec": stamp["nanosec"]},
+            "frame_id": content["header"]["frame_id"],
+            "pose": _find_pose(content),
+        }
+        return replace(one, kind="foxglove.PoseInFrame", content=made)
+
+    return _each(log, change)
+
+
+def _yaw(pose: Any) -> float:
+    x, y, z, w = (pose["orientation"][axis] for axis in "xyzw")
+    return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def _add_twist(log: Log, roles: Roles) -> Log | None:
+    """The velocity of the poses themselves, under a name that says nothing."""
+    if not _has_pose(log, roles):
+        return None
+    made: list[Message] = []
+    before: tuple[int, Any] | None = None
+    for one in log.messages:
+        made.append(one)
+        if one.topic != roles.pose:
+            continue
+        content = _copy(one.content)
+        stamp = content["header"]["stamp"]
+        time, pose = stamp["sec"] * 10**9 + stamp["nanosec"], _find_pose(content)
+        if before is not None and time > before[0]:
+            elapsed, yaw = (time - before[0]) / 1e9, _yaw(before[1])
+            x, y = (pose["position"][axis] - before[1]["position"][axis] for axis in "xy")
+            turned = math.remainder(_yaw(pose) - yaw, 2.0 * math.pi)
+            ahead = x * math.cos(yaw + 0.5 * turned) + y * math.sin(yaw + 0.5 * turned)
+            twist = {
+                "linear": {"x": ahead / elapsed, "y": 0.0, "z": 0.0},
+                "angular": {"x": 0.0, "y": 0.0, "z": turned / elapsed},
+            }
+            header = {"stamp": stamp, "frame_id": "base_link"}
+            kind = "geometry_msgs/msg/TwistStamped"
+            made.append(
+                Message("/body_motion", kind, {"header": header, "twist": twist}, one.log_time, one.publish_time)
+            )
+        before = (time, pose)
+    definitions = {"geometry_msgs/msg/TwistStamped": TWIST} | log.definitions
+    return replace(log, messages=made, definitions=definitions)
+
+
+def _step_clock(log: Log, _: Roles) -> Log | None:
+    first, last = log.length
+    if last - first < 60e9:  # noqa: PLR2004 - both passes and the rest must be long enough
+        return None
+    middle = first + 0.5 * (last - first)
+
+    def change(one: Message) -> Message:
+        if one.log_time < middle:
+            return one
+        content = _copy(one.content)
+        for stamp in _list_stamps(content):
+            stamp["sec"] -= 10
+        return replace(one, content=content, log_time=one.log_time - 10**10, publish_time=one.publish_time - 10**10)
+
+    return _each(log, change)
+
+
+def _list_stamps(content: Any) -> Iterator[dict[str, int]]:
+    if isinstance(content, dict):
+        for name, value in content.items():
+            if name == "stamp" and isinstance(value, dict):
+                yield value
+            else:
+                yield from _list_stamps(value)
+    elif isinstance(content, list) and content and isinstance(content[0], dict):
+        for value in content:
+            yield from _list_stamps(value)
