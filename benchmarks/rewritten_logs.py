@@ -166,7 +166,7 @@ def list_changes() -> list[Change]:
         Change("a measured twist beside", _add_twist),
         Change("clock back by 10 s", _step_clock, "put back|clock"),
         Change("sides exchanged", _exchange, "exchanged"),
-        Change("both encoders backward", lambda log, roles: _scale_wheels(log, roles, -1.0, -1.0), "both encoders count backward"),
+        Change("both encoders backward", lambda log, roles: _scale_wheels(log, roles, -1.0, -1.0), "counts? backward"),
         Change("left encoder dead", lambda log, roles: _scale_wheels(log, roles, left=0.0), "left wheels' encoder"),
         Change("wheels in rpm", lambda log, roles: _scale_wheels(log, roles, *(30.0 / math.pi,) * 2), "rpm"),
         Change("wheels x 3", lambda log, roles: _scale_wheels(log, roles, 3.0, 3.0), "radius|unit"),
@@ -285,7 +285,8 @@ def _map_sides(
         if one.topic == joints:
             content = _copy(one.content)
             by_name = [
-                factors[0] if "left" in name else factors[1] if "right" in name else 1.0 for name in content["name"]
+                1.0 if "steer" in name else factors[0] if "left" in name else factors[1] if "right" in name else 1.0
+                for name in content["name"]
             ]
             for field in ("velocity", "position"):
                 if len(content[field]) == len(by_name):

@@ -178,19 +178,22 @@ def _shrink(log: float, share: float) -> float:
     return min(0.0, log - np.log(max(share, 1e-6))) if log < 0.0 else log
 
 
-def find_wheel_unit(gain: float, name: str) -> str:
-    """Unit of wheel speeds by the radius that each would mean, about .12 m within a factor of two.
+def find_wheel_unit(gain: float, share: float, name: str, radius: float | None = None) -> str:
+    """Unit of wheel speeds by the radius that each would mean.
 
     Args:
         gain: path over the wheels' angle.
+        share: part of the motion that is explained; a poor fit attenuates the gain.
         name: of the signals, which may name the unit.
+        radius: of the wheels, if it is known; else about .12 m within a factor of two.
     """
-    named = {"rpm": "rpm", "deg": "deg/s"}
-    for word, unit in named.items():
+    for word, unit in (("rpm", "rpm"), ("deg", "deg/s")):
         if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower()):
             return unit
+    spread = 0.7 if radius is None else 0.35
     costs = {
-        unit: np.log(abs(gain) / factor / 0.12) ** 2 / (2 * 0.7**2) + _STRANGE * (unit != "rad/s")
+        unit: _shrink(float(np.log(abs(gain) / factor / (radius or 0.12))), share) ** 2 / (2 * spread**2)
+        + _STRANGE * (unit != "rad/s")
         for unit, factor in WHEELS.items()
     }
     best = min(costs, key=lambda unit: costs[unit])

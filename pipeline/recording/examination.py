@@ -113,6 +113,8 @@ _EXPLAINED = 0.9
 """Share of the motion that a signal in a strange unit explains, and vibration does not."""
 _SMALLEST_M = 0.1
 """Radius of a wheel [m] that counts as small."""
+_EQUAL = 0.02
+"""Deviation of both gains from one within which a signal measures the motion."""
 _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
@@ -234,11 +236,7 @@ class _Examination:
         roles = {id(one.reading): role for role, one in used if one is not None}
         roles |= {id(gyro): "gyro"} if gyro is not None else {}
         return Recording(
-            replace(
-                self.sources,
-                command=None if command is None else command.source,
-                wheels=None if wheels is None else wheels.source,
-            ),
+            self._name_sources(command, wheels),
             self._complete(),
             tuple(self.findings),
             kind,
@@ -404,6 +402,22 @@ class _Examination:
         return next(
             (one for one in drives if source is not None and one.source.signals == source.signals), None
         )
+
+    def _name_sources(self, command: _Drive | None, wheels: _Drive | None) -> Sources:
+        """The sources with these roles, and what was said of a choice by name that no longer holds left out."""
+        made = self.sources
+        for role, drive in (("command", command), ("wheels", wheels)):
+            before, source = getattr(made, role), None if drive is None else drive.source
+            if source is None or source == before:
+                continue
+            rest = [one for one in (before, *made.others.get(role, ())) if one is not None and one != source]
+            made = replace(
+                made,
+                others={**made.others, role: tuple(rest)},
+                notes=tuple(note for note in made.notes if not note.startswith(f"{role}:")),
+                **{role: source},
+            )
+        return made
 
     def _tell_role(self, role: str, chosen: _Drive, other: _Drive) -> None:
         text = (
@@ -647,17 +661,15 @@ class _Examination:
                     f'yaw_unit = "{rate}"',
                     {"yaw_unit": rate},
                 )
-        if (
-            wheels is not None
-            and wheels.reading.form == "sides"
-            and self._is_usable(wheels)
-            and not self.is_known
-        ):
+        if wheels is not None and wheels.reading.form == "sides" and self._is_usable(wheels):
             signal = wheels.source.signals[0]
             explained = wheels.reading.explained
             if explained is None or signal.unit or not wheels.sign("ahead"):
                 return
-            unit = find_wheel_unit(float(explained.ahead.gains[0]), str(wheels.source))
+            gain, radius = float(explained.ahead.gains[0]), self.vehicle.wheel_radius_m
+            unit = find_wheel_unit(
+                gain, explained.shares[0], str(wheels.source), radius if self.is_known else None
+            )
             if unit != "rad/s":
                 self._correct(
                     "wheels",
@@ -769,13 +781,15 @@ def _describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
     made, role = reading.explained, roles.get(id(reading), "")
     if made is None:
         return Evidence(reading.name, role, "" if role else "too little of it is recorded beside the poses")
+    gains = (float(made.ahead.gains[0]), float(made.turned.gains[0]))
     reason = "" if role else "another is likelier" if made.is_sure else "the motion does not follow it"
+    if not role and made.is_sure and max(abs(gain - 1.0) for gain in gains) < _EQUAL:
+        reason = "it measures the motion"
     return Evidence(
         reading.name,
         role,
         reason,
         made.moves,
-        float(made.ahead.gains[0]),
-        float(made.turned.gains[0]),
+        *gains,
         made.lag + made.delay,
     )

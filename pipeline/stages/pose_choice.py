@@ -6,7 +6,7 @@ explains its path, and it never moves sideways.
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -16,7 +16,7 @@ import polars as pl
 from pipeline.core import SlipError, arrays, format_share, rigid
 from pipeline.core.arrays import Flags, Floats
 from pipeline.logs import LogData
-from pipeline.run.signals import ANSWERS_S, LIVE_SHARE
+from pipeline.run.signals import LIVE_SHARE
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
 from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
@@ -337,97 +337,6 @@ def replace_pose(sources: Sources, ratings: Sequence[PoseRating]) -> Sources:
         "pose": tuple(replace(one.source, reason=one.refusal or one.reason) for one in ratings[1:]),
     }
     return replace(sources, pose=chosen, notes=tuple(notes), others=others).separated(best.same_as)
-
-
-_LIKELY: Final = {"wheel_radius_m": (0.7, 1.4), "track_width_m": (0.8, 4.0)}
-"""Bounds of the ratio of geometry from poses to that of the controller: slip reduces a radius, and the yaw
-rate of a skid-steered vehicle may be a quarter of the ideal one."""
-
-
-def fit_geometry(wheels: pl.DataFrame, poses: pl.DataFrame, kind: str) -> dict[str, float] | None:
-    """Estimate the geometry of an unknown vehicle from its poses.
-
-    Args:
-        wheels: measured, with a placeholder of unit radius, track width and wheelbase.
-        poses: of the localization.
-        kind: of vehicle.
-
-    Returns:
-        Wheel radius and effective track width [m], or the wheelbase of a car; None if the motion is
-            insufficient.
-    """
-    fresh = poses.filter(~pl.col("held") & pl.col("x").is_finite() & pl.col("q_w").is_finite())
-    if fresh.height < FEWEST_MESSAGES or wheels.height < FEWEST_MESSAGES:
-        return None
-    time = fresh["t"].to_numpy()
-    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
-    position = np.stack([fresh[axis].to_numpy() for axis in "xy"], axis=1)[ends]
-    yaw = np.unwrap(yaw_of(np.stack([fresh[f"q_{axis}"].to_numpy() for axis in "xyzw"], axis=1)))[ends]
-    distance, _ = split_chords(position, yaw)
-    clock = wheels["t"].to_numpy()
-
-    def integral(rate: Floats) -> Floats:
-        return arrays.integrate_between(time[ends[:-1]], time[ends[1:]], clock, rate)
-
-    if kind == "ackermann":
-        speed, steering = wheels["speed"].to_numpy(), wheels["steering"].to_numpy()
-        scale = _median_gain(distance, integral(speed))
-        bent = _median_gain(np.diff(yaw), integral(speed * np.tan(steering)))
-        return None if not scale or not bent else {"wheelbase_m": 1.0 / bent}
-    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    radius = _median_gain(distance, integral(0.5 * (left + right)))
-    over = _median_gain(np.diff(yaw), integral(right - left))
-    if not radius or not over or radius <= 0.0 or over <= 0.0:
-        return None
-    return {"wheel_radius_m": radius, "track_width_m": radius / over}
-
-
-def fit_controller(
-    commands: pl.DataFrame, wheels: pl.DataFrame, by_pose: Mapping[str, float]
-) -> dict[str, float] | None:
-    """Geometry that a controller uses to convert body commands to wheel speeds.
-
-    Args:
-        commands: body commands.
-        wheels: measured, with a placeholder of unit radius and track width.
-        by_pose: result of `fit_geometry`.
-
-    Returns:
-        Wheel radius and track width [m]; None without body commands, or if wheels and commands disagree, or
-            the result contradicts the motion of the poses.
-    """
-    if (
-        commands.height < FEWEST_MESSAGES
-        or wheels.height < FEWEST_MESSAGES
-        or "wheel_radius_m" not in by_pose
-    ):
-        return None
-    if commands["body_x"].null_count() == commands.height or wheels["left"].null_count() == wheels.height:
-        return None
-    commands = commands.filter(pl.col("body_x").is_finite() & pl.col("body_w").is_finite())
-    if commands.height < FEWEST_MESSAGES:
-        return None
-    asked, clock = commands["t"].to_numpy(), wheels["t"].to_numpy()
-    begin, end = max(asked[0], clock[0]), min(asked[-1], clock[-1]) - ANSWERS_S
-    # Spans in which the wheels were read, however long they were silent in between.
-    number = np.floor((clock - begin) / WINDOW_S)[:, None] - np.arange(np.ceil(ANSWERS_S / WINDOW_S) + 1.0)
-    starts = begin + np.unique(number[number >= 0.0]) * WINDOW_S
-    starts = starts[starts < end]
-    spans = (starts, starts + ANSWERS_S)
-    held = np.minimum(np.diff(asked), arrays.usual_hold(asked))
-    left, right = wheels["left"].to_numpy(), wheels["right"].to_numpy()
-    rolled, turned = (
-        arrays.integrate_between(*spans, clock, rate) for rate in (0.5 * (left + right), right - left)
-    )
-    sums = (np.append(0.0, np.cumsum(commands[name].to_numpy()[:-1] * held)) for name in ("body_x", "body_w"))
-    distance, turn = (np.diff([np.interp(at, asked, total) for at in spans], axis=0)[0] for total in sums)
-    radius, over = find_steady_gain(distance, rolled), find_steady_gain(turn, turned)
-    if not radius or not over or radius <= 0.0 or over <= 0.0:
-        return None
-    geometry = {"wheel_radius_m": radius, "track_width_m": radius / over}
-    ratios = {key: by_pose[key] / value for key, value in geometry.items()}
-    fits = all(low < ratios[key] < high for key, (low, high) in _LIKELY.items())
-    return geometry if fits else None
 
 
 def find_steady_gain(moved: Floats, driven: Floats) -> float | None:

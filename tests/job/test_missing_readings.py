@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import polars as pl
 import pytest
 
 from pipeline.core.arrays import integrate_between
@@ -15,7 +14,6 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.simulate import Encoders, Recording, make_scenario, simulate_run, write_log
 from pipeline.stages.drive import differentiate_angle
-from pipeline.stages.pose_choice import fit_controller, fit_geometry
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -67,32 +65,6 @@ def test_an_unknown_vehicle_is_fitted_without_readings_that_are_missing(
     ladder = outcome.summary["diagnosis"]["ladder"]
     floor = outcome.summary["diagnosis"]["noise_floor"]
     assert ladder[-1]["r_mrmse_rad"] < 2.0 * floor["r_mrmse_rad"]
-
-
-def test_geometry_does_not_depend_on_where_readings_are_missing() -> None:
-    time = np.arange(0.0, 100.0, 0.05)
-    speed, turn = 0.5 * np.sin(0.3 * time), 0.6 * np.cos(0.2 * time)
-    yaw = np.cumsum(turn) * 0.05
-    position = np.cumsum(np.stack((speed * np.cos(yaw), speed * np.sin(yaw))), axis=1) * 0.05
-    zero = np.zeros_like(time)
-    poses = pl.DataFrame({
-        "t": time, "held": np.zeros(time.size, dtype=bool), "x": position[0], "y": position[1],
-        "q_x": zero, "q_y": zero, "q_z": np.sin(yaw / 2.0), "q_w": np.cos(yaw / 2.0),
-    })  # fmt: skip
-    commands = pl.DataFrame({"t": time, "body_x": speed, "body_w": turn})
-    whole = {"left": (speed - 0.25 * turn) / 0.1, "right": (speed + 0.25 * turn) / 0.1}
-    for lose in (fall_silent, every_other):
-        gap = lose(time)
-        wheels = pl.DataFrame({"t": time, **{side: values + gap for side, values in whole.items()}})
-        fitted = fit_geometry(wheels, poses, "differential")
-        assert fitted == pytest.approx({"wheel_radius_m": 0.1, "track_width_m": 0.5}, rel=0.01)
-        holes = commands.with_columns(body_x=speed + gap, body_w=turn + gap)
-        for asked in (commands, holes):
-            assert fit_controller(asked, wheels, fitted) == pytest.approx(fitted, rel=0.01)
-    # Mostly silent: what was read decides, not the zeros in place of the rest.
-    silent = np.where(time > 40.0, np.nan, 0.0)
-    wheels = pl.DataFrame({"t": time, **{side: values + silent for side, values in whole.items()}})
-    assert fit_geometry(wheels, poses, "differential") == pytest.approx(fitted, rel=0.01)
 
 
 def test_a_rate_is_integrated_over_what_was_read() -> None:

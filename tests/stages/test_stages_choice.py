@@ -6,7 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import polars as pl
 import pytest
 from stage_logs import FIELD, PLAIN, TakeThrough
 
@@ -26,7 +25,6 @@ from pipeline.sources import Configuration, DriveSection, find_preset, load_conf
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, unwrap_counter
 from pipeline.stages.extract import extract_tables
-from pipeline.stages.pose_choice import fit_controller
 from pipeline.stages.reading import list_wanted, read_pose_topic
 
 SECOND = 10**9
@@ -107,21 +105,6 @@ def test_an_unknown_vehicle_gets_the_geometry_of_its_controller_or_of_its_motion
     (finding,) = chosen.findings
     assert finding.id == "vehicle_fitted"
     assert said in finding.text
-
-
-def test_commands_on_another_scale_than_the_motion_give_no_geometry() -> None:
-    times = np.arange(0.0, 60.0, 0.1)
-    forward, turning = np.sin(0.3 * times), np.cos(0.2 * times)
-    sides = {side: (forward + sign * 0.2 * turning) / 0.1 for side, sign in (("left", -1), ("right", 1))}
-    wheels, by_pose = pl.DataFrame({"t": times, **sides}), {"wheel_radius_m": 0.095, "track_width_m": 0.6}
-    told = [
-        fit_controller(
-            pl.DataFrame({"t": times, "body_x": by * forward, "body_w": by * turning}), wheels, by_pose
-        )
-        for by in (1.0, 3.0)
-    ]
-    assert told[0] == pytest.approx({"wheel_radius_m": 0.1, "track_width_m": 0.4}, rel=0.02)
-    assert told[1] is None
 
 
 @pytest.mark.parametrize("period", [2**16, 2**32])

@@ -1,0 +1,133 @@
+"""A log written anew with one thing changed: the same answer, or the change is told."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+from front import Answer, ask, find_roles, judge
+from rewritten_logs import Change, Log, list_changes, read, write
+
+from pipeline.job import Options
+from pipeline.job.keys import set_up_log
+from pipeline.simulate import simulate_case
+
+ROOT = Path(__file__).parents[2]
+CASES = ROOT / ".." / "shared" / "cases"
+CHANGES = {change.name: change for change in list_changes()}
+# Kinds of layouts: wheel commands beside body commands, a car by its joints, and a vehicle that nothing names.
+SAMPLES = ("husky_tile", "ackermann_gravel", "turtlebot4")
+QUICK = {
+    ("husky_tile", "an arm beside the wheels"),
+    ("husky_tile", "poses turned by 90 degrees"),
+    ("husky_tile", "right wheels reversed"),
+    ("husky_tile", "clock back by 10 s"),
+    ("ackermann_gravel", "both encoders backward"),
+    ("turtlebot4", "poses in JSON"),
+    ("turtlebot4", "wheels in rpm"),
+    ("turtlebot4", "a measured twist beside"),
+    ("turtlebot4", "yaw rate in degrees"),
+    ("turtlebot4", "sides exchanged"),
+}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[Path, Log, Answer]]:
+    """Each log as it is, with its answer."""
+    made = {}
+    for name in SAMPLES:
+        path = ROOT / "data_samples" / f"{name}.mcap"
+        if not path.exists():
+            path = tmp_path_factory.mktemp("drawn") / f"{name}.mcap"
+            simulate_case(None, {}, out=path, seed=5, duration_s=100.0, platform=name)
+        made[name] = (path, read(path), ask(path))
+    return made
+
+
+def check(logs: dict[str, tuple[Path, Log, Answer]], name: str, change: Change, folder: Path) -> None:
+    path, log, before = logs[name]
+    made = change.make(log, find_roles(path))
+    if made is None:
+        pytest.skip("this log has nothing to change so")
+    after = ask(write(made, folder / path.name))
+    assert judge(change, before, after) != "WRONG", after
+
+
+@pytest.mark.parametrize(("name", "change"), sorted(QUICK))
+def test_a_changed_log_gives_the_same_answer_or_tells(
+    logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, tmp_path: Path
+) -> None:
+    check(logs, name, CHANGES[change], tmp_path)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("name", "change"), [(name, change) for name in SAMPLES for change in CHANGES if (name, change) not in QUICK]
+)
+def test_every_change_gives_the_same_answer_or_is_told(
+    logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, tmp_path: Path
+) -> None:
+    check(logs, name, CHANGES[change], tmp_path)
+
+
+def load_cases() -> ModuleType | None:
+    """What must be said of each case, if the cases are here."""
+    if not (CASES / "cases.py").exists():
+        return None
+    sys.path.insert(0, str(CASES))
+    try:
+        spec = importlib.util.spec_from_file_location("field_cases", CASES / "cases.py")
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    finally:
+        sys.path.remove(str(CASES))
+    return module
+
+
+# Of these the examination alone says what must be said, before any effect is looked for.
+TOLD = {
+    "heading_offset": "90 degrees",
+    "y_up": "the y axis of their frame points up",
+    "optical": "optical",
+    "lidar_backwards": "to the rear",
+    "lidar_backwards_cmd": "frame",
+    "wheels_numbered": "wheel_1",
+    "steer_inverted": "inverted",
+    "flipped_joints": "polarity",
+    "cmd_degrees": "deg/s",
+    "stale_odom": "wheel odometry, not a localization",
+    "mavros": "setpoint_velocity",
+    "rpm_floats": "rpm",
+}
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
+@pytest.mark.parametrize("name", sorted(TOLD))
+def test_a_case_of_the_field_is_told(name: str, tmp_path: Path) -> None:
+    log = CASES / "logs" / f"{name}.mcap"
+    setup = set_up_log(log, Options(out=tmp_path))
+    assert TOLD[name] in " ".join(one.text for one in setup.choice.findings)
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
+def test_cases_of_the_field_say_what_they_must(tmp_path: Path) -> None:
+    from verbs import run_slip  # noqa: PLC0415
+
+    cases = load_cases()
+    assert cases is not None
+    wrong = []
+    for name, (_, _, must, never, args, config) in cases.CASES.items():
+        log = CASES / "logs" / f"{name}.mcap"
+        given = ["--config", str(log.with_suffix(".toml"))] if config else []
+        _, said, told = run_slip("diagnose", log, *args, *given, "--results", tmp_path / name)
+        text = re.sub(r"\s+", " ", said + told)
+        if not re.search(must, text) or (never and re.search(never, text)):
+            wrong.append(name)
+    assert len(wrong) <= 2, wrong

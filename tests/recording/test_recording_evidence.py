@@ -1,0 +1,290 @@
+"""What a motion says of the signals beside it: frame, signs, sides, units and lengths, on drawn drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import polars as pl
+import pytest
+
+from pipeline.recording.evidence import (
+    find_body_units,
+    find_frame,
+    find_reversed,
+    find_wheel_unit,
+    measure_controller,
+    measure_geometry,
+    rate_command,
+)
+from pipeline.recording.motion import Motion, measure_motion
+from pipeline.recording.readings import Held, Reading
+from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit
+
+RADIUS, TRACK, GAIN, LAG = 0.1, 0.5, 0.77, 0.25
+STEP = 0.01
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A drive at 100 Hz: commands, what the body did, and its pose with noise at 10 Hz."""
+
+    time: np.ndarray
+    asked: np.ndarray
+    speed: np.ndarray
+    rate: np.ndarray
+    place: np.ndarray
+    yaw: np.ndarray
+    rows: np.ndarray
+
+    def wheels(self) -> tuple[np.ndarray, np.ndarray]:
+        """Speeds of the left and the right wheels [rad/s]: they turn as asked, after the lag."""
+        turn = self.rate / GAIN
+        return (self.speed - 0.5 * TRACK * turn) / RADIUS, (self.speed + 0.5 * TRACK * turn) / RADIUS
+
+
+def draw(seed: int = 1, seconds: float = 100.0) -> Drive:
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, seconds, STEP)
+    holds = np.cumsum(rng.uniform(1.0, 3.0, 200))
+    number = np.searchsorted(holds, time)
+    asked = np.stack([rng.uniform(-1.0, 1.0, 200)[number], rng.uniform(-1.0, 1.0, 200)[number]], axis=1)
+    made = np.zeros_like(asked)
+    for k in range(1, time.size):
+        made[k] = made[k - 1] + STEP / LAG * (asked[k - 1] - made[k - 1])
+    speed, rate = made[:, 0], GAIN * made[:, 1]
+    yaw = np.cumsum(rate) * STEP
+    place = np.cumsum(speed * np.exp(1j * yaw)) * STEP
+    rows = np.arange(0, time.size, 10)
+    noise = rng.normal(0.0, 0.002, (2, rows.size))
+    return Drive(
+        time,
+        asked,
+        speed,
+        rate,
+        place[rows] + noise[0] + 1j * noise[1],
+        yaw[rows] + rng.normal(0, 0.002, rows.size),
+        rows,
+    )
+
+
+def tabulate(drive: Drive, *, turned: float = 0.0, axis: int = 2, backward: bool = False) -> pl.DataFrame:
+    """Table `poses`, with the heading turned [rad], or in a frame whose given axis is up."""
+    half = 0.5 * (drive.yaw + turned)
+    zero = np.zeros(half.size)
+    place = -drive.place if backward else drive.place
+    flat = {2: (place.real, place.imag, zero), 1: (place.real, zero, -place.imag)}[axis]
+    spin = {2: (zero, zero, np.sin(half)), 1: (zero, np.sin(half), zero)}[axis]
+    return pl.DataFrame({
+        "t": drive.time[drive.rows], "segment": np.zeros(half.size, dtype=np.int32),
+        **dict(zip("xyz", flat, strict=True)), "q_x": spin[0], "q_y": spin[1], "q_z": spin[2], "q_w": np.cos(half),
+        "held": np.zeros(half.size, dtype=bool), "active": np.ones(half.size, dtype=bool),
+    })  # fmt: skip
+
+
+def measured(poses: pl.DataFrame) -> Motion:
+    motion = measure_motion(poses)
+    assert motion is not None
+    return motion
+
+
+def command(drive: Drive, ahead: float = 1.0, turn: float = 1.0) -> Reading:
+    at = slice(None, None, 10)
+    return Reading(
+        "body",
+        "/cmd_vel",
+        Held(drive.time[at], ahead * drive.asked[at, 0]),
+        Held(drive.time[at], turn * drive.asked[at, 1]),
+    )
+
+
+def sides(drive: Drive, left: float = 1.0, right: float = 1.0) -> Reading:
+    at = slice(None, None, 5)
+    one, two = drive.wheels()
+    return Reading(
+        "sides", "/joint_states", Held(drive.time[at], left * one[at]), Held(drive.time[at], right * two[at])
+    )
+
+
+def test_gain_and_delay_of_a_command_are_recovered() -> None:
+    drive = draw()
+    made = command(drive).explain(measured(tabulate(drive)))
+    assert made is not None
+    assert made.is_sure
+    assert not made.crossed
+    assert made.ahead.gains[0] == pytest.approx(1.0, abs=0.01)
+    assert made.turned.gains[0] == pytest.approx(GAIN, abs=0.01)
+    assert made.lag + made.delay == pytest.approx(LAG, abs=0.06)
+
+
+def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None:
+    drive = draw(2)
+    motion = measured(tabulate(drive))
+    wheels = sides(drive)
+    made = wheels.explain(motion)
+    assert made is not None
+    radius, track = measure_geometry(made)
+    assert radius is not None
+    assert track is not None
+    assert radius.value == pytest.approx(RADIUS, rel=0.01)
+    assert track.value == pytest.approx(TRACK / GAIN, rel=0.01)
+    found = measure_controller(command(drive), wheels)
+    assert found is not None
+    assert [one.value for one in found if one] == pytest.approx([RADIUS, TRACK], rel=0.01)
+
+
+def test_a_straight_drive_shows_a_radius_and_no_track() -> None:
+    drive = draw(3)
+    straight = Drive(drive.time, drive.asked * [1.0, 0.0], drive.speed, 0.0 * drive.rate,
+                     (np.cumsum(drive.speed) * STEP)[drive.rows] + 0j, 0.0 * drive.yaw, drive.rows)  # fmt: skip
+    made = sides(straight).explain(measured(tabulate(straight)))
+    assert made is not None
+    radius, track = measure_geometry(made)
+    assert radius is not None
+    assert radius.value == pytest.approx(RADIUS, rel=0.01)
+    assert track is None
+
+
+@pytest.mark.parametrize(("axis", "up"), [(2, "z"), (1, "y")])
+@pytest.mark.parametrize("degrees", [0.0, 90.0, -90.0])
+def test_the_frame_of_the_pose_is_found(axis: int, up: str, degrees: float) -> None:
+    drive = draw(4)
+    motion = measured(tabulate(drive, turned=np.radians(degrees), axis=axis))
+    assert motion.up == up
+    readings = [command(drive), sides(drive)]
+    for one in readings:
+        one.explain(motion)
+    turned, margin = find_frame(motion, readings)
+    assert not turned.flip
+    if degrees == 0.0:
+        assert (turned.offset_deg, margin) == (0.0, 0.0)
+    else:
+        assert turned.offset_deg == 90.0
+        assert margin > 3.0
+
+
+@pytest.mark.parametrize(("left", "right"), [(-1.0, 1.0), (1.0, -1.0)])
+def test_a_side_that_counts_backward_is_told_from_all_else(left: float, right: float) -> None:
+    drive = draw(5)
+    made = sides(drive, left, right).explain(measured(tabulate(drive)))
+    assert made is not None
+    assert made.crossed
+    assert made.sign_margin > 3.0
+    assert (made.ahead.gains[0] > 0.0) == (right < 0.0)
+
+
+C, W, G = "command", "wheels", "gyro"
+
+
+@pytest.mark.parametrize(
+    ("signs", "faults"),
+    [
+        ({(C, "ahead"): 1, (C, "turned"): 1, (W, "ahead"): 1, (W, "turned"): 1}, ()),
+        ({(C, "ahead"): -1, (C, "turned"): 1, (W, "ahead"): -1, (W, "turned"): 1}, ("pose_backward",)),
+        ({(C, "turned"): -1, (W, "turned"): -1, (G, "turned"): -1}, ("pose_mirrored",)),
+        ({(C, "ahead"): 1, (C, "turned"): 1, (W, "ahead"): 1, (W, "turned"): -1}, ("wheels_exchanged",)),
+        ({(C, "ahead"): 1, (C, "turned"): 1, (W, "ahead"): -1, (W, "turned"): -1}, ("wheels_both",)),
+        ({(C, "ahead"): -1, (C, "turned"): 1, (W, "ahead"): 1, (W, "turned"): 1}, ("command_ahead",)),
+        ({(C, "turned"): 1, (W, "turned"): 1, (G, "turned"): -1}, ("gyro",)),
+        ({(C, "turned"): -1, (G, "turned"): -1}, ("pose_mirrored",)),
+    ],
+)
+def test_the_fewest_faults_explain_the_signs(
+    signs: dict[tuple[str, str], int], faults: tuple[str, ...]
+) -> None:
+    made = find_reversed(signs)  # type: ignore[arg-type]
+    assert made.faults == faults
+    assert made.rivals == ()
+
+
+def test_of_two_that_contradict_each_other_both_may_be_wrong() -> None:
+    made = find_reversed({(C, "ahead"): -1, (C, "turned"): 1})
+    assert {made.faults, *made.rivals} == {("pose_backward",), ("command_ahead",)}
+
+
+@pytest.mark.parametrize(
+    ("gains", "units"),
+    [
+        ((0.95, 0.6), ("m/s", "rad/s")),
+        ((1.0, 0.77 * np.pi / 180.0), ("m/s", "deg/s")),
+        ((1.0 / 3.6, 0.9), ("m/s", "rad/s")),
+        ((1e-3, 0.9e-3), ("mm/s", "mrad/s")),
+        ((0.3, 0.3), ("m/s", "rad/s")),
+    ],
+)
+def test_units_of_a_body_command(gains: tuple[float, float], units: tuple[str, str]) -> None:
+    assert find_body_units(gains, (0.95, 0.95)) == units
+
+
+def test_a_poor_fit_shows_no_unit() -> None:
+    assert find_body_units((0.9, 0.076), (0.5, 0.1)) == ("m/s", "rad/s")
+
+
+@pytest.mark.parametrize(
+    ("gain", "name", "unit"),
+    [(0.033, "/joint_states", "rad/s"), (0.3, "/joint_states", "rad/s"), (0.0105, "/wheel/left/rpm", "rpm"),
+     (0.0017, "/wheels", "deg/s")],
+)  # fmt: skip
+def test_unit_of_wheel_speeds(gain: float, name: str, unit: str) -> None:
+    assert find_wheel_unit(gain, 0.95, name) == unit
+
+
+@pytest.mark.parametrize(
+    ("gain", "share", "unit"), [(0.29, 0.9, "rad/s"), (0.0271, 0.9, "rpm"), (0.05, 0.35, "rad/s")]
+)
+def test_unit_of_the_wheels_of_a_known_vehicle(gain: float, share: float, unit: str) -> None:
+    """On ice a fit is poor, and its gain low: that is no unit."""
+    assert find_wheel_unit(gain, share, "/wheels", 0.3) == unit
+
+
+def test_a_measured_motion_is_no_command() -> None:
+    drive = draw(6)
+    motion = measured(tabulate(drive))
+    asked, seen = (
+        command(drive),
+        Reading("body", "/motion", Held(drive.time, drive.speed), Held(drive.time, drive.rate)),
+    )
+    delays = []
+    for one in (asked, seen):
+        made = one.explain(motion)
+        assert made is not None
+        delays.append(made.lag + made.delay)
+    # Even where the names say nothing, and the motion comes first by its type.
+    asked.name = "/velocity_a"
+    assert rate_command(asked, 1, min(delays)) > rate_command(seen, 0, min(delays)) + 4.0
+
+
+def test_a_signal_of_another_body_explains_nothing() -> None:
+    drive, other = draw(7), draw(8)
+    made = command(other).explain(measured(tabulate(drive)))
+    assert made is not None
+    assert not made.is_sure
+
+
+def test_noise_of_positions_does_not_hide_a_gain() -> None:
+    """Increments of white noise are anticorrelated: whitened, a small gain is certain; else it is not."""
+    rng = np.random.default_rng(9)
+    count = 3000
+    edges = np.arange(count + 1) * 0.1
+    steps = Steps(edges[:-1], edges[1:])
+    driven = 0.1 * np.cumsum(rng.normal(0.0, 0.02, count))
+    noise = np.diff(rng.normal(0.0, 0.05, count + 1))
+    made = fit(0.5 * driven + noise, driven[:, None], steps)
+    assert made.gains[0] == pytest.approx(0.5, abs=0.05)
+    none = fit(0.5 * driven + noise, np.zeros((count, 0)), steps)
+    assert compare(made.blocks, none.blocks) > 3.0
+    plain = np.linalg.lstsq(driven[:, None], 0.5 * driven + noise, rcond=None)
+    deviation = np.sqrt(plain[1][0] / count / (driven @ driven))
+    assert abs(made.t[0]) > 2.0 * abs(plain[0][0] / deviation)
+
+
+def test_two_alike_readings_are_not_told_apart() -> None:
+    rng = np.random.default_rng(10)
+    blocks = rng.normal(0.0, 1.0, 40)
+    assert abs(compare(blocks, blocks[::-1].copy())) < 3.0
+    assert compare(blocks, blocks) == 0.0
+
+
+def test_too_few_poses_say_nothing() -> None:
+    drive = draw(11)
+    assert measure_motion(tabulate(drive).head(FEWEST_STEPS)) is None
