@@ -331,7 +331,7 @@ def test_rigid_bodies_show_what_was_built_into_them() -> None:
 
 
 @pytest.mark.long
-def test_an_effect_whose_interval_includes_no_effect_is_a_finding_and_no_name(tmp_path: Path) -> None:
+def test_a_heading_skew_that_no_prediction_shows_is_a_finding_and_no_name(tmp_path: Path) -> None:
     """A heading skew of 18 ms with an interval from -3 to 38 ms was named beside the three hidden effects."""
     log = tmp_path / "run.mcap"
     write_riddle(draw_riddle("sets", 990007), log)
@@ -339,5 +339,5 @@ def test_an_effect_whose_interval_includes_no_effect_is_a_finding_and_no_name(tm
     vehicle, recording = read_recording(manifest)
     (run,) = diagnose_runs([recording], vehicle).runs
     assert {effect.id for effect in run.effects} == {"deadband", "effective_track", "icr_offset"}
-    (said,) = [one["text"] for one in run.findings if one["id"] == "insignificant_effect"]
-    assert str(said).startswith("heading_skew is not significant: the 95 % interval of d, ")
+    (said,) = [one["text"] for one in run.findings if one["id"] == "idle_effect"]
+    assert str(said).startswith("heading_skew reduces the error over half a second, but not ")
