@@ -16,7 +16,7 @@ from stored import diagnosed_results, place, recorded_results, stored_run  # noq
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# A busy machine is slow, not wrong: properties are checked, not timed. `--hypothesis-profile many` draws more.
+# A busy machine is slow, not wrong: properties are not timed. `--hypothesis-profile many` draws more.
 settings.register_profile("few", deadline=None, max_examples=30)
 settings.register_profile("many", deadline=None, max_examples=500)
 settings.load_profile("few")

@@ -281,7 +281,11 @@ def test_uneven_drives_are_named(kind: str, tmp_path: Path) -> None:
     "seed",
     [
         pytest.param(20, id="a wave across the map took the place of a track in two minutes of stop and go"),
-        pytest.param(44, id="a lag of the body was an alternative, though the wheels' part contradicted it"),
+        pytest.param(
+            44,
+            id="a lag of the body was an alternative, though the wheels' part contradicted it",
+            marks=pytest.mark.long,
+        ),
         pytest.param(998_003, id="the same after stop and go", marks=pytest.mark.long),
         pytest.param(
             31, id="a lag was dropped together with two lags that were alike", marks=pytest.mark.long

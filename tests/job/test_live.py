@@ -100,7 +100,7 @@ def test_what_a_server_sends_is_recorded_as_it_is(kind: str, source: Path, tmp_p
     server = make_server(kind, messages)
     seen = []
     try:
-        with receive(server.port, tmp_path / "run") as log, playing(server, messages, 4.0) as player:
+        with receive(server.port, tmp_path / "run") as log, playing(server, messages, 8.0) as player:
             while player.is_alive():
                 seen.append(count_messages(log))
                 time.sleep(0.2)
