@@ -84,6 +84,7 @@ check: $(VENV)/.ready-dev ## style, types, and layers of imports
 
 test-long: $(VENV)/.ready-dev ## the tests that take minutes
 	$(BIN)/python -m pytest -n 2 -m long
+	$(BIN)/python -m pytest -n 2 -m "not long" --hypothesis-profile many tests/fuzz
 
 format: $(VENV)/.ready-dev ## format the code
 	$(BIN)/ruff format

@@ -16,9 +16,10 @@ from stored import diagnosed_results, place, recorded_results, stored_run  # noq
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-# A busy machine is slow, not wrong: properties are checked, not timed.
-settings.register_profile("untimed", deadline=None)
-settings.load_profile("untimed")
+# A busy machine is slow, not wrong: properties are not timed. `--hypothesis-profile many` draws more.
+settings.register_profile("few", deadline=None, max_examples=30)
+settings.register_profile("many", deadline=None, max_examples=500)
+settings.load_profile("few")
 # Lines are whole where nobody looks; a worker of pytest-xdist is told the width of the terminal.
 os.environ.pop("COLUMNS", None)
 

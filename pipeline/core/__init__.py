@@ -115,7 +115,7 @@ INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 
 def suffix_unit(unit: object) -> str:
     """A unit as the suffix of a number; empty for a plain number, or one of unknown unit."""
-    return "" if unit in {"", "1"} else f" {unit}"
+    return "" if unit in {None, "", "1"} else f" {unit}"
 
 
 def mark_finding(severity: object) -> str:

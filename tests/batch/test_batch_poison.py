@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import pytest
 
 KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")
-LIMITS = {"executor": "local", "timeout_s": 4.0, "memory_bytes": 700_000_000}
+LIMITS = {"executor": "local", "timeout_s": 3.0, "memory_bytes": 700_000_000}
 
 
 def test_each_kind_of_poison_is_named_and_the_others_are_done(season: Path, tmp_path: Path) -> None:
@@ -40,7 +40,7 @@ def test_each_kind_of_poison_is_named_and_the_others_are_done(season: Path, tmp_
     }
     reasons = {Path(line.path).stem: line.reason for line in outcome.lines}
     assert "poison" in reasons["raises"]
-    assert "4 s" in reasons["hangs"]
+    assert "3 s" in reasons["hangs"]
     assert "GB" in reasons["eats"]
     assert "signal 11" in reasons["dies"]
     assert "exit code 7" in reasons["leaves"]

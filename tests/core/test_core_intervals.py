@@ -18,9 +18,12 @@ from pipeline.core import format_interval, split_interval
         (1512.0, 1100.0, 1900.0, "N", "1512 N [1100, 1900]"),
         (0.0, -0.02, 0.02, "m", "0.000 m [-0.020, 0.020]"),
         (2.0, 2.0, 2.0, "1", "2 [2, 2]"),
+        (0.45, 0.444, 0.455, None, "0.450 [0.444, 0.455]"),
     ],
 )
-def test_digits_follow_the_interval(value: float, low: float, high: float, unit: str, text: str) -> None:
+def test_digits_follow_the_interval(
+    value: float, low: float, high: float, unit: str | None, text: str
+) -> None:
     assert format_interval(value, low, high, unit) == text
 
 

@@ -12,7 +12,7 @@ from test_diagnosis_search import _load
 from pipeline.core.compute import Budget
 from pipeline.estimation import Input
 from pipeline.estimation.acceptance import LEAST_T, Improvement, compare, compare_rivals
-from pipeline.estimation.evidence import ORDER, Tiles, learn_noise
+from pipeline.estimation.evidence import ORDER, Noise, Tiles, learn_noise
 from pipeline.estimation.search import simplify
 from pipeline.estimation.selection import open_selection, prepare
 from pipeline.estimation.state import Weights
@@ -23,8 +23,18 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 COUNT = 480  # four minutes of half-second windows
-TILES = Tiles(np.arange(COUNT), np.minimum(np.arange(COUNT), ORDER), np.arange(COUNT) // 20)
-PLAIN = Weights(np.ones((COUNT, 3)), np.full((COUNT, 3), 6.0))
+
+
+def make_tiles(count: int) -> Tiles:
+    return Tiles(np.arange(count), np.minimum(np.arange(count), ORDER), np.arange(count) // 20)
+
+
+def make_weights(count: int) -> Weights:
+    return Weights(np.ones((count, 3)), np.full((count, 3), 6.0))
+
+
+TILES = make_tiles(COUNT)
+PLAIN = make_weights(COUNT)
 
 
 def make_noise(generator: np.random.Generator, repeat: float, size: np.ndarray | float = 1.0) -> np.ndarray:
@@ -34,12 +44,13 @@ def make_noise(generator: np.random.Generator, repeat: float, size: np.ndarray |
     return values.T
 
 
-def judge(residual: np.ndarray, column: np.ndarray) -> Improvement:
+def judge(residual: np.ndarray, column: np.ndarray, noise: Noise | None = None) -> Improvement:
     """A column fitted by least squares to the innovations, and compared with nothing."""
-    noise = learn_noise(TILES, (0, 1, 2), residual)
+    count = len(residual)
+    noise = noise or learn_noise(make_tiles(count), (0, 1, 2), residual)
     white, filtered = noise.whiten(residual[:, :, None]), noise.whiten(column[:, :, None])
     gain = float((white * filtered).sum() / (filtered**2).sum())
-    return compare(noise, PLAIN, residual, residual - gain * column)
+    return compare(noise, make_weights(count), residual, residual - gain * column)
 
 
 @pytest.mark.parametrize("repeat", [0.0, 0.6, 0.9])
@@ -51,6 +62,28 @@ def test_chance_alone_stays_within_its_standard_errors(repeat: float) -> None:
         found.append(judge(make_noise(generator, repeat), slow).t)
     assert np.mean(np.square(found)) == pytest.approx(1.0, abs=0.35)
     assert max(found) < LEAST_T
+
+
+def test_none_of_thirty_candidates_is_significant_where_there_is_only_noise() -> None:
+    reached = []
+    for seed in range(60):
+        generator = np.random.default_rng(seed)
+        residual = make_noise(generator, 0.6)
+        columns = np.repeat(generator.normal(size=(30, COUNT // 12, 3)), 12, axis=1)
+        noise = learn_noise(TILES, (0, 1, 2), residual)
+        reached += [judge(residual, column, noise).share for column in columns]
+    assert max(reached) < 1.0
+
+
+def test_what_hardly_changes_a_prediction_is_not_significant_however_long_the_drive() -> None:
+    generator = np.random.default_rng(8)
+    count = 5 * COUNT
+    noise, column = generator.normal(size=(2, count, 3))
+    small, enough = (judge(noise + size * column, column) for size in (0.085, 0.12))
+    assert small.gain < 0.01 < enough.gain
+    assert small.share > 1.0, "it is evident"
+    assert not small.is_significant
+    assert enough.is_significant
 
 
 def test_noise_that_is_larger_where_the_column_acts_is_no_evidence() -> None:

@@ -43,6 +43,8 @@ _DRIVES = {
     "wheel_speed_limit": {"limit": 5.0},
     "wheel_speed_scaling": {"limit": 5.0},
 }
+_ALIKE = {"drive_gain", "side_gain", "turn_acceleration_limit", "wheel_speed_scaling"}
+"""Each has another of its kind above."""
 _GROUNDS = {"grade_load": Ground(hill_m=1.0, hill_length_m=25.0)}
 
 
@@ -53,7 +55,9 @@ def _diagnose(log: Path) -> RunDiagnosis:
     return told
 
 
-@pytest.mark.parametrize("name", _DRIVES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.long) if name in _ALIKE else name for name in _DRIVES]
+)
 def test_it_is_named_with_its_numbers_and_nothing_beside_it(name: str, tmp_path: Path) -> None:
     """49 % of the asked difference at all rates was named a limit, and ramps a servo."""
     scenario = Scenario(
@@ -97,6 +101,7 @@ def test_small_wheels_that_accelerate_as_cars_do_turn_faster_than_large_ones(tmp
     assert found == pytest.approx(hidden, rel=0.05)
 
 
+@pytest.mark.long
 def test_the_speed_loop_of_a_slow_robot_is_fitted_to_the_end(tmp_path: Path) -> None:
     """From a bound of 1.3 m/s, which never acts at 1 m/s, it ended beside a lag, or a gain of one side."""
     servo = {

@@ -41,7 +41,7 @@ def list_ids(judged: RunDiagnosis) -> set[str]:
     return {effect.id for effect in judged.effects}
 
 
-@pytest.mark.parametrize("reads", [0.95, 1.08])
+@pytest.mark.parametrize("reads", [0.95, pytest.param(1.08, marks=pytest.mark.long)])
 def test_encoders_that_misread_are_named_with_the_line_that_mends_them(reads: float, tmp_path: Path) -> None:
     judged = judge(tmp_path, {"effective_track": 1.3}, reads)
     assert list_ids(judged) == {"drive_lag", "effective_track"}

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_log_never_breaks_the_reader(tmp_path: Path, seed: int) -> None:
     rng = random.Random(seed)  # noqa: S311 - no secret
@@ -22,7 +22,6 @@ def test_a_damaged_log_never_breaks_the_reader(tmp_path: Path, seed: int) -> Non
     check_log(path)
 
 
-@settings(max_examples=300, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_a_damaged_definition_is_parsed_or_refused(seed: int) -> None:
     check_definition(random.Random(seed))  # noqa: S311 - no secret

@@ -223,7 +223,7 @@ def test_a_full_disk_under_what_is_shown_is_one_line_and_the_watch_goes_on(
     assert "The watch goes on." in told.stderr
 
 
-@pytest.mark.parametrize("by", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("by", [signal.SIGINT, pytest.param(signal.SIGTERM, marks=pytest.mark.long)])
 def test_a_signal_ends_a_watch_with_the_diagnosis_so_far(by: signal.Signals, tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 6.0)
     content = log.read_bytes()

@@ -163,7 +163,7 @@ def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
         pytest.param(
             {"turn_lag": {"tau_mean": 0.4, "tau_diff": 1.3}, "transport_delay": 0.3}, marks=pytest.mark.long
         ),
-        {"body_inertia": 0.6, "effective_track": 2.6},
+        pytest.param({"body_inertia": 0.6, "effective_track": 2.6}, marks=pytest.mark.long),
         pytest.param(
             {"wheel_servo": {"tau": 0.3, "reset": 0.3, "bound": 0.6, "scrub": 0.4, "creep": 0.07}},
             marks=pytest.mark.long,

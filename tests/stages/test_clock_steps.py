@@ -145,7 +145,7 @@ def find_effects(taken: Taken, tables: dict[str, pl.DataFrame]) -> tuple[set[str
 
 
 def test_no_array_is_sized_by_a_hole(drive: TakeThrough) -> None:
-    taken = drive(FIELD)
+    taken = drive(replace(FIELD, duration_s=40.0))
     effects, peaks = find_effects(taken, hold_open(taken, 0.0))
     assert {"drive_lag", "effective_track"} <= effects
     found, needed = find_effects(taken, hold_open(taken, STEPS_S["23 years"]))

@@ -32,8 +32,19 @@ def fall_silent(timeout_s: float, effects: Mapping[str, float] | None = None) ->
     )
 
 
-@pytest.mark.parametrize("timeout_s", [0.25, 0.5, 1.0])
-@pytest.mark.parametrize("effects", [{"drive_lag": 0.3}, {"acceleration_limit": 4.0}], ids=str)
+@pytest.mark.parametrize(
+    ("effects", "timeout_s"),
+    [
+        ({"drive_lag": 0.3}, 0.25),
+        ({"acceleration_limit": 4.0}, 0.5),
+        ({"drive_lag": 0.3}, 1.0),
+        *(
+            pytest.param({"acceleration_limit": 4.0}, longer, marks=pytest.mark.long)
+            for longer in (0.25, 1.0)
+        ),
+    ],
+    ids=str,
+)
 def test_silences_show_when_the_base_stops(
     drive: TakeThrough, timeout_s: float, effects: Mapping[str, float]
 ) -> None:

@@ -17,8 +17,10 @@ def stretch(scenario: Scenario, share: float, along_rad: float = 0.5) -> Scenari
     return replace(scenario, pose=replace(scenario.pose, map_stretch=share, map_stretch_rad=along_rad))
 
 
-@pytest.mark.parametrize("along_rad", [0.5, 2.2])
-@pytest.mark.parametrize("seed", [4, pytest.param(5, marks=pytest.mark.long)])
+@pytest.mark.parametrize(
+    ("seed", "along_rad"),
+    [(4, 0.5), *(pytest.param(*more, marks=pytest.mark.long) for more in ((4, 2.2), (5, 0.5), (5, 2.2)))],
+)
 def test_a_map_that_is_longer_along_one_direction_is_told_with_its_interval(
     drive: TakeThrough, seed: int, along_rad: float
 ) -> None:

@@ -97,7 +97,15 @@ def test_a_suspect_sample_makes_its_window_suspect() -> None:
     assert cut_windows(slip, 20.0)["suspect"].to_list() == [False, True]
 
 
-@pytest.mark.parametrize("program", ["drive_steps", "smooth", "ramps", "slalom", "teleop", "circle"])
+@pytest.mark.parametrize(
+    "program",
+    [
+        "drive_steps",
+        "ramps",
+        "teleop",
+        *(pytest.param(more, marks=pytest.mark.long) for more in ("smooth", "slalom", "circle")),
+    ],
+)
 def test_every_way_of_driving_has_windows_inside_steps_and_segments(drive: TakeThrough, program: str) -> None:
     taken = drive(replace(FIELD, program=Program(program)), {"velocity": {"rate_hz": 20}})  # type: ignore[arg-type]
     for name in ("command", "measured"):

@@ -122,7 +122,15 @@ def test_trap_8_intervals_by_time_and_by_state(drive: TakeThrough) -> None:
 ODOMETRY = PoseSensor(source="wheels", noise_m=0.0, noise_rad=0.0, noise_z_m=0.0, noise_tilt_rad=0.0)
 
 
-@pytest.mark.parametrize("program", ["drive_steps", "slalom", "smooth", "teleop", "spins", "straight"])
+@pytest.mark.parametrize(
+    "program",
+    [
+        "drive_steps",
+        "teleop",
+        "straight",
+        *(pytest.param(more, marks=pytest.mark.long) for more in ("slalom", "smooth", "spins")),
+    ],
+)
 def test_trap_9_wheel_odometry_is_recognised_however_it_is_driven(drive: TakeThrough, program: str) -> None:
     scenario = replace(LONGER, pose=ODOMETRY, program=Program(program), encoders=Encoders(noise_radps=0.02))  # type: ignore[arg-type]
     taken = drive(scenario)
@@ -277,13 +285,14 @@ def test_trap_21_commands_of_another_vehicle_are_those_of_its_wheels_and_track(
 @pytest.mark.parametrize(
     "effects",
     [
-        {"drive_lag": 0.6},
-        {"wheel_speed_limit": 4.5},
         {"turn_lag": {"tau_mean": 0.3, "tau_diff": 1.0}},
         {"body_speed_limit": 0.7, "body_turn_limit": 0.6},
-        {"deadband": 0.1},
         {"deadband": 0.2},
         {"wheel_radius": 0.8},
+        *(
+            pytest.param(more, marks=pytest.mark.long)
+            for more in ({"drive_lag": 0.6}, {"wheel_speed_limit": 4.5}, {"deadband": 0.1})
+        ),
     ],
     ids=str,
 )

@@ -1,18 +1,16 @@
 from __future__ import annotations
 
+import multiprocessing
 import os
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
+import store_writer
 
 from pipeline.store import Store
 
-HERE = Path(__file__).parents[1] / "fixtures"
-
-StartWriter = Callable[..., "subprocess.Popen[str]"]
+StartWriter = Callable[..., "Writer"]
 
 
 @pytest.fixture
@@ -20,22 +18,49 @@ def store(tmp_path: Path) -> Store:
     return Store(tmp_path / "results", patience_s=10.0)
 
 
+class Writer:
+    """A function of `store_writer.py` in a process of its own, and what that says."""
+
+    def __init__(self, *arguments: object) -> None:
+        # A server that has loaded everything forks the writers: none waits for its libraries.
+        server = multiprocessing.get_context("forkserver")
+        server.set_forkserver_preload(["pytest", "polars", "pipeline.store", "schemas"])
+        hears, says = server.Pipe(duplex=False)
+        self._process = server.Process(target=store_writer.run, args=(says, *map(str, arguments)))
+        self._process.start()
+        says.close()
+        self.stdout = os.fdopen(os.dup(hears.fileno()))
+        hears.close()
+
+    @property
+    def pid(self) -> int | None:
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        return self._process.exitcode
+
+    def wait(self, timeout: float = 30.0) -> int | None:
+        self._process.join(timeout)
+        return self._process.exitcode
+
+    def kill(self) -> None:
+        self._process.kill()
+
+    def close(self) -> None:
+        self.kill()
+        self._process.join()
+        self.stdout.close()
+
+
 @pytest.fixture
 def start_writer() -> Iterator[StartWriter]:
-    """Starts `store_writer.py` with arguments; whatever still runs at the end is killed."""
-    started: list[subprocess.Popen[str]] = []
-    environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join((str(HERE), str(HERE.parents[1]))),
-        "POLARS_MAX_THREADS": "1",
-    }
+    """Starts a `Writer`; whatever still runs at the end is killed."""
+    started: list[Writer] = []
 
-    def start(*arguments: object) -> subprocess.Popen[str]:
-        command = [sys.executable, str(HERE / "store_writer.py"), *(str(argument) for argument in arguments)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
-        started.append(process)
-        return process
+    def start(*arguments: object) -> Writer:
+        started.append(Writer(*arguments))
+        return started[-1]
 
     yield start
-    for process in started:
-        process.kill()
-        process.communicate()
+    for writer in started:
+        writer.close()

@@ -196,5 +196,5 @@ def test_results_that_are_being_written_are_not_damaged(store: Store, start_writ
         found = store.examine()
         assert (found.problems, found.unchecked) == ((), ())
         looks += 1
-    assert [writer.returncode for writer in writers] == [0, 0]
+    assert [writer.wait() for writer in writers] == [0, 0]
     assert looks > 5

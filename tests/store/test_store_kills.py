@@ -76,11 +76,9 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
     unfinished = 0
     for _ in range(rounds):
         writer = start_writer("loop", store.root, RUN, begun, 10_000)
-        assert writer.stdout is not None
         told = [int(writer.stdout.readline()) for _ in range(chance.randint(1, 3))]
         time.sleep(chance.uniform(0.0, 0.03))
         writer.kill()
-        # What readline has read ahead is lost to communicate.
         told += [int(line) for line in writer.stdout.read().split()]
         assert writer.wait(30) == -signal.SIGKILL
 
@@ -97,7 +95,7 @@ def kill_at_random(store: Store, start_writer: StartWriter, *, rounds: int, seed
 
 
 def test_killed_at_random_moments_the_run_is_whole(store: Store, start_writer: StartWriter) -> None:
-    kill_at_random(store, start_writer, rounds=20, seed=7)
+    kill_at_random(store, start_writer, rounds=10, seed=7)
 
 
 @pytest.mark.long

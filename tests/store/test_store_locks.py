@@ -69,7 +69,6 @@ def test_waiting_ends_with_the_name_of_the_holder_and_death_releases(
     store: Store, start_writer: StartWriter
 ) -> None:
     holder = start_writer("hold", store.root, RUN)
-    assert holder.stdout is not None
     assert holder.stdout.readline() == "ready\n"
     hasty = Store(store.root, patience_s=0.1)
     with pytest.raises(StoreError, match=f"process {holder.pid} on") as caught:
@@ -87,7 +86,6 @@ def test_a_child_that_outlives_a_killed_writer_does_not_keep_its_lock(
     store: Store, start_writer: StartWriter
 ) -> None:
     holder = start_writer("hold_with_child", store.root, RUN)
-    assert holder.stdout is not None
     child = int(holder.stdout.readline())
     try:
         holder.kill()

@@ -67,6 +67,8 @@ def test_a_person_adds_the_hidden_effect_undoes_drops_a_log_and_reloads(
 
     other = simulate_case("husky_tile", out=tmp_path / "other.mcap", duration_s=40.0)
     chrome.run("scrollTo(0, 0)")
+    # Seconds in which a person reads pass at once.
+    chrome.run("(() => { const wait = setTimeout; window.setTimeout = (work) => wait(work, 200); })()")
     chrome.drop(other, "#drop")
     chrome.wait("[...document.querySelectorAll('.run')].length === 2")
     # What went well is a notice that goes away by itself.
