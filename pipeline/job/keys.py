@@ -19,6 +19,7 @@ from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
+    TRANSFORM_TYPES,
     ChannelInfo,
     LogIndex,
     Loss,
@@ -39,7 +40,6 @@ from pipeline.sources import (
     load_configuration,
 )
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
-from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import blame_damage
 from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store

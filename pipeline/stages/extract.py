@@ -302,9 +302,9 @@ class _Extraction:
         return stamp, log_time, arrays, breaks
 
     def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
-        pose = find_type(columns.type_name).pose
+        pose = source.fields or find_type(columns.type_name).pose
         if pose is None or not pose.names:
-            return reading.read_pose_topic(columns)
+            return reading.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
         text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))

@@ -10,12 +10,19 @@ import numpy as np
 
 from pipeline.core import format_share, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.logs import LogError, Ragged, RaggedStrings, TopicColumns, TransformBuffer, TransformSeries
+from pipeline.logs import (
+    TRANSFORM_TYPES,
+    LogError,
+    Ragged,
+    RaggedStrings,
+    TopicColumns,
+    TransformBuffer,
+    TransformSeries,
+)
 from pipeline.sources import PoseSource, Vehicle
 from pipeline.sources.candidates import LOCALIZED
 from pipeline.sources.configuration import VelocitySection
 from pipeline.sources.message_types import PoseFields, plain_type
-from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 

@@ -35,12 +35,12 @@ def list_paths(kind: MessageType) -> list[str]:
     if kind.ground_velocity is not None:
         paths += [kind.ground_velocity.east, kind.ground_velocity.north]
     if kind.pose is not None:
-        paths += filter(None, [kind.pose.parent, kind.pose.child, kind.pose.names])
+        paths += filter(None, [kind.pose.parent, kind.pose.child, kind.pose.names, kind.pose.angle])
     for vectors in (
         kind.pose and (kind.pose.position, kind.pose.orientation),
         kind.imu and (kind.imu.rate, kind.imu.force),
     ):
-        for fields in vectors or ():
+        for fields in filter(None, vectors or ()):
             paths += fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in "xyz"]
     return paths
 

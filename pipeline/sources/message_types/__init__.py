@@ -80,8 +80,10 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pose: structures with x, y, z(, w), or their fields one by one, the quaternion's w last.
 
     Attributes:
-        position: [m].
+        position: [m]; of two fields they are x and y, and z is zero.
         orientation: quaternion.
+        angle: field of the heading in place of a quaternion, counterclockwise from x.
+        angle_unit: unit of the heading.
         parent: field with the name of the reference frame.
         child: field with the name of the frame whose pose is given.
         names: field with the names of several bodies; position and orientation are sequences of equal length.
@@ -90,7 +92,9 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     position: str | list[str]
-    orientation: str | list[str]
+    orientation: str | list[str] = ""
+    angle: str = ""
+    angle_unit: Literal["rad", "deg"] = "rad"
     parent: str = ""
     child: str = ""
     names: str = ""
