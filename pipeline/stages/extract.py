@@ -115,7 +115,12 @@ class _Extraction:
         # All texts of a topic may be unreadable.
         self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
         pose = sources.pose
-        self.chain = pose_topics.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
+        self.chain = (
+            pose_topics.chain_poses(topics, pose, where, drive=drive)
+            if pose and pose.from_transforms
+            else None
+        )
         self.paused_s = 0.0
         self.clocks = self._align()
         self.start_ns = self._find_start()
@@ -279,7 +284,7 @@ class _Extraction:
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += pose_topics.report_chain(chain, topic)
+            self.findings += pose_topics.report_chain(chain, source)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:

@@ -230,3 +230,60 @@ def test_fields_that_are_no_pose_are_refused(pose: dict[str, str], said: str, tm
     assert "\n" not in str(caught.value)
     if "heading" not in said:
         assert isinstance(caught.value, ConfigurationError)
+
+
+def record_frames(drive: DrawnDrive, frames: dict[str, float], parent: str = "map") -> DrawnTopic:
+    """Transforms of frames that do a share of the drive."""
+    inner = "transforms[]."
+    poses = [
+        {
+            f"{inner}{name}": value * share if name.endswith(("x", "y")) else value
+            for name, value in given.items()
+        }
+        for share in frames.values()
+        for given in [drive.pose("transform.", ("translation", "rotation"))]
+    ]
+    columns = {name: np.stack([pose[name] for pose in poses], axis=1) for name in poses[0]}
+    count = len(frames)
+    stamps = {
+        f"{inner}{name}": np.repeat(value[:, None], count, 1) for name, value in stamp_ros(drive).items()
+    }
+    names = {f"{inner}header.frame_id": [parent] * count, f"{inner}child_frame_id": list(frames)}
+    return record_cdr(drive, "/tf", "tf2_msgs/msg/TFMessage", columns | stamps | names)
+
+
+def test_the_only_frame_that_moves_is_the_vehicle(tmp_path: Path) -> None:
+    drive = draw_drive()
+    frames = record_frames(drive, {"car_rear_axle": 1.0, "dock": 0.0, "odom_combined": 0.2})
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), frames)
+    check_poses(extract_drawn(log), drive)
+    said = read_findings(log)["vehicle_frame"]
+    assert said.startswith("no frame is called base_link: car_rear_axle, the only one that moves, is taken")
+    assert "[pose] frames" in said
+    assert "vehicle_frame" not in read_findings(log, pose={"frames": ["map", "car_rear_axle"]})
+
+
+def test_of_several_frames_that_move_the_one_of_the_namespace_is_the_vehicle(tmp_path: Path) -> None:
+    drive = draw_drive()
+    frames = record_frames(drive, {"robot1/axle": 1.0, "robot2/axle": 0.5})
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive, "/robot1/cmd_vel"), frames)
+    check_poses(extract_drawn(log), drive)
+    assert "robot1/axle, the only one that moves in its namespace" in read_findings(log)["vehicle_frame"]
+
+
+@pytest.mark.parametrize(
+    ("frames", "said"),
+    [
+        ({"car": 1.0, "truck": 0.5}, r"several frames move \(car, truck\)"),
+        ({"dock": 0.0}, "no frame moves"),
+    ],
+)
+def test_without_one_frame_that_moves_the_frames_are_listed(
+    frames: dict[str, float], said: str, tmp_path: Path
+) -> None:
+    drive = draw_drive()
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), record_frames(drive, frames))
+    with pytest.raises(SlipError, match=said) as caught:
+        extract_drawn(log)
+    assert caught.value.code == "no_base_frame"
+    assert "Known frames: " in caught.value.hint
