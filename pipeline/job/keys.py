@@ -25,6 +25,7 @@ from pipeline.logs import (
     Loss,
     RemotePath,
     Wanted,
+    list_fields,
     locate_recorded,
     open_log,
     read_topics,
@@ -40,6 +41,7 @@ from pipeline.sources import (
     load_configuration,
 )
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
+from pipeline.sources.topics import find_pose_fields
 from pipeline.stages import blame_damage
 from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store
@@ -111,7 +113,8 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     if sources.pose is None:
         what = "no topic can serve as pose (an odometry, a pose, or transforms)" + blame_damage(index.losses)
         named = "Name it in run.toml ([pose] topic = ...)"
-        hint = f"{named if _may_be_named(index, 'pose', 'fix') else _RECORD_POSE}. The log has: {there}."
+        named = named if _may_be_named(index, "pose", "fix") else _suggest_pose(index) or _RECORD_POSE
+        hint = f"{named}. The log has: {there}."
         raise JobError("no_pose", what, where=str(index.path), hint=hint)
     wanted = {"command": sources.command, "measured": sources.wheels}
     if all(wanted[name] is None for name in options.inputs):
@@ -121,6 +124,28 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
         is_there = _may_be_named(index, "drive", "number", "joints")
         hint = f"{named if is_there else _RECORD_DRIVE}. The log has: {there}."
         raise JobError("no_command", what, where=str(index.path), hint=hint)
+
+
+def _suggest_pose(index: LogIndex) -> str:
+    """Topics whose fields look like poses, and the lines that use them; empty if there are none."""
+    found = {topic: find_pose_fields(topic, fields) for topic, fields in list_fields(index).items()}
+    lines = [
+        "{} looks like a pose, of a type that is not known; to use it, in run.toml: [pose] {}".format(
+            topic,
+            "; ".join(
+                f'{key} = "{topic}.{path}"' for key, path in zip(("x", "y", "yaw"), three, strict=True)
+            ),
+        )
+        for topic, three in sorted(found.items())
+        if three is not None and three[2]
+    ]
+    places = [
+        f"{topic} has positions ({three[0]}, {three[1]}) of a type that is not known, and no heading in one "
+        "field: publish them as geometry_msgs/PoseStamped"
+        for topic, three in sorted(found.items())
+        if three is not None and not three[2]
+    ]
+    return ". ".join(lines or places)
 
 
 _RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
@@ -137,7 +162,7 @@ def _may_be_named(index: LogIndex, *parts: str) -> bool:
     types = {plain_type(channel.type_name) for channel in index.channels if channel.message_count}
     if "pose" in parts and types.intersection(TRANSFORM_TYPES):
         return True
-    # Single fields of any type can be named as signals of a drive, but not of a pose.
+    # Single fields of any type can be named as signals of a drive; those of a pose are looked for by name.
     strange = "number" in parts and any(
         find_type(name) == MessageType() and name.partition("/")[0] not in _KNOWN_PACKAGES
         and name not in TRANSFORM_TYPES

@@ -29,7 +29,7 @@ from pipeline.logs.catalog import OVER_BUDGET
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings, join_times
 from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
 from pipeline.logs.part import is_finished
-from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, read_topics
+from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics
 from pipeline.logs.records import ROS1_BAG, SQLITE_BAG, LogError, Loss
 from pipeline.logs.remote import FETCHED, RemotePath, locate_recorded, open_store, spell_location, to_location
 from pipeline.logs.schema import bundled_types, definition_text, field_names, short_name

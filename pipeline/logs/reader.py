@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -279,6 +279,29 @@ def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, tuple[str, ...] | None]
         both = None if before is None or want.fields is None else dict.fromkeys((*before, *want.fields))
         merged[want.topic] = None if both is None else tuple(both)
     return merged
+
+
+_MOST_LISTED: Final = 20_000
+"""Maximum number of messages of a JSON or protobuf topic that are read for the names of its fields."""
+
+
+def list_fields(index: LogIndex) -> dict[str, tuple[str, ...]]:
+    """Leaf fields of every topic with messages; topics that cannot be decoded are left out.
+
+    Fields of JSON and protobuf are known from the messages, and unknown where these are very many.
+    """
+    schemas = _list_schemas(index)
+    fields: dict[str, tuple[str, ...]] = {}
+    for info in index.channels:
+        if not info.message_count:
+            continue
+        with suppress(LogError):
+            leaves = decoder_for(info, schemas[info.id], None, where=str(index.path)).leaves
+            if not leaves and info.message_count <= _MOST_LISTED:
+                read = read_topics(index, [Wanted(info.topic)], sha256="unused").of(info.topic)
+                leaves = tuple(name for columns in read for name in columns.fields)
+            fields[info.topic] = (*fields.get(info.topic, ()), *leaves)
+    return fields
 
 
 def _no_topic(index: LogIndex, topic: str) -> LogError:

@@ -454,6 +454,40 @@ class _Chooser:
         return ranked[0][1]
 
 
+_ALONG = re.compile(r"(?:p|pos|pose|position)?_?(x)(?:_m)?|(east)(?:ing)?")
+_ACROSS = {"x": "y", "east": "north"}
+_ANGLE = re.compile(r"(?:theta|yaw|heading|psi|phi|bearing)(?!.*(?:rate|vel|acc|cov)).*")
+_NO_PLACE = re.compile(r"vel|twist|linear|angular|accel|cov|gyro|mag|goal|target|cmd|error|std")
+
+
+def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str] | None:
+    """Fields of a topic of any type that by their names are a position in the plane and a heading.
+
+    Args:
+        topic: name of the topic.
+        fields: its leaf fields.
+
+    Returns:
+        x, y and the heading, which is empty if there is none; None without a position.
+    """
+    if _NOT_A_POSE.search(topic.lower()):
+        return None
+    usable = [path for path in fields if not _NO_PLACE.search(path.lower()) and "[]" not in path]
+    angles = [path for path in usable if _ANGLE.fullmatch(path.rpartition(".")[2].lower())]
+    for path in usable:
+        space, dot, name = path.rpartition(".")
+        match = _ALONG.fullmatch(name.lower())
+        if match is None:
+            continue
+        start = match.start(match.lastindex or 0)
+        along = match[match.lastindex or 0]
+        other = f"{space}{dot}{name[:start]}{_ACROSS[along]}{name[start + len(along) :]}"
+        if other in usable:
+            beside = [angle for angle in angles if angle.rpartition(".")[0] == space]
+            return path, other, next(iter((*beside, *angles)), "")
+    return None
+
+
 def list_topics(section: DriveSection) -> Iterable[str]:
     """Topics in the configuration of a drive."""
     pairs = (section.left_topic, section.right_topic, section.speed_topic, section.steering_topic)

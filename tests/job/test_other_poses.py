@@ -232,6 +232,52 @@ def test_fields_that_are_no_pose_are_refused(pose: dict[str, str], said: str, tm
         assert isinstance(caught.value, ConfigurationError)
 
 
+def record_unknown(drive: DrawnDrive, spelling: str) -> DrawnTopic:
+    """Poses of a type that nobody knows."""
+    if spelling == "json":
+        rows = zip(drive.x, drive.y, drive.yaw, strict=True)
+        messages = [
+            {"state": {"pos_x": x, "pos_y": y}, "yaw_rate": 0.1, "heading": yaw} for x, y, yaw in rows
+        ]
+        return record_json(drive, "/tracker", "Tracked", messages)
+    if spelling == "place":
+        fields = {"position.x": drive.x, "position.y": drive.y}
+        text = f"geometry_msgs/Point position\n{MARK}\nMSG: geometry_msgs/Point\nfloat64 x\nfloat64 y\n"
+        return record_cdr(drive, "/tracker", "lab_msgs/msg/Tracked", fields, text)
+    return record_cdr(drive, "/tracker", "lab_msgs/msg/Tracked", flat(drive), FLAT)
+
+
+@pytest.mark.parametrize(
+    ("spelling", "said"),
+    [
+        ("flat", '[pose] x = "/tracker.x"; y = "/tracker.y"; yaw = "/tracker.theta"'),
+        ("json", '[pose] x = "/tracker.state.pos_x"; y = "/tracker.state.pos_y"; yaw = "/tracker.heading"'),
+        ("place", "/tracker has positions (position.x, position.y)"),
+    ],
+)
+def test_a_log_without_a_known_pose_names_fields_that_look_like_one(
+    spelling: str, said: str, tmp_path: Path
+) -> None:
+    drive = draw_drive()
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), record_unknown(drive, spelling))
+    with pytest.raises(SlipError) as caught:
+        extract_drawn(log)
+    assert caught.value.code == "no_pose"
+    assert said in str(caught.value)
+    assert "None of its topics" not in str(caught.value)
+    if "[pose]" in said:
+        lines = said.replace("[pose] ", "[pose]\n").replace("; ", "\n")
+        (tmp_path / "run.toml").write_text(lines, encoding="utf-8")
+        check_poses(extract_drawn(log), drive)
+
+
+def test_commands_and_goals_do_not_look_like_poses(tmp_path: Path) -> None:
+    drive = draw_drive()
+    goal = record_cdr(drive, "/goal", "lab_msgs/msg/Tracked", flat(drive), FLAT)
+    with pytest.raises(SlipError, match="None of its topics holds any"):
+        extract_drawn(write_drawn(tmp_path / "run.mcap", record_twist(drive), goal))
+
+
 def record_frames(drive: DrawnDrive, frames: dict[str, float], parent: str = "map") -> DrawnTopic:
     """Transforms of frames that do a share of the drive."""
     inner = "transforms[]."
