@@ -276,7 +276,7 @@ def list_named(names: str) -> list[str]:
 
 
 def _refuse(where: str) -> BatchError:
-    hint = "Recordings are files that end in .mcap, .db3 or .bag, and folders of rosbag2"
+    hint = "Recordings are files that end in .mcap, .mcap.zstd, .db3 or .bag, and folders of rosbag2"
     return BatchError("logs_not_found", "there is no recording in it", where=where, hint=hint)
 
 
@@ -334,7 +334,7 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
             yield from _list_recordings(folder, looker)
-    elif match.suffix in SUFFIXES and looker.ask(match, match.is_file):
+    elif match.name.endswith(SUFFIXES) and looker.ask(match, match.is_file):
         yield looker.ask(match, lambda: _parent_recording(match) or match) or match
 
 
@@ -359,7 +359,7 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
     parts = [name for name in names if not name.endswith(".bag")]
     if is_listed:
         return parts
-    pattern = re.compile(re.escape(folder.name) + r"_\d+\.\w+")
+    pattern = re.compile(re.escape(folder.name) + r"_\d+\.[\w.]+")
     return [name for name in parts if pattern.fullmatch(name)]
 
 
@@ -380,7 +380,7 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
         objects = [one for one in objects if fnmatch.fnmatchcase(str(one), str(target))]
     listed = {one.parent for one in objects if one.name == LISTING}
     for one in objects:
-        if one.suffix in SUFFIXES:
+        if one.name.endswith(SUFFIXES):
             folder = one.parent
             is_part = bool(list_parts(folder, [one.name], is_listed=folder in listed))
             yield folder if is_part else one

@@ -30,6 +30,7 @@ from pipeline.logs import (
     open_log,
     read_topics,
     spell_location,
+    stem_of,
     to_location,
 )
 from pipeline.sources import (
@@ -176,7 +177,8 @@ def name_plainly(path: Path) -> str:
 
     Bytes of a file name that are not UTF-8 are written as ``\xe9``.
     """
-    name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    stem = stem_of(path)
+    name = f"{path.parent.name}/{stem}" if path.parent.name else stem
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 

@@ -27,7 +27,16 @@ from pipeline.core.rigid import (
 )
 from pipeline.logs.catalog import OVER_BUDGET
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings, join_times
-from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
+from pipeline.logs.index import (
+    SUFFIXES,
+    ChannelInfo,
+    LogIndex,
+    hash_log,
+    list_files,
+    open_log,
+    shorten,
+    stem_of,
+)
 from pipeline.logs.part import is_finished
 from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics
 from pipeline.logs.records import ROS1_BAG, SQLITE_BAG, LogError, Loss

@@ -15,6 +15,7 @@ from pipeline.core.compute import usable_threads
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
+from pipeline.logs.compressed import COMPRESSED, uncompressed_name
 from pipeline.logs.part import (
     catalog_file,
     count_fetched,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs.spans import Span
 
-SUFFIXES: Final = (".mcap", ".db3", ".bag")
+SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
 """Suffixes of the files of recordings."""
 
 _LONGEST_SHOWN: Final = 100
@@ -217,7 +218,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         return [path], []
     listing = path / "metadata.yaml"
     every = list_files(path)
-    if every and every[0].suffix not in SUFFIXES:
+    if every and not every[0].name.endswith(SUFFIXES):
         return every, []
     here = [file for file in every if file.suffix == every[0].suffix]
     if listing.is_file():
@@ -231,7 +232,10 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         listed = [
             name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(SUFFIXES)
         ]
-        named = {name: _find_listed(path, name) for name in listed}
+        named = {
+            name: next(filter(None, (_find_listed(path, f"{name}{end}") for end in ("", *COMPRESSED))), None)
+            for name in listed
+        }
         parts = [file for file in named.values() if file is not None] or here
         missing = [_show(name) for name, file in named.items() if file is None]
         if parts:
@@ -239,7 +243,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
                 Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
             ]
             return parts, losses
-    stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
+    stems = {re.sub(r"_\d+$", "", stem_of(file)) for file in here}
     if here and len(stems) == 1:
         return here, []
     what, hint = "the folder holds no recording", "Give one .mcap, .db3 or .bag file, or one rosbag2 folder"
@@ -264,6 +268,11 @@ def list_files(folder: Path) -> list[Path]:
     return list_tables(folder)
 
 
+def stem_of(file: Path) -> str:
+    """Name of a file of a recording without its suffixes."""
+    return Path(uncompressed_name(file)).stem
+
+
 def _find_listed(folder: Path, name: str) -> Path | None:
     """Path of a file in the listing of a recording; None if it is not in the folder."""
     try:
@@ -281,8 +290,9 @@ def _show(name: str) -> str:
 
 
 def _split_number(file: Path) -> tuple[str, int]:
-    match = re.search(r"_(\d+)$", file.stem)
-    return (file.stem[: match.start()], int(match[1])) if match else (file.stem, -1)
+    stem = stem_of(file)
+    match = re.search(r"_(\d+)$", stem)
+    return (stem[: match.start()], int(match[1])) if match else (stem, -1)
 
 
 def _listed_files(text: str) -> list[str]:
