@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
@@ -172,7 +172,9 @@ def shorten(name: str) -> str:
     return f"{name[:LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
-def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -> LogIndex:
+def open_log(
+    path: str | os.PathLike[str], *, max_inflated: int | None = None, is_one: bool = False
+) -> LogIndex:
     """Build the index of a recording.
 
     Args:
@@ -181,6 +183,8 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
             text tables of a known data set.
         max_inflated: limit of the inflated size of all chunks of a file [bytes], by default a plausible one
             for its size; chunks beyond it are omitted and reported as a loss.
+        is_one: whether the files of a folder are known to be parts of one recording; otherwise its
+            ``metadata.yaml`` says so, or they follow one another in time.
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
@@ -194,7 +198,59 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
             catalog = catalog_file(source, threads=usable_threads(), max_inflated=max_inflated)
             parts.append(Part(file, source.size, catalog, version_of(source)))
             fetched += count_fetched([source])
+    unlisted = len(parts) > 1 and not is_one and not (location / LISTING).is_file()
+    if unlisted and files[0].name.endswith(SUFFIXES):
+        _require_one_recording(location, parts)
     return merge_parts(location, parts, losses, fetched)
+
+
+def _require_one_recording(folder: Path, parts: Sequence[Part]) -> None:
+    """Refuse files that are named as parts of one recording and do not follow one another in time."""
+    times = [(part.path, part.catalog.start_ns, part.catalog.end_ns) for part in parts]
+    pair = _find_overlap(times)
+    if pair is None:
+        return
+    first, second = (file.name for file in pair)
+    raise LogError(
+        "not_a_recording",
+        f"the folder holds {len(parts)} recordings, not parts of one: {second} begins before {first} ends",
+        where=str(folder),
+        hint=f"Give one of its files; `slip batch {folder}` analyzes each as a log of its own",
+    )
+
+
+_OVERLAP_NS: Final = 1_000_000_000, 5_000_000_000
+"""Overlap of parts of one recording [ns]: what a recorder holds in its cache when it begins the next file,
+as half of a part, within these limits."""
+
+_Times = tuple[Path, int | None, int | None]
+
+
+def _find_overlap(times: Iterable[_Times]) -> tuple[Path, Path] | None:
+    """The first two files, in their order, of which the second begins before the first ends; None without.
+
+    Args:
+        times: each file with its first and last log time [ns]; those without are left out.
+    """
+    known = [(file, start, end) for file, start, end in times if start is not None and end is not None]
+    for (first, start, end), (second, begin, last) in itertools.pairwise(known):
+        half = min(end - start, last - begin) // 2
+        if end - begin > min(max(half, _OVERLAP_NS[0]), _OVERLAP_NS[1]):
+            return first, second
+    return None
+
+
+def are_separate(files: Iterable[Path]) -> bool:
+    """Whether files, in their order, do not follow one another in time, as parts of a recording do."""
+    times: list[_Times] = []
+    for file in files:
+        with suppress(LogError, OSError):
+            # The times of an unfinished file are known only after reading all of it.
+            if is_finished(file):
+                with open_source(file) as source:
+                    catalog = catalog_file(source)
+                times.append((file, catalog.start_ns, catalog.end_ns))
+    return _find_overlap(times) is not None
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -260,7 +316,7 @@ def list_files(folder: Path) -> list[Path]:
 
     If there are none, the text tables of a known data set.
     """
-    named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number))
+    named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=split_number))
     if files := [file for file in named if not file.is_dir()]:
         return files
     from pipeline.logs.other_formats import list_tables  # noqa: PLC0415 - few logs need it
@@ -289,7 +345,8 @@ def _show(name: str) -> str:
     return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
 
 
-def _split_number(file: Path) -> tuple[str, int]:
+def split_number(file: Path) -> tuple[str, int]:
+    """Name of a file without its number, and the number; -1 without."""
     stem = stem_of(file)
     match = re.search(r"_(\d+)$", stem)
     return (stem[: match.start()], int(match[1])) if match else (stem, -1)
