@@ -31,6 +31,7 @@ from pipeline.logs.index import (
     SUFFIXES,
     ChannelInfo,
     LogIndex,
+    find_types,
     hash_log,
     list_files,
     open_log,

@@ -132,8 +132,8 @@ class LogIndex:
 
     @property
     def types(self) -> dict[str, str]:
-        """Message type by topic."""
-        return {channel.topic: channel.type_name for channel in self.channels}
+        """Message type by topic; of several types the one with most messages."""
+        return find_types(self.channels)
 
     @property
     def containers(self) -> frozenset[str]:
@@ -163,6 +163,16 @@ class LogIndex:
     def topics(self) -> tuple[str, ...]:
         """Names of all topics, sorted."""
         return tuple(sorted({channel.topic for channel in self.channels}))
+
+
+def find_types(channels: Iterable[ChannelInfo]) -> dict[str, str]:
+    """Message type by topic; of several types the one with most messages."""
+    fullest: dict[str, ChannelInfo] = {}
+    for channel in channels:
+        known = fullest.setdefault(channel.topic, channel)
+        if (channel.message_count or 0) >= (known.message_count or 0):
+            fullest[channel.topic] = channel
+    return {topic: channel.type_name for topic, channel in fullest.items()}
 
 
 def shorten(name: str) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal, TypeVar
 
-from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, wanted_transforms
+from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, find_types, wanted_transforms
 from pipeline.sources.candidates import (
     CONFIGURED,
     DEAD_RECKONED,
@@ -207,7 +207,7 @@ class _Chooser:
     """Candidates of one log."""
 
     def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
-        self.types = {channel.topic: plain_type(channel.type_name) for channel in channels}
+        self.types = {topic: plain_type(kind) for topic, kind in find_types(channels).items()}
         self.counts = {channel.topic: channel.message_count or 0 for channel in channels}
         self.vehicle = vehicle
         self.where = where

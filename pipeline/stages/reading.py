@@ -25,7 +25,7 @@ from pipeline.sources import (
     Sources,
 )
 from pipeline.sources.configuration import IntervalSection
-from pipeline.sources.message_types import PoseFields, find_type
+from pipeline.sources.message_types import PoseFields, find_alike, find_type
 from pipeline.stages import Finding, StageError
 
 _LARGEST = 1e12
@@ -251,7 +251,10 @@ def list_wanted(
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
-    wanted = [Wanted(topic, _recorded_fields(types[topic], fields)) for topic, fields in by_topic.items()]
+    wanted = [
+        Wanted(topic, _recorded_fields(types[topic], fields), find_alike(types[topic], fields))
+        for topic, fields in by_topic.items()
+    ]
     return wanted + _list_wanted_transforms(every, types)
 
 
