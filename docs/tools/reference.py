@@ -237,6 +237,7 @@ def _say_roles(content: dict[str, Any]) -> tuple[str, str]:
         "pose": "pose",
         "imu": "gyro",
         "number": "one side, or one of two numbers",
+        "numbers": "sides, if the configuration names its elements",
     }
     roles, fields = [], []
     for key, value in content.items():

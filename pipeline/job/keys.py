@@ -23,6 +23,7 @@ from pipeline.logs import (
     ChannelInfo,
     LogIndex,
     Loss,
+    Ragged,
     RemotePath,
     Wanted,
     list_fields,
@@ -41,9 +42,10 @@ from pipeline.sources import (
     choose_sources,
     load_configuration,
 )
+from pipeline.sources.candidates import COMMANDED
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
 from pipeline.sources.topics import find_pose_fields
-from pipeline.stages import blame_damage
+from pipeline.stages import Finding, Severity, blame_damage
 from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store
 
@@ -92,10 +94,39 @@ def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> L
     _require_messages(index)
     chosen = choose(index, configuration, options.overrides)
     _require_sources(chosen.sources, index, options)
+    chosen = replace(chosen, findings=(*chosen.findings, *_list_unused(index, chosen.sources)))
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def _list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
+    """Findings on topics of two numbers a message that may be those of a left and a right wheel."""
+    drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
+    used = {signal.topic for drive in drives for signal in drive.signals}
+    fields = {
+        topic: numbers.field
+        for topic, kind in index.types.items()
+        if topic not in used and (numbers := find_type(kind).numbers) is not None
+    }
+    wanted = [Wanted(topic, (field,)) for topic, field in fields.items()]
+    findings = []
+    for columns in read_topics(index, wanted, sha256="unused", skip_unfit=True).topics if wanted else ():
+        topic, field = columns.topic, fields[columns.topic]
+        column = columns.fields.get(field)
+        values = column.fixed() if isinstance(column, Ragged) else None
+        if values is None or values.shape[1] != 2 or not np.ptp(values, axis=0).all():  # noqa: PLR2004 - two sides
+            continue
+        role = "command" if COMMANDED.search(topic.lower()) else "wheels"
+        text = (
+            f"not used: {topic} (two numbers a message), whose meaning is not known; if they are the left "
+            f'and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
+            f'right_topic = "{topic}.{field}[1]"; unit = "rad/s" (or "m/s", "rpm", "rad")'
+        )
+        severity: Severity = "info" if getattr(sources, role) else "warning"
+        findings.append(Finding("numbers_not_used", severity, text, where=topic))
+    return findings
 
 
 def _require_messages(index: LogIndex) -> None:
@@ -122,7 +153,7 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
-        is_there = _may_be_named(index, "drive", "number", "joints")
+        is_there = _may_be_named(index, "drive", "number", "numbers", "joints")
         hint = f"{named if is_there else _RECORD_DRIVE}. The log has: {there}."
         raise JobError("no_command", what, where=str(index.path), hint=hint)
 

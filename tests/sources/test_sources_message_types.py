@@ -10,7 +10,7 @@ from pipeline.logs import bundled_types, field_names
 from pipeline.sources import ConfigurationError, Signal, convert_unit, find_preset
 from pipeline.sources.message_types import MessageType, find_type, list_types
 
-PARTS = ("drive", "number", "joints", "pose", "fix", "ground_velocity", "imu", "power")
+PARTS = ("drive", "number", "numbers", "joints", "pose", "fix", "ground_velocity", "imu", "power")
 KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})
 BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
 
@@ -25,6 +25,8 @@ def list_paths(kind: MessageType) -> list[str]:
         paths += [kind.text.field, kind.text.tag]
     if kind.number is not None:
         paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
+    if kind.numbers is not None:
+        paths.append(kind.numbers.field)
     if kind.joints is not None:
         plain = [kind.joints.velocity, kind.joints.position]
         inner = [kind.joints.interfaces, kind.joints.values]

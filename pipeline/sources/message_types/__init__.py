@@ -6,6 +6,7 @@ of
 - ``drive``: two fields of the drive: ``sides`` (left, right), ``body`` (forward speed, yaw rate) or
   ``steering`` (speed, steering angle); fields joined by ``+`` are averaged;
 - ``number``: one field; ``quantity`` or the topic's name states its meaning;
+- ``numbers``: a sequence of numbers whose meaning only the user knows;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a position on Earth, a velocity east and north;
 - ``power``: fields of currents and voltages;
@@ -58,6 +59,12 @@ class NumberField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     unit: str = ""
     sign: Literal[1, -1] = 1
     per_turn: str = ""
+
+
+class NumbersField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sequence of numbers without a stated meaning."""
+
+    field: str
 
 
 class JointFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -168,6 +175,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     drive: DriveFields | None = None
     number: NumberField | None = None
+    numbers: NumbersField | None = None
     joints: JointFields | None = None
     pose: PoseFields | None = None
     fix: FixFields | None = None
