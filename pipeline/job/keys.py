@@ -160,7 +160,7 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
 
 def _suggest_pose(index: LogIndex) -> str:
     """Topics whose fields look like poses, and the lines that use them; empty if there are none."""
-    found = {topic: find_pose_fields(topic, fields) for topic, fields in list_fields(index).items()}
+    by_topic = {topic: find_pose_fields(topic, fields) for topic, fields in list_fields(index).items()}
     lines = [
         "{} looks like a pose, of a type that is not known; to use it, in run.toml: [pose] {}".format(
             topic,
@@ -168,16 +168,16 @@ def _suggest_pose(index: LogIndex) -> str:
                 f'{key} = "{topic}.{path}"' for key, path in zip(("x", "y", "yaw"), three, strict=True)
             ),
         )
-        for topic, three in sorted(found.items())
+        for topic, three in sorted(by_topic.items())
         if three is not None and three[2]
     ]
-    places = [
+    positions = [
         f"{topic} has positions ({three[0]}, {three[1]}) of a type that is not known, and no heading in one "
         "field: publish them as geometry_msgs/PoseStamped"
-        for topic, three in sorted(found.items())
+        for topic, three in sorted(by_topic.items())
         if three is not None and not three[2]
     ]
-    return ". ".join(lines or places)
+    return ". ".join(lines or positions)
 
 
 _RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"

@@ -34,7 +34,7 @@ class _Inflated:
         weakref.finalize(self, os.close, self.descriptor)
 
 
-_KEPT: Final = Newest[_Inflated](16)
+_NEWEST: Final = Newest[_Inflated](16)
 """The files inflated last: a recording is cataloged, read and hashed one after the other."""
 
 
@@ -61,7 +61,7 @@ def open_inflated(path: Path, descriptor: int) -> int:
             _inflate(path, status.st_size, source, target)
             return _Inflated(target)
 
-    return os.dup(_KEPT.recall((path, status.st_size, status.st_mtime_ns), inflate).descriptor)
+    return os.dup(_NEWEST.recall((path, status.st_size, status.st_mtime_ns), inflate).descriptor)
 
 
 def _inflate(path: Path, size: int, source: IO[bytes], target: IO[bytes]) -> None:

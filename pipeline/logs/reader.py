@@ -99,7 +99,7 @@ class LogData:
     Attributes:
         index: index of the recording.
         topics: columns of every channel of the wanted topics that could be decoded.
-        left_out: times of the channels that lack the wanted fields, which others of their topics have.
+        unfit: times of the channels that lack the wanted fields, which others of their topics have.
         losses: all known losses.
         notes: remarks that are not losses.
         sha256: SHA-256 of the recording's bytes (hex); for an object, of its version and size.
@@ -118,7 +118,7 @@ class LogData:
     unchecked: str = ""
     repeated: Mapping[str, int] = field(default_factory=dict)
     readable: Mapping[int, int] = field(default_factory=dict)
-    left_out: tuple[TopicColumns, ...] = ()
+    unfit: tuple[TopicColumns, ...] = ()
 
     def of(self, topic: str) -> list[TopicColumns]:
         """Columns of every channel of a topic."""
@@ -202,10 +202,10 @@ def read_topics(
     counted = [(job.info, job.buffer.count) for job in jobs.values()]
     losses.update(dict.fromkeys(_count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []
-    left_out: list[TopicColumns] = []
+    unfit: list[TopicColumns] = []
     for columns, lost in map_in_order(lambda job: _finish(job, repeated), jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
-        (left_out if jobs[columns.channel_id].is_unfit else topics).append(columns)
+        (unfit if jobs[columns.channel_id].is_unfit else topics).append(columns)
     twice = {jobs[number].info.topic: 0 for number in repeated}
     for number, rows in repeated.items():
         twice[jobs[number].info.topic] += rows.size
@@ -221,7 +221,7 @@ def read_topics(
         coverage.format_coverage(),
         twice,
         readable,
-        tuple(left_out),
+        tuple(unfit),
     )
 
 

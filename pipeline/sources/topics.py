@@ -457,7 +457,7 @@ class _Chooser:
 _ALONG = re.compile(r"(?:p|pos|pose|position)?_?(x)(?:_m)?|(east)(?:ing)?")
 _ACROSS = {"x": "y", "east": "north"}
 _ANGLE = re.compile(r"(?:theta|yaw|heading|psi|phi|bearing)(?!.*(?:rate|vel|acc|cov)).*")
-_NO_PLACE = re.compile(r"vel|twist|linear|angular|accel|cov|gyro|mag|goal|target|cmd|error|std")
+_NOT_A_POSITION = re.compile(r"vel|twist|linear|angular|accel|cov|gyro|mag|goal|target|cmd|error|std")
 
 
 def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str] | None:
@@ -472,7 +472,7 @@ def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str
     """
     if _NOT_A_POSE.search(topic.lower()):
         return None
-    usable = [path for path in fields if not _NO_PLACE.search(path.lower()) and "[]" not in path]
+    usable = [path for path in fields if not _NOT_A_POSITION.search(path.lower()) and "[]" not in path]
     angles = [path for path in usable if _ANGLE.fullmatch(path.rpartition(".")[2].lower())]
     for path in usable:
         space, dot, name = path.rpartition(".")

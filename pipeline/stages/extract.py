@@ -126,8 +126,8 @@ class _Extraction:
                 recorded.setdefault(columns.topic, []).append(columns)
         joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
         self.columns = {columns.topic: columns for columns in joined if columns is not None}
-        used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.left_out else ()
-        self.findings += [self._report_left_out(one) for one in data.left_out if one.topic in used]
+        used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
+        self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
         pose = sources.pose
         drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
         self.chain = (

@@ -358,8 +358,8 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
         if not link.fixed and _reaches(link.position) and not _REFERENCE.match(link.child.rsplit("/", 1)[-1])
     ]
     space = drive.strip("/").partition("/")[0] + "/"
-    found = moving if len(moving) == 1 else [frame for frame in moving if frame.startswith(space)]
-    if len(found) != 1:
+    chosen = moving if len(moving) == 1 else [frame for frame in moving if frame.startswith(space)]
+    if len(chosen) != 1:
         moved = f"several frames move ({', '.join(moving[:_LISTED])})" if moving else "no frame moves"
         raise StageError(
             "no_base_frame",
@@ -368,7 +368,7 @@ def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
             hint="Name both: [pose] frames = [parent, child]. "
             f"Known frames: {', '.join(buffer.frames()) or 'none'}.",
         )
-    return found[0]
+    return chosen[0]
 
 
 def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:

@@ -16,7 +16,7 @@ BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
 
 
 def list_paths(kind: MessageType) -> list[str]:
-    paths: list[str] = []
+    paths = [kind.numbers.field] if kind.numbers else []
     if kind.drive is not None:
         paths += [*kind.drive.first.split("+"), *kind.drive.second.split("+")]
         paths += [kind.drive.sideways] if kind.drive.sideways else []
@@ -25,8 +25,6 @@ def list_paths(kind: MessageType) -> list[str]:
         paths += [kind.text.field, kind.text.tag]
     if kind.number is not None:
         paths += [kind.number.field, *filter(None, [kind.number.per_turn])]
-    if kind.numbers is not None:
-        paths.append(kind.numbers.field)
     if kind.joints is not None:
         plain = [kind.joints.velocity, kind.joints.position]
         inner = [kind.joints.interfaces, kind.joints.values]
