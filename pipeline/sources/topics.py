@@ -232,7 +232,8 @@ class _Chooser:
         drives -= set(numbers.ground_velocities())
         robots = find_robots(drives, poses)
         named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
-        named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
+        pose = configuration.pose.topic or configuration.pose.x
+        named = tuple(filter(None, (*named, pose, configuration.imu.topic)))
         self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
         if self._robot is not None:
             others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)

@@ -169,7 +169,7 @@ class _Extraction:
                 text = f"{topic} carries two types, both read: {' and '.join(types)}"
             if joined.header_time is None and any(one.header_time is not None for one in stamped):
                 text += "; one of them has no stamps: the times of recording are used"
-            self.findings.append(Finding("several_types", "info", text, where=topic, count=len(types)))
+            self.findings.append(Finding("several_types", "warning", text, where=topic, count=len(types)))
             return joined
         if joined is not None:
             text = f"{topic} was recorded on {count} channels: their messages were put in one order"

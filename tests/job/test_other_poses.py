@@ -206,6 +206,25 @@ def test_three_fields_of_a_topic_are_a_pose(names: tuple[str, str, str], tmp_pat
     check_poses(extract_drawn(log), drive)
 
 
+def test_the_fields_of_a_pose_name_the_robot(tmp_path: Path) -> None:
+    drive = draw_drive()
+    topics = [
+        one
+        for robot in ("robot1", "robot2")
+        for one in (
+            record_twist(drive, f"/{robot}/cmd_vel"),
+            record_cdr(drive, f"/{robot}/pose", "geometry_msgs/msg/PoseStamped", drive.pose("pose.")),
+        )
+    ]
+    tracker = record_cdr(drive, "/robot2/tracker", "lab_msgs/msg/Tracked", flat(drive), FLAT)
+    log = write_drawn(tmp_path / "run.mcap", *topics, tracker)
+    with pytest.raises(SlipError, match="several robots"):
+        extract_drawn(log)
+    names = {"x": "x", "y": "y", "yaw": "theta"}
+    pose = {key: f"/robot2/tracker.{name}" for key, name in names.items()}
+    check_poses(extract_drawn(log, pose=pose), drive)
+
+
 @pytest.mark.parametrize(
     ("pose", "said"),
     [

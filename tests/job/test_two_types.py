@@ -56,7 +56,9 @@ def test_commands_of_two_types_are_one_series(change_s: float, tmp_path: Path) -
     commands = extract_drawn(log, "commands")
     np.testing.assert_allclose(commands["body_x"], drive.speed)
     np.testing.assert_allclose(commands["body_w"], drive.turn)
-    said = read_findings(log)["several_types"]
+    (shown,) = extract_drawn(log, "findings").filter(id="several_types").to_dicts()
+    assert shown["severity"] == "warning"
+    said = shown["text"]
     assert said.startswith(f"/cmd_vel carries two types, both read: {TWIST} and {STAMPED}")
     assert "the times of recording are used" in said
 
