@@ -16,12 +16,13 @@ from effects_pages import escape, table, write_effect_pages
 import schemas
 from pipeline.cli import build_app
 from pipeline.export import list_targets
+from pipeline.logs import TRANSFORM_TYPES
 from pipeline.sources import Configuration, list_presets
 
 if TYPE_CHECKING:
     from cyclopts import App
 
-_FIELDS = ("field", "name", "velocity", "position", "orientation", "rate")
+_FIELDS = ("field", "name", "velocity", "position", "orientation", "angle", "rate")
 _META = ("--help", "-h", "--version", "--install-completion")
 
 
@@ -217,6 +218,8 @@ def write_message_types() -> str:
         for name, content in sorted(tomllib.loads(file.read_text(encoding="utf-8")).items()):
             if isinstance(content, dict) and name[0].isupper():
                 rows.append((f"`{package}/{name}`", *_say_roles(content)))
+    rows += [(f"`{name}`", "pose, along a chain of frames", "") for name in TRANSFORM_TYPES]
+    rows.sort()
     return (
         "# Message types that are read\n\n"
         "Types that can serve as command, wheels, pose or gyro without any configuration; each package is a "
@@ -234,6 +237,7 @@ def _say_roles(content: dict[str, Any]) -> tuple[str, str]:
         "pose": "pose",
         "imu": "gyro",
         "number": "one side, or one of two numbers",
+        "numbers": "sides, if the configuration names its elements",
     }
     roles, fields = [], []
     for key, value in content.items():
@@ -244,7 +248,8 @@ def _say_roles(content: dict[str, Any]) -> tuple[str, str]:
                 fields += [f"`{each['first']}`", f"`{each['second']}`"]
         elif key in words:
             roles.append(words[key])
-            fields += [f"`{value[each]}`" for each in _FIELDS if isinstance(value.get(each), str)]
+            named = [value[each] for each in _FIELDS if each in value]
+            fields += [f"`{one}`" for each in named for one in ([each] if isinstance(each, str) else each)]
     return ", ".join(dict.fromkeys(roles)), ", ".join(dict.fromkeys(fields))
 
 

@@ -17,7 +17,7 @@ from typing import TypeVar
 from pipeline.batch import BatchError
 from pipeline.core.untrusted import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
-from pipeline.logs.index import LISTING
+from pipeline.logs.index import LISTING, are_separate, split_number
 from pipeline.logs.other_formats import recognize_text_folder
 
 # Reading of arbitrary folders: link cycles, dead mounts, folders without permission.
@@ -276,7 +276,7 @@ def list_named(names: str) -> list[str]:
 
 
 def _refuse(where: str) -> BatchError:
-    hint = "Recordings are files that end in .mcap, .db3 or .bag, and folders of rosbag2"
+    hint = "Recordings are files that end in .mcap, .mcap.zstd, .db3 or .bag, and folders of rosbag2"
     return BatchError("logs_not_found", "there is no recording in it", where=where, hint=hint)
 
 
@@ -334,13 +334,17 @@ def _find_match(match: Path, looker: Looker) -> Iterator[Path]:
     if looker.ask(match, match.is_dir):
         for folder in looker.walk(match):
             yield from _list_recordings(folder, looker)
-    elif match.suffix in SUFFIXES and looker.ask(match, match.is_file):
+    elif match.name.endswith(SUFFIXES) and looker.ask(match, match.is_file):
         yield looker.ask(match, lambda: _parent_recording(match) or match) or match
 
 
 def _list_recordings(folder: Folder, looker: Looker) -> Iterator[Path]:
     logs = [name for name in folder.files if name.endswith(SUFFIXES)]
-    parts = set(list_parts(folder.path, logs, is_listed=LISTING in folder.files))
+    is_listed = LISTING in folder.files
+    parts = set(list_parts(folder.path, logs, is_listed=is_listed))
+    if len(parts) > 1 and not is_listed:
+        files = sorted((folder.files[name] for name in parts), key=split_number)
+        parts = set() if looker.ask(folder.path, partial(are_separate, files)) else parts
     tables = None if logs else looker.ask(folder.path, partial(recognize_text_folder, folder.path))
     if parts or tables is not None:
         yield folder.path
@@ -359,7 +363,7 @@ def list_parts(folder: Path, names: Iterable[str], *, is_listed: bool) -> list[s
     parts = [name for name in names if not name.endswith(".bag")]
     if is_listed:
         return parts
-    pattern = re.compile(re.escape(folder.name) + r"_\d+\.\w+")
+    pattern = re.compile(re.escape(folder.name) + r"_\d+\.[\w.]+")
     return [name for name in parts if pattern.fullmatch(name)]
 
 
@@ -380,7 +384,7 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
         objects = [one for one in objects if fnmatch.fnmatchcase(str(one), str(target))]
     listed = {one.parent for one in objects if one.name == LISTING}
     for one in objects:
-        if one.suffix in SUFFIXES:
+        if one.name.endswith(SUFFIXES):
             folder = one.parent
             is_part = bool(list_parts(folder, [one.name], is_listed=folder in listed))
             yield folder if is_part else one
@@ -389,7 +393,11 @@ def _find_remote(target: RemotePath) -> Iterator[Path]:
 def _parent_recording(log: Path) -> Path | None:
     folder = log.parent
     listed = (folder / LISTING).is_file()
-    return folder if list_parts(folder, [log.name], is_listed=listed) else None
+    if not list_parts(folder, [log.name], is_listed=listed):
+        return None
+    files = list_files(folder)
+    parts = set(list_parts(folder, [file.name for file in files], is_listed=listed))
+    return None if not listed and are_separate(file for file in files if file.name in parts) else folder
 
 
 def _find_growing(listed: Iterable[Path], settle_s: float, looker: Looker) -> set[Path]:

@@ -27,6 +27,7 @@ from pipeline.run.heading import HeadingSource
 from pipeline.run.signals import find_fastest_wheel, name_inputs, split_wheels
 from pipeline.run.windows import HORIZON_S, WINDOW_S
 from pipeline.sources import Vehicle
+from pipeline.stages.pose_topics import SLOW_HZ
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,27 @@ _STILL = 1e-9
 """Offset of wheel speed and yaw rate [rad/s], so that their sum over a run is not zero."""
 
 
+def _refuse_few(run: MotionRun, count: int) -> MotionError:
+    """Error for a run with too few windows, with the reason."""
+    periods = np.diff(run.track.times)
+    rate = 1.0 / float(np.median(periods)) if periods.size else 0.0
+    if 0.0 < rate < SLOW_HZ:
+        return MotionError(
+            "slow_poses",
+            f"its poses come at {rate:.2g} Hz: at least {SLOW_HZ:g} Hz are needed",
+            where=run.name,
+            hint="Record a faster localization, or the transforms (/tf): the odometry in them fills the time "
+            "between its poses.",
+        )
+    return MotionError(
+        "too_short",
+        f"the run has {count} stretches of half a second with live commands and good poses; "
+        f"{FEWEST_WINDOWS} are needed",
+        where=run.name,
+        hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
+    )
+
+
 class Problem:
     """Runs prepared for one input.
 
@@ -165,13 +187,7 @@ class Problem:
         counts = [comparison.windows.start.size for comparison in self.comparisons]
         for run, count in zip(self.runs, counts, strict=True):
             if count < FEWEST_WINDOWS:
-                raise MotionError(
-                    "too_short",
-                    f"the run has {count} stretches of half a second with live commands and good poses; "
-                    f"{FEWEST_WINDOWS} are needed",
-                    where=run.name,
-                    hint="Drive longer, or check the intervals and the pose topic with `slip inspect`.",
-                )
+                raise _refuse_few(run, count)
         self.largest = measure_largest(self.runs, self.vehicle)
         self.exceeded = measure_exceeded(self.runs, self.vehicle)
         self.fits, self.refits = Newest[PartFit](_MOST_FITS), Newest[State](_MOST_FITS * FOLDS)

@@ -262,6 +262,8 @@ def _explain_empty(manifest: Manifest) -> str:
     except StoreError:
         findings = None
     ids = [one.get("id") for one in findings if isinstance(one, dict)] if isinstance(findings, list) else []
+    if "slow_poses" in ids:
+        return "its poses are too slow to be diagnosed"
     return "too short to be diagnosed alone" if "too_short" in ids else "its diagnosis gave no numbers"
 
 

@@ -19,15 +19,19 @@ from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
 from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
+    TRANSFORM_TYPES,
     ChannelInfo,
     LogIndex,
     Loss,
+    Ragged,
     RemotePath,
     Wanted,
+    list_fields,
     locate_recorded,
     open_log,
     read_topics,
     spell_location,
+    stem_of,
     to_location,
 )
 from pipeline.sources import (
@@ -38,9 +42,10 @@ from pipeline.sources import (
     choose_sources,
     load_configuration,
 )
+from pipeline.sources.candidates import COMMANDED
 from pipeline.sources.message_types import MessageType, describe_types, find_type, plain_type
-from pipeline.sources.topics import TRANSFORM_TYPES
-from pipeline.stages import blame_damage
+from pipeline.sources.topics import find_pose_fields
+from pipeline.stages import Finding, Severity, blame_damage
 from pipeline.stages.clocks import describe_pauses, find_pauses
 from pipeline.store import Manifest, Store
 
@@ -91,10 +96,39 @@ def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> L
     _require_sources(chosen.sources, index, options)
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
+    chosen = replace(chosen, findings=(*chosen.findings, *_list_unused(index, chosen.sources)))
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
+
+
+def _list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
+    """Findings on topics of two numbers a message that may be those of a left and a right wheel."""
+    drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
+    used = {signal.topic for drive in drives for signal in drive.signals}
+    fields = {
+        topic: numbers.field
+        for topic, kind in index.types.items()
+        if topic not in used and (numbers := find_type(kind).numbers) is not None
+    }
+    wanted = [Wanted(topic, (field,)) for topic, field in fields.items()]
+    findings = []
+    for columns in read_topics(index, wanted, sha256="unused", skip_unfit=True).topics if wanted else ():
+        topic, field = columns.topic, fields[columns.topic]
+        column = columns.fields.get(field)
+        values = column.fixed() if isinstance(column, Ragged) else None
+        if values is None or values.shape[1] != 2 or not np.ptp(values, axis=0).all():  # noqa: PLR2004 - two sides
+            continue
+        role = "command" if COMMANDED.search(topic.lower()) else "wheels"
+        text = (
+            f"not used: {topic} (two numbers a message), whose meaning is not known; if they are the left "
+            f'and right wheels, in run.toml: [{role}] left_topic = "{topic}.{field}[0]"; '
+            f'right_topic = "{topic}.{field}[1]"; unit = "rad/s" (or "m/s", "rpm", "rad")'
+        )
+        severity: Severity = "info" if getattr(sources, role) else "warning"
+        findings.append(Finding("numbers_not_used", severity, text, where=topic))
+    return findings
 
 
 def _require_messages(index: LogIndex) -> None:
@@ -113,16 +147,39 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     if sources.pose is None:
         what = "no topic can serve as pose (an odometry, a pose, or transforms)" + blame_damage(index.losses)
         named = "Name it in run.toml ([pose] topic = ...)"
-        hint = f"{named if _may_be_named(index, 'pose', 'fix') else _RECORD_POSE}. The log has: {there}."
+        named = named if _may_be_named(index, "pose", "fix") else _suggest_pose(index) or _RECORD_POSE
+        hint = f"{named}. The log has: {there}."
         raise JobError("no_pose", what, where=str(index.path), hint=hint)
     wanted = {"command": sources.command, "measured": sources.wheels}
     if all(wanted[name] is None for name in options.inputs):
         roles = " or ".join("command" if name == "command" else "measured wheels" for name in options.inputs)
         what = f"no topic can serve as {roles}{blame_damage(index.losses)}"
         named = "Name it in run.toml ([command] topic = ..., or left_topic and right_topic)"
-        is_there = _may_be_named(index, "drive", "number", "joints")
+        is_there = _may_be_named(index, "drive", "number", "numbers", "joints")
         hint = f"{named if is_there else _RECORD_DRIVE}. The log has: {there}."
         raise JobError("no_command", what, where=str(index.path), hint=hint)
+
+
+def _suggest_pose(index: LogIndex) -> str:
+    """Topics whose fields look like poses, and the lines that use them; empty if there are none."""
+    by_topic = {topic: find_pose_fields(topic, fields) for topic, fields in list_fields(index).items()}
+    lines = [
+        "{} looks like a pose, of a type that is not known; to use it, in run.toml: [pose] {}".format(
+            topic,
+            "; ".join(
+                f'{key} = "{topic}.{path}"' for key, path in zip(("x", "y", "yaw"), three, strict=True)
+            ),
+        )
+        for topic, three in sorted(by_topic.items())
+        if three is not None and three[2]
+    ]
+    positions = [
+        f"{topic} has positions ({three[0]}, {three[1]}) of a type that is not known, and no heading in one "
+        "field: publish them as geometry_msgs/PoseStamped"
+        for topic, three in sorted(by_topic.items())
+        if three is not None and not three[2]
+    ]
+    return ". ".join(lines or positions)
 
 
 _RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
@@ -139,7 +196,7 @@ def _may_be_named(index: LogIndex, *parts: str) -> bool:
     types = {plain_type(channel.type_name) for channel in index.channels if channel.message_count}
     if "pose" in parts and types.intersection(TRANSFORM_TYPES):
         return True
-    # Single fields of any type can be named as signals of a drive, but not of a pose.
+    # Single fields of any type can be named as signals of a drive; those of a pose are looked for by name.
     strange = "number" in parts and any(
         find_type(name) == MessageType() and name.partition("/")[0] not in _KNOWN_PACKAGES
         and name not in TRANSFORM_TYPES
@@ -153,7 +210,8 @@ def name_plainly(path: Path) -> str:
 
     Bytes of a file name that are not UTF-8 are written as ``\xe9``.
     """
-    name = f"{path.parent.name}/{path.stem}" if path.parent.name else path.stem
+    stem = stem_of(path)
+    name = f"{path.parent.name}/{stem}" if path.parent.name else stem
     return os.fsencode(name).decode("utf-8", "backslashreplace")
 
 

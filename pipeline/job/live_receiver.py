@@ -23,6 +23,7 @@ import msgspec
 
 from pipeline.core import SlipError
 from pipeline.job import JobError
+from pipeline.logs import TRANSFORM_TYPES
 from pipeline.logs.live_recording import (
     FOXGLOVE_NAMES,
     FrameError,
@@ -31,7 +32,7 @@ from pipeline.logs.live_recording import (
     choose_protocol,
 )
 from pipeline.sources.message_types import MessageType, find_type, plain_type
-from pipeline.sources.topics import STRING_TYPE, TRANSFORM_TYPES
+from pipeline.sources.topics import STRING_TYPE
 
 if TYPE_CHECKING:
     from websockets.exceptions import WebSocketException

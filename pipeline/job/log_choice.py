@@ -109,8 +109,8 @@ def find_controller(index: LogIndex) -> Controller | None:
 
 def find_static_frames(index: LogIndex) -> TransformBuffer:
     """The static transforms of a log."""
-    topics = [channel.topic for channel in index.channels if channel.message_count != 0]
-    static = [one for one in wanted_transforms(topics) if one.topic.endswith("static")]
+    types = {channel.topic: channel.type_name for channel in index.channels if channel.message_count != 0}
+    static = [one for one in wanted_transforms(types) if one.topic.endswith("static")]
     return TransformBuffer(_read(index, static))
 
 

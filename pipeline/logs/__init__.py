@@ -9,7 +9,7 @@ child; slower links above it, such as map to odom, are corrections of it: each c
 recorded, even if it is dated ahead, and what it corrects arose along the path since the one before.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
@@ -26,21 +26,81 @@ from pipeline.core.rigid import (
     rotate,
 )
 from pipeline.logs.catalog import OVER_BUDGET
-from pipeline.logs.columns import Ragged, RaggedStrings, Strings, join_times
-from pipeline.logs.index import SUFFIXES, ChannelInfo, LogIndex, hash_log, list_files, open_log, shorten
+from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings, join_times
+from pipeline.logs.index import (
+    SUFFIXES,
+    ChannelInfo,
+    LogIndex,
+    find_types,
+    hash_log,
+    list_files,
+    open_log,
+    shorten,
+    stem_of,
+)
 from pipeline.logs.part import is_finished
-from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, read_topics
+from pipeline.logs.reader import LogData, TopicColumns, Wanted, join_channels, list_fields, read_topics
 from pipeline.logs.records import ROS1_BAG, SQLITE_BAG, LogError, Loss
 from pipeline.logs.remote import FETCHED, RemotePath, locate_recorded, open_store, spell_location, to_location
-from pipeline.logs.schema import bundled_types, definition_text, field_names
+from pipeline.logs.schema import bundled_types, definition_text, field_names, short_name
 
-_TRANSFORM: Final = "transforms[]."
-_NUMBERS: Final = (
-    "header.stamp.sec",
-    "header.stamp.nanosec",
-    *(f"transform.translation.{axis}" for axis in "xyz"),
-    *(f"transform.rotation.{axis}" for axis in "xyzw"),
-)
+
+@dataclass(frozen=True, slots=True)
+class _Layout:
+    """Fields of a message of transforms.
+
+    Attributes:
+        each: path of one transform; empty if a message is one.
+        parent: name of the parent frame.
+        stamp: a structure of ``sec`` and ``nanosec``.
+        transform: path of ``translation`` and ``rotation``.
+    """
+
+    each: str
+    parent: str
+    stamp: str
+    transform: str
+
+    @property
+    def frames(self) -> tuple[str, str]:
+        """Fields of the names of parent and child."""
+        return f"{self.each}{self.parent}", f"{self.each}child_frame_id"
+
+    @property
+    def structures(self) -> tuple[str, str, str]:
+        """Paths of stamp, translation and rotation."""
+        moved = f"{self.each}{self.transform}"
+        return f"{self.each}{self.stamp}", f"{moved}translation", f"{moved}rotation"
+
+    @property
+    def numbers(self) -> list[str]:
+        """Fields of the structures."""
+        parts = (("sec", "nanosec"), "xyz", "xyzw")
+        return [
+            f"{path}.{part}" for path, names in zip(self.structures, parts, strict=True) for part in names
+        ]
+
+
+_MESSAGE: Final = _Layout("transforms[].", "header.frame_id", "header.stamp", "transform.")
+_FOXGLOVE: Final = _Layout("", "parent_frame_id", "timestamp", "")
+_LAYOUTS: Final = {
+    "tf2_msgs/TFMessage": _MESSAGE,
+    "tf/tfMessage": _MESSAGE,
+    **{f"{package}/FrameTransform": _FOXGLOVE for package in ("foxglove", "foxglove_msgs")},
+    **{
+        f"{package}/FrameTransforms": replace(_FOXGLOVE, each="transforms[].")
+        for package in ("foxglove", "foxglove_msgs")
+    },
+}
+TRANSFORM_TYPES: Final = tuple(_LAYOUTS)
+"""Types of messages of transforms, as ``package/Name``."""
+
+
+def _find_layout(type_name: str) -> _Layout | None:
+    """Fields of a type of transforms; None of another."""
+    return _LAYOUTS.get(short_name(type_name.replace(".", "/")))
+
+
 _LEAST_NORM: Final = 1e-6
 _HELD_INTERVALS: Final = 3.0
 _SMALLEST_LEAD_NS: Final = 1_000_000
@@ -49,13 +109,6 @@ _SMALLEST_LEAD_NS: Final = 1_000_000
 _LONGEST_PATH: Final = 2.0
 """Path between two changes of a correction [m + rad] above which the second one is a jump: AMCL corrects
 every 0.2 m or 0.2 rad, slam_toolbox every 0.5 m or 0.5 rad."""
-
-TRANSFORM_FIELDS: Final = (
-    f"{_TRANSFORM}header",
-    f"{_TRANSFORM}child_frame_id",
-    f"{_TRANSFORM}transform",
-)
-"""Fields of a TFMessage that ``build_transforms`` needs."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,17 +160,27 @@ class TransformSeries:
     notes: tuple[str, ...]
 
 
-def wanted_transforms(topics: Iterable[str]) -> list[Wanted]:
-    """Topics and fields to read for a buffer: the topics of a log named ``tf`` or ``tf_static``."""
-    return [Wanted(topic, TRANSFORM_FIELDS) for topic in topics if _base_name(topic) in ("tf", "tf_static")]
+def wanted_transforms(types: Mapping[str, str]) -> list[Wanted]:
+    """Topics and fields to read for a buffer.
+
+    Args:
+        types: message type by topic. Messages of ROS are transforms of the robot on topics named ``tf`` or
+            ``tf_static``; Foxglove's types are on any.
+    """
+    wanted = []
+    for topic, kind in types.items():
+        layout = _find_layout(kind)
+        if layout is not None and (layout is not _MESSAGE or _base_name(topic) in ("tf", "tf_static")):
+            wanted.append(Wanted(topic, (*layout.frames, *layout.structures)))
+    return wanted
 
 
 class TransformBuffer:
     """All transforms of a recording.
 
     Args:
-        topics: columns of TFMessage topics, others are ignored; a transform on ``tf_static`` is fixed for
-            the whole recording.
+        topics: columns of topics of transforms, others are ignored; a transform on ``tf_static`` is fixed
+            for the whole recording.
     """
 
     def __init__(self, topics: Iterable[TopicColumns]) -> None:
@@ -229,7 +292,7 @@ class TransformBuffer:
         links: dict[str, list[Link]] = {}
         invalid: dict[str, int] = {}
         for columns in topics:
-            for link, bad in _split_by_child(columns, fixed=_base_name(columns.topic) == "tf_static"):
+            for link, bad in _split_by_child(columns, fixed=_base_name(columns.topic).endswith("static")):
                 links.setdefault(link.child, []).append(link)
                 invalid[link.child] = invalid.get(link.child, 0) + bad
         for child, several in links.items():
@@ -251,13 +314,13 @@ class TransformBuffer:
 
 def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, int]]:
     """Links with their valid rows, and the number of invalid rows of each."""
-    parents = columns.fields.get(f"{_TRANSFORM}header.frame_id")
-    children = columns.fields.get(f"{_TRANSFORM}child_frame_id")
-    numbers = [columns.fields.get(f"{_TRANSFORM}{path}") for path in _NUMBERS]
+    layout = _find_layout(columns.type_name) or _MESSAGE
+    parents, children = (_spread(columns.fields.get(name)) for name in layout.frames)
+    numbers = [_spread(columns.fields.get(name)) for name in layout.numbers]
     if not isinstance(parents, RaggedStrings) or not isinstance(children, RaggedStrings):
         return []
     ragged = [column for column in numbers if isinstance(column, Ragged)]
-    if len(ragged) < len(_NUMBERS):
+    if len(ragged) < len(numbers):
         return []
     offsets = [parents.offsets, children.offsets, *(column.offsets for column in ragged)]
     counts = np.diff(np.array(offsets), axis=1)
@@ -291,6 +354,16 @@ def _split_by_child(columns: TopicColumns, *, fixed: bool) -> list[tuple[Link, i
         )
         links.append((link, int((here & ~valid).sum())))
     return links
+
+
+def _spread(column: Column | None) -> Column | None:
+    """A column of one value a message as sequences of one, or of none where there is no text."""
+    if isinstance(column, Strings):
+        there = column.codes >= 0
+        return RaggedStrings(column.codes[there], column.values, np.append(0, np.cumsum(there)))
+    if isinstance(column, np.ndarray):
+        return Ragged(column, np.arange(column.size + 1))
+    return column
 
 
 def _join(links: list[Link]) -> Link:

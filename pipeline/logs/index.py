@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
@@ -15,6 +15,7 @@ from pipeline.core.compute import usable_threads
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
+from pipeline.logs.compressed import COMPRESSED, uncompressed_name
 from pipeline.logs.part import (
     catalog_file,
     count_fetched,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 
     from pipeline.logs.spans import Span
 
-SUFFIXES: Final = (".mcap", ".db3", ".bag")
+SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
 """Suffixes of the files of recordings."""
 
 _LONGEST_SHOWN: Final = 100
@@ -131,8 +132,8 @@ class LogIndex:
 
     @property
     def types(self) -> dict[str, str]:
-        """Message type by topic."""
-        return {channel.topic: channel.type_name for channel in self.channels}
+        """Message type by topic; of several types the one with most messages."""
+        return find_types(self.channels)
 
     @property
     def containers(self) -> frozenset[str]:
@@ -164,6 +165,16 @@ class LogIndex:
         return tuple(sorted({channel.topic for channel in self.channels}))
 
 
+def find_types(channels: Iterable[ChannelInfo]) -> dict[str, str]:
+    """Message type by topic; of several types the one with most messages."""
+    fullest: dict[str, ChannelInfo] = {}
+    for channel in channels:
+        known = fullest.setdefault(channel.topic, channel)
+        if (channel.message_count or 0) >= (known.message_count or 0):
+            fullest[channel.topic] = channel
+    return {topic: channel.type_name for topic, channel in fullest.items()}
+
+
 def shorten(name: str) -> str:
     """Shorten a name from a log for use in tables; a cut name states its full length."""
     if len(name) <= LONGEST_NAME:
@@ -171,7 +182,9 @@ def shorten(name: str) -> str:
     return f"{name[:LONGEST_NAME]} (cut, of {len(name)} characters)"
 
 
-def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -> LogIndex:
+def open_log(
+    path: str | os.PathLike[str], *, max_inflated: int | None = None, is_one: bool = False
+) -> LogIndex:
     """Build the index of a recording.
 
     Args:
@@ -180,6 +193,8 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
             text tables of a known data set.
         max_inflated: limit of the inflated size of all chunks of a file [bytes], by default a plausible one
             for its size; chunks beyond it are omitted and reported as a loss.
+        is_one: whether the files of a folder are known to be parts of one recording; otherwise its
+            ``metadata.yaml`` says so, or they follow one another in time.
 
     Raises:
         LogError: ``log_not_found``, ``log_empty``, ``not_mcap``, ``not_a_recording``, ``log_unreadable``.
@@ -193,7 +208,59 @@ def open_log(path: str | os.PathLike[str], *, max_inflated: int | None = None) -
             catalog = catalog_file(source, threads=usable_threads(), max_inflated=max_inflated)
             parts.append(Part(file, source.size, catalog, version_of(source)))
             fetched += count_fetched([source])
+    unlisted = len(parts) > 1 and not is_one and not (location / LISTING).is_file()
+    if unlisted and files[0].name.endswith(SUFFIXES):
+        _require_one_recording(location, parts)
     return merge_parts(location, parts, losses, fetched)
+
+
+def _require_one_recording(folder: Path, parts: Sequence[Part]) -> None:
+    """Refuse files that are named as parts of one recording and do not follow one another in time."""
+    times = [(part.path, part.catalog.start_ns, part.catalog.end_ns) for part in parts]
+    pair = _find_overlap(times)
+    if pair is None:
+        return
+    first, second = (file.name for file in pair)
+    raise LogError(
+        "not_a_recording",
+        f"the folder holds {len(parts)} recordings, not parts of one: {second} begins before {first} ends",
+        where=str(folder),
+        hint=f"Give one of its files; `slip batch {folder}` analyzes each as a log of its own",
+    )
+
+
+_OVERLAP_NS: Final = 1_000_000_000, 5_000_000_000
+"""Overlap of parts of one recording [ns]: what a recorder holds in its cache when it begins the next file,
+as half of a part, within these limits."""
+
+_Times = tuple[Path, int | None, int | None]
+
+
+def _find_overlap(times: Iterable[_Times]) -> tuple[Path, Path] | None:
+    """The first two files, in their order, of which the second begins before the first ends; None without.
+
+    Args:
+        times: each file with its first and last log time [ns]; those without are left out.
+    """
+    known = [(file, start, end) for file, start, end in times if start is not None and end is not None]
+    for (first, start, end), (second, begin, last) in itertools.pairwise(known):
+        half = min(end - start, last - begin) // 2
+        if end - begin > min(max(half, _OVERLAP_NS[0]), _OVERLAP_NS[1]):
+            return first, second
+    return None
+
+
+def are_separate(files: Iterable[Path]) -> bool:
+    """Whether files, in their order, do not follow one another in time, as parts of a recording do."""
+    times: list[_Times] = []
+    for file in files:
+        with suppress(LogError, OSError):
+            # The times of an unfinished file are known only after reading all of it.
+            if is_finished(file):
+                with open_source(file) as source:
+                    catalog = catalog_file(source)
+                times.append((file, catalog.start_ns, catalog.end_ns))
+    return _find_overlap(times) is not None
 
 
 def hash_log(path: str | os.PathLike[str]) -> str:
@@ -217,7 +284,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         return [path], []
     listing = path / "metadata.yaml"
     every = list_files(path)
-    if every and every[0].suffix not in SUFFIXES:
+    if every and not every[0].name.endswith(SUFFIXES):
         return every, []
     here = [file for file in every if file.suffix == every[0].suffix]
     if listing.is_file():
@@ -231,7 +298,10 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         listed = [
             name for name in _listed_files(listing.read_text("utf-8", "replace")) if name.endswith(SUFFIXES)
         ]
-        named = {name: _find_listed(path, name) for name in listed}
+        named = {
+            name: next(filter(None, (_find_listed(path, f"{name}{end}") for end in ("", *COMPRESSED))), None)
+            for name in listed
+        }
         parts = [file for file in named.values() if file is not None] or here
         missing = [_show(name) for name, file in named.items() if file is None]
         if parts:
@@ -239,7 +309,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
                 Loss("missing_part", f"{name} of the recording is not in its folder") for name in missing
             ]
             return parts, losses
-    stems = {re.sub(r"_\d+$", "", file.stem) for file in here}
+    stems = {re.sub(r"_\d+$", "", stem_of(file)) for file in here}
     if here and len(stems) == 1:
         return here, []
     what, hint = "the folder holds no recording", "Give one .mcap, .db3 or .bag file, or one rosbag2 folder"
@@ -256,12 +326,17 @@ def list_files(folder: Path) -> list[Path]:
 
     If there are none, the text tables of a known data set.
     """
-    named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=_split_number))
+    named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=split_number))
     if files := [file for file in named if not file.is_dir()]:
         return files
     from pipeline.logs.other_formats import list_tables  # noqa: PLC0415 - few logs need it
 
     return list_tables(folder)
+
+
+def stem_of(file: Path) -> str:
+    """Name of a file of a recording without its suffixes."""
+    return Path(uncompressed_name(file)).stem
 
 
 def _find_listed(folder: Path, name: str) -> Path | None:
@@ -280,9 +355,11 @@ def _show(name: str) -> str:
     return plain if plain.isprintable() and len(plain) <= _LONGEST_SHOWN else repr(name[:_LONGEST_SHOWN])
 
 
-def _split_number(file: Path) -> tuple[str, int]:
-    match = re.search(r"_(\d+)$", file.stem)
-    return (file.stem[: match.start()], int(match[1])) if match else (file.stem, -1)
+def split_number(file: Path) -> tuple[str, int]:
+    """Name of a file without its number, and the number; -1 without."""
+    stem = stem_of(file)
+    match = re.search(r"_(\d+)$", stem)
+    return (stem[: match.start()], int(match[1])) if match else (stem, -1)
 
 
 def _listed_files(text: str) -> list[str]:

@@ -457,7 +457,7 @@ class LiveRecording:
         if not list_files(self.folder):
             self.abandon()
             return
-        listing = _spell_listing(open_log(self.folder), list_files(self.folder))
+        listing = _spell_listing(open_log(self.folder, is_one=True), list_files(self.folder))
         with self._naming_os_errors():
             (self.folder / LISTING).write_text(listing, encoding="utf-8")
 

@@ -23,6 +23,7 @@ from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover, keep_within
 from pipeline.logs.chunks import checksum
+from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.records import (
     LONGEST_HEAD,
     LONGEST_MAGIC,
@@ -50,13 +51,13 @@ def _list_neighbours(path: Path) -> list[str]:
 
 
 class FileSource(AbstractContextManager["FileSource"]):
-    """A local file, open for the duration of a `with` block.
+    """A local file, open for the duration of a `with` block; one that is compressed as a whole is inflated.
 
     Args:
         path: the file.
 
     Attributes:
-        size: count of bytes when it was opened.
+        size: count of bytes when it was opened, inflated.
         name: the path.
 
     Raises:
@@ -84,6 +85,13 @@ class FileSource(AbstractContextManager["FileSource"]):
             self.close()
             hint = "The recorder was stopped before it wrote anything; omit this file"
             raise LogError("log_empty", "the file is empty", where=self.name, hint=hint)
+        if path.suffix in COMPRESSED:
+            compressed = self._descriptor
+            try:
+                self._descriptor = open_inflated(path, compressed)
+            finally:
+                os.close(compressed)
+            self.size = os.fstat(self._descriptor).st_size
 
     def read_at(self, offset: int, length: int) -> bytes:
         """The bytes from ``offset``; fewer than ``length`` only at the end."""
@@ -119,7 +127,12 @@ def open_source(path: Path, version: str | None = None) -> AbstractContextManage
     Raises:
         LogError: ``log_not_found``, ``log_unreadable``, ``log_empty``, ``log_changed``.
     """
-    return RemoteSource(path, version) if isinstance(path, RemotePath) else FileSource(path)
+    if not isinstance(path, RemotePath):
+        return FileSource(path)
+    if path.suffix in COMPRESSED:
+        what = "a file that is compressed as a whole is not read from an object store"
+        raise LogError("log_unreadable", what, where=str(path), hint="Copy it, or unpack it there: zstd -d")
+    return RemoteSource(path, version)
 
 
 def version_of(source: ByteSource) -> str | None:
@@ -239,6 +252,9 @@ def is_finished(path: Path) -> bool:
     with path.open("rb") as stream:
         head = stream.read(LONGEST_HEAD)
         size = stream.seek(0, os.SEEK_END)
+        if path.suffix in COMPRESSED:
+            # The end of the content is known only after inflating it: the time of change decides.
+            return False
         if detect_container(head):
             return is_whole(head, size) and not is_written_to(path)
         stream.seek(max(0, size - len(rec.MAGIC)))

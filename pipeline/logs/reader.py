@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Final
 
@@ -35,6 +35,7 @@ from pipeline.logs.columns import (
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
 from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
+from pipeline.logs.schema import short_name
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
 
 if TYPE_CHECKING:
@@ -54,10 +55,13 @@ class Wanted:
         topic: name of the topic.
         fields: paths of fields such as ``twist.twist.linear.x``, ``velocity``, ``velocity[0]`` or
             ``transforms[].child_frame_id``; a path of a structure selects all its fields. None selects all.
+        alike: by other types of the topic (``package/Name``), their own paths of the fields; channels of
+            these types are read as if they were of the first.
     """
 
     topic: str
     fields: tuple[str, ...] | None = None
+    alike: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -95,6 +99,7 @@ class LogData:
     Attributes:
         index: index of the recording.
         topics: columns of every channel of the wanted topics that could be decoded.
+        unfit: times of the channels that lack the wanted fields, which others of their topics have.
         losses: all known losses.
         notes: remarks that are not losses.
         sha256: SHA-256 of the recording's bytes (hex); for an object, of its version and size.
@@ -113,6 +118,7 @@ class LogData:
     unchecked: str = ""
     repeated: Mapping[str, int] = field(default_factory=dict)
     readable: Mapping[int, int] = field(default_factory=dict)
+    unfit: tuple[TopicColumns, ...] = ()
 
     def of(self, topic: str) -> list[TopicColumns]:
         """Columns of every channel of a topic."""
@@ -196,9 +202,10 @@ def read_topics(
     counted = [(job.info, job.buffer.count) for job in jobs.values()]
     losses.update(dict.fromkeys(_count_missing(counted, tuple(losses))))
     topics: list[TopicColumns] = []
+    unfit: list[TopicColumns] = []
     for columns, lost in map_in_order(lambda job: _finish(job, repeated), jobs.values(), workers):
         losses.update(dict.fromkeys(lost))
-        topics.append(columns)
+        (unfit if jobs[columns.channel_id].is_unfit else topics).append(columns)
     twice = {jobs[number].info.topic: 0 for number in repeated}
     for number, rows in repeated.items():
         twice[jobs[number].info.topic] += rows.size
@@ -214,6 +221,7 @@ def read_topics(
         coverage.format_coverage(),
         twice,
         readable,
+        tuple(unfit),
     )
 
 
@@ -234,6 +242,9 @@ class _Job:
     recipe: Recipe
     buffer: ChannelBuffer
     fields: tuple[str, ...] | None
+    spelled: Mapping[str, str]
+    type_name: str
+    is_unfit: bool = False
 
 
 def _choose_channels(
@@ -247,38 +258,83 @@ def _choose_channels(
     """Decoders of the wanted channels by the recording's channel number."""
     jobs: dict[int, _Job] = {}
     schemas = _list_schemas(index)
+    types = index.types
     by_topic: dict[str, list[ChannelInfo]] = {}
     for info in index.channels:
         by_topic.setdefault(info.topic, []).append(info)
-    for topic, fields in _merge_wanted(wanted).items():
+    for topic, want in _merge_wanted(wanted).items():
         infos = by_topic.get(topic)
         if not infos:
             raise _no_topic(index, topic)
         errors: list[LogError] = []
+        plain = {info.id: short_name(info.type_name.replace(".", "/")) for info in infos}
         for info in infos:
+            own = want.alike.get(plain[info.id], {})
+            fields = tuple(own.values()) if own else want.fields
+            name = types[topic] if own else info.type_name
             try:
                 recipe = decoder_for(info, schemas[info.id], fields, where=str(index.path))
-                jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields)
+                spelled = {path: wanted for wanted, path in own.items()}
+                jobs[info.id] = _Job(info, recipe, ChannelBuffer(recipe.decoder), fields, spelled, name)
             except LogError as error:
                 errors.append(error)
                 if error.code == "unsupported_encoding" and info.message_count:
                     text = f"{info.message_count} messages of {topic}: {error.what}"
                     losses[Loss(error.code, text, start_ns=index.start_ns, end_ns=index.end_ns)] = None
         unfit = [error for error in errors if error.code != "unsupported_encoding"]
+        if len(errors) < len(infos):
+            for info in (one for one in infos if one.id not in jobs and one.message_count):
+                with suppress(LogError):
+                    recipe = decoder_for(info, schemas[info.id], (), where=str(index.path))
+                    buffer = ChannelBuffer(recipe.decoder)
+                    jobs[info.id] = _Job(info, recipe, buffer, (), {}, info.type_name, is_unfit=True)
         if unfit and len(errors) == len(infos) and not skip_unfit:
             raise unfit[0]
         notes += [f"{topic} has several channels; {error.what} in one of them" for error in unfit]
     return jobs
 
 
-def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, tuple[str, ...] | None]:
-    """Fields by topic; a topic that is wanted twice has the fields of both requests."""
-    merged: dict[str, tuple[str, ...] | None] = {}
+def _merge_wanted(wanted: Iterable[Wanted]) -> dict[str, Wanted]:
+    """Requests by topic; a topic that is wanted twice has the fields of both requests."""
+    merged: dict[str, Wanted] = {}
     for want in wanted:
-        before = merged.get(want.topic, ())
-        both = None if before is None or want.fields is None else dict.fromkeys((*before, *want.fields))
-        merged[want.topic] = None if both is None else tuple(both)
+        before = merged.get(want.topic)
+        if before is None:
+            merged[want.topic] = want
+        elif before.fields is None or want.fields is None:
+            merged[want.topic] = Wanted(want.topic)
+        else:
+            fields = tuple(dict.fromkeys((*before.fields, *want.fields)))
+            alike = {
+                name: {**paths, **want.alike[name]}
+                for name, paths in before.alike.items()
+                if name in want.alike
+            }
+            merged[want.topic] = Wanted(want.topic, fields, alike)
     return merged
+
+
+_MOST_LISTED: Final = 20_000
+"""Maximum number of messages of a JSON or protobuf topic that are read for the names of its fields."""
+
+
+def list_fields(index: LogIndex) -> dict[str, tuple[str, ...]]:
+    """Leaf fields of every topic with messages; topics that cannot be decoded are left out.
+
+    Fields of JSON and protobuf are known from the messages, and unknown where these are very many.
+    """
+    schemas = _list_schemas(index)
+    fields: dict[str, tuple[str, ...]] = {}
+    for info in index.channels:
+        if not info.message_count:
+            continue
+        with suppress(LogError):
+            leaves = decoder_for(info, schemas[info.id], None, where=str(index.path)).leaves
+            if not leaves and info.message_count <= _MOST_LISTED:
+                read = read_topics(index, [Wanted(info.topic)], sha256="unused").of(info.topic)
+                leaves = tuple(name for columns in read for name in columns.fields)
+            fields[info.topic] = (*fields.get(info.topic, ()), *leaves)
+    return fields
 
 
 def _no_topic(index: LogIndex, topic: str) -> LogError:
@@ -381,7 +437,8 @@ def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list
     log_time, publish_time, rows = job.buffer.finish(repeated_rows)
     leaves = job.recipe.decoder.columns(rows)
     header_time = _header_time(leaves, log_time)
-    fields = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
+    columns_of = derive_columns(leaves, job.fields, job.recipe.leaves or tuple(leaves))
+    fields = {job.spelled.get(path, path): column for path, column in columns_of.items()}
     losses = []
     for rejected in job.recipe.decoder.rejected:
         start, end = job.buffer.times_of(rejected.rows)
@@ -395,7 +452,7 @@ def _finish(job: _Job, repeated: Mapping[int, Ints]) -> tuple[TopicColumns, list
     columns = TopicColumns(
         job.info.topic,
         job.info.id,
-        job.info.type_name,
+        job.type_name,
         log_time,
         publish_time,
         header_time,

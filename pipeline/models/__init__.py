@@ -58,12 +58,12 @@ def check_target(path: Path) -> None:
     Raises:
         MotionError: ``model_misplaced``, the path is a configuration of logs.
     """
-    from pipeline.logs.index import SUFFIXES  # noqa: PLC0415 - heavy
+    from pipeline.logs.index import SUFFIXES, stem_of  # noqa: PLC0415 - heavy
 
     if not path.is_file() or is_model(path):
         return
     for log in path.parent.glob("*"):
-        if log.suffix in SUFFIXES and path.name in {FLEET_FILE, RUN_FILE, f"{log.stem}.toml"}:
+        if log.name.endswith(SUFFIXES) and path.name in {FLEET_FILE, RUN_FILE, f"{stem_of(log)}.toml"}:
             what = f"it is the configuration of {log.name}, which a model would replace"
             hint = "Give the model another name, for example model.toml."
             raise MotionError("model_misplaced", what, where=str(path), hint=hint)

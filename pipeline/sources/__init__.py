@@ -14,6 +14,7 @@ import msgspec
 
 from pipeline.core import guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
+from pipeline.logs import stem_of
 from pipeline.sources.candidates import (
     CONFIGURED,
     DriveForm,
@@ -235,7 +236,7 @@ def list_configuration_files(
     """
     folder = log.resolve().parent
     fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
-    beside = [folder / RUN_FILE, folder / f"{log.stem}.toml"]
+    beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
     files = [
         file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
     ]

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 
-from pipeline.sources.message_types import NumberField, find_type, list_pairs
+from pipeline.sources.message_types import NumberField, PoseFields, find_type, list_pairs
 
 ELECTRIC = {
     "current": re.compile(r"current(_battery|_input|_motor)?$"),
@@ -104,6 +104,7 @@ class PoseSource:
         content: content of the topic.
         velocity: topic with the velocities over ground that belong to a fix.
         name: of the body, if a message contains the poses of several.
+        fields: the fields of the pose, if the configuration names them.
     """
 
     topic: str
@@ -113,6 +114,7 @@ class PoseSource:
     content: PoseContent = PoseContent.POSE
     velocity: str = ""
     name: str = ""
+    fields: PoseFields | None = None
 
     def __str__(self) -> str:
         return f"{self.topic} ({' -> '.join(self.frames)})" if self.frames else self.topic

@@ -149,10 +149,14 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
 
 
 class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[pose]``: a pose topic, or a pair of frames of the transforms.
+    """``[pose]``: a pose topic, three fields of a topic, or a pair of frames of the transforms.
 
     Attributes:
         topic: poses, satellite fixes, or velocities over ground.
+        x: field with the position along x [m], such as ``/tracker.x``, for a topic of any type.
+        y: field of the same topic with the position along y [m].
+        yaw: field of the same topic with the heading, counterclockwise from x [rad]; in degrees if its name
+            contains ``deg``.
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
         axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
@@ -163,6 +167,9 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """
 
     topic: str | None = None
+    x: str | None = None
+    y: str | None = None
+    yaw: str | None = None
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
     axes: Literal["enu", "ned"] = "enu"

@@ -5,9 +5,9 @@ import re
 from collections import defaultdict
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import TypeVar
+from typing import Literal, TypeVar
 
-from pipeline.logs import ChannelInfo
+from pipeline.logs import TRANSFORM_TYPES, ChannelInfo, find_types, wanted_transforms
 from pipeline.sources.candidates import (
     CONFIGURED,
     DEAD_RECKONED,
@@ -31,7 +31,7 @@ from pipeline.sources.configuration import (
     Vehicle,
     find_preset,
 )
-from pipeline.sources.message_types import find_type, list_types, plain_type
+from pipeline.sources.message_types import PoseFields, find_type, list_types, plain_type
 
 # Several robots in one log: separated by their namespaces, so that commands and poses are of the same robot.
 #
@@ -155,7 +155,6 @@ def _holds(spaces: Collection[str], topics: Collection[str]) -> bool:
 # usual names of vehicles and words such as `cmd` or `status` rank them. The choice includes its reason. If a
 # log contains several robots, all roles are filled from the namespace of one.
 
-TRANSFORM_TYPES = ("tf2_msgs/TFMessage", "tf/tfMessage")
 STRING_TYPE = "std_msgs/String"
 DEFAULT_INTERVAL = ("/drive/calib_state", "calib")
 
@@ -208,7 +207,7 @@ class _Chooser:
     """Candidates of one log."""
 
     def __init__(self, channels: list[ChannelInfo], vehicle: Vehicle, where: str) -> None:
-        self.types = {channel.topic: plain_type(channel.type_name) for channel in channels}
+        self.types = {topic: plain_type(kind) for topic, kind in find_types(channels).items()}
         self.counts = {channel.topic: channel.message_count or 0 for channel in channels}
         self.vehicle = vehicle
         self.where = where
@@ -233,7 +232,8 @@ class _Chooser:
         drives -= set(numbers.ground_velocities())
         robots = find_robots(drives, poses)
         named = (*list_topics(configuration.command), *list_topics(configuration.wheels))
-        named = tuple(filter(None, (*named, configuration.pose.topic, configuration.imu.topic)))
+        pose = configuration.pose.topic or configuration.pose.x
+        named = tuple(filter(None, (*named, pose, configuration.imu.topic)))
         self._robot = choose_robot(robots, configured=named, drives=drives, poses=poses, where=self.where)
         if self._robot is not None:
             others = ", ".join(robot.strip("/") for robot in robots if robot != self._robot)
@@ -317,6 +317,8 @@ class _Chooser:
     def choose_pose(self, section: PoseSection) -> PoseSource | None:
         """The localization: configured, else the best by name, else transforms, else any odometry."""
         topic, frames = section.topic, section.frames
+        if section.x or section.y or section.yaw:
+            return self._pose_of_fields(section)
         transforms = self._dynamic_transforms(is_configured=bool(frames))
         if frames:
             if not transforms:
@@ -334,7 +336,9 @@ class _Chooser:
                 return self._by_satellites(name, CONFIGURED)
             what = f"the topic {name!r} of type {self.types[name]} cannot serve as pose"
             usable = ", ".join((*list_types("pose"), *list_types("fix")))
-            raise self._bad(what, f"Use one of: {usable}; or pose.frames.")
+            raise self._bad(
+                what, f"Use one of: {usable}; or pose.frames, or pose.x, y and yaw with its fields."
+            )
         candidates = [
             (ranked[0], replace(ranked[1], name=section.name or ""))
             for name in self.with_part("pose")
@@ -351,6 +355,28 @@ class _Chooser:
             candidates.append((2.5, PoseSource(transforms, "the chain of transforms", from_transforms=True)))
         return self._best(candidates, self.vehicle.topics.pose, "pose")
 
+    def _pose_of_fields(self, section: PoseSection) -> PoseSource:
+        """The pose of three fields of a topic."""
+        given = {"x": section.x, "y": section.y, "yaw": section.yaw}
+        example = '[pose] x = "/topic.x", y = "/topic.y", yaw = "/topic.yaw"'
+        if absent := [name for name, text in given.items() if not text]:
+            what = f"a pose of fields needs x, y and yaw, and pose.{absent[0]} is not given"
+            raise self._bad(what, f"Give all three: {example}.", "field_needed")
+        signals = {name: self.require(text or "", f"pose.{name}") for name, text in given.items()}
+        if bare := [name for name, signal in signals.items() if not signal.field]:
+            what = f"pose.{bare[0]} names the topic {signals[bare[0]].topic!r} without a field"
+            raise self._bad(what, f"Name the field of each: {example}.", "field_needed")
+        topics = list(dict.fromkeys(signal.topic for signal in signals.values()))
+        if len(topics) > 1 or section.topic not in {None, topics[0]}:
+            what = f"the fields of a pose are of one topic, and {' and '.join(topics)} are several"
+            if len(topics) == 1:
+                what = f"pose.topic is {section.topic!r}, and the fields of the pose are of {topics[0]!r}"
+            raise self._bad(what, "Name three fields of one topic.", "pose_of_several_topics")
+        x, y, yaw = (signal.fields()[0] for signal in signals.values())
+        unit: Literal["rad", "deg"] = "deg" if "deg" in yaw.lower() else "rad"
+        fields = PoseFields(position=[x, y], angle=yaw, angle_unit=unit)
+        return PoseSource(topics[0], CONFIGURED, fields=fields)
+
     def _own(self) -> Topics:
         """Topics of one robot."""
         return Topics({topic: self.types[topic] for topic in self.of_type(*self.types.values())})
@@ -365,11 +391,7 @@ class _Chooser:
         return PoseSource(topic, reason, content=PoseContent.FIX, velocity=nearest)
 
     def _dynamic_transforms(self, *, is_configured: bool) -> str:
-        topics = [
-            name
-            for name, kind in self.types.items()
-            if kind in TRANSFORM_TYPES and name.rsplit("/", 1)[-1] == "tf"
-        ]
+        topics = [one.topic for one in wanted_transforms(self.types) if not one.topic.endswith("static")]
         own = [name for name in topics if name.startswith(self._robot or "")]
         # Transforms of all robots together serve only if frames are configured.
         return next(iter(own or (topics if is_configured else [])), "")
@@ -431,6 +453,40 @@ class _Chooser:
         if others:
             self.notes.append(f"{role}: {ranked[0][1]} was preferred to {others}")
         return ranked[0][1]
+
+
+_ALONG = re.compile(r"(?:p|pos|pose|position)?_?(x)(?:_m)?|(east)(?:ing)?")
+_ACROSS = {"x": "y", "east": "north"}
+_ANGLE = re.compile(r"(?:theta|yaw|heading|psi|phi|bearing)(?!.*(?:rate|vel|acc|cov)).*")
+_NOT_A_POSITION = re.compile(r"vel|twist|linear|angular|accel|cov|gyro|mag|goal|target|cmd|error|std")
+
+
+def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str] | None:
+    """Fields of a topic of any type that by their names are a position in the plane and a heading.
+
+    Args:
+        topic: name of the topic.
+        fields: its leaf fields.
+
+    Returns:
+        x, y and the heading, which is empty if there is none; None without a position.
+    """
+    if _NOT_A_POSE.search(topic.lower()):
+        return None
+    usable = [path for path in fields if not _NOT_A_POSITION.search(path.lower()) and "[]" not in path]
+    angles = [path for path in usable if _ANGLE.fullmatch(path.rpartition(".")[2].lower())]
+    for path in usable:
+        space, dot, name = path.rpartition(".")
+        match = _ALONG.fullmatch(name.lower())
+        if match is None:
+            continue
+        start = match.start(match.lastindex or 0)
+        along = match[match.lastindex or 0]
+        other = f"{space}{dot}{name[:start]}{_ACROSS[along]}{name[start + len(along) :]}"
+        if other in usable:
+            beside = [angle for angle in angles if angle.rpartition(".")[0] == space]
+            return path, other, next(iter((*beside, *angles)), "")
+    return None
 
 
 def list_topics(section: DriveSection) -> Iterable[str]:

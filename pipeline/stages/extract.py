@@ -90,6 +90,20 @@ def extract_tables(
     return Extraction(data, sources, configuration, vehicle, where).run()
 
 
+def _make_alike(channels: Sequence[TopicColumns]) -> list[TopicColumns]:
+    """Channels of several types with the fields that all have, and with stamps if all have them."""
+    shared = set.intersection(*(set(columns.fields) for columns in channels))
+    stamped = all(columns.header_time is not None for columns in channels)
+    return [
+        replace(
+            columns,
+            header_time=columns.header_time if stamped else None,
+            fields={name: column for name, column in columns.fields.items() if name in shared},
+        )
+        for columns in channels
+    ]
+
+
 class Extraction:
     """One log's extraction: columns, common clocks, and findings.
 
@@ -115,11 +129,16 @@ class Extraction:
             if columns.topic != aside:
                 recorded.setdefault(columns.topic, []).append(columns)
         joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
-        stamped = [reading.with_stamps(columns) for columns in joined if columns is not None]
-        # All texts of a topic may be unreadable.
-        self.columns = {columns.topic: columns for columns in stamped if columns.log_time.size}
+        self.columns = {columns.topic: columns for columns in joined if columns is not None}
+        used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
+        self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
         pose = sources.pose
-        self.chain = pose_topics.chain_poses(topics, pose, where) if pose and pose.from_transforms else None
+        drive = next((one.signals[0].topic for one in (sources.command, sources.wheels) if one), "")
+        self.chain = (
+            pose_topics.chain_poses(topics, pose, where, drive=drive)
+            if pose and pose.from_transforms
+            else None
+        )
         self.paused_s = 0.0
         self.clocks = self._align()
         self.start_ns = self._find_start()
@@ -138,11 +157,24 @@ class Extraction:
 
     def _join_channels(self, topic: str, recorded: Sequence[TopicColumns]) -> TopicColumns | None:
         """All channels of a topic as one series; if they cannot be joined, the one with most messages."""
-        channels = [columns for columns in recorded if columns.log_time.size]
+        # All texts of a topic may be unreadable.
+        stamped = [reading.with_stamps(columns) for columns in recorded if columns.log_time.size]
+        channels = [columns for columns in stamped if columns.log_time.size]
         if len(channels) <= 1:
             return channels[0] if channels else None
+        types = self._list_types(channels)
+        if len(types) > 1:
+            channels = _make_alike(channels)
         joined = join_channels(channels)
         count = len(channels)
+        if joined is not None and len(types) > 1:
+            text = f"{topic} carries {len(types)} types, all read: {', '.join(types)}"
+            if len(types) == 2:  # noqa: PLR2004 - as one says it
+                text = f"{topic} carries two types, both read: {' and '.join(types)}"
+            if joined.header_time is None and any(one.header_time is not None for one in stamped):
+                text += "; one of them has no stamps: the times of recording are used"
+            self.findings.append(Finding("several_types", "warning", text, where=topic, count=len(types)))
+            return joined
         if joined is not None:
             text = f"{topic} was recorded on {count} channels: their messages were put in one order"
             self.findings.append(Finding("several_channels", "info", text, where=topic, count=count))
@@ -150,6 +182,22 @@ class Extraction:
         text = f"{topic} was recorded on {count} channels of different types: the fullest was used"
         self.findings.append(Finding("several_channels", "warning", text, where=topic, count=count))
         return max(channels, key=lambda columns: columns.log_time.size)
+
+    def _list_types(self, channels: Sequence[TopicColumns]) -> list[str]:
+        """Types of channels as recorded, each once."""
+        ids = {columns.channel_id for columns in channels}
+        return list(dict.fromkeys(one.type_name for one in self.data.index.channels if one.id in ids))
+
+    def _report_left_out(self, columns: TopicColumns) -> Finding:
+        """Messages of a topic that lack the fields that its other type has."""
+        topic, count = columns.topic, columns.log_time.size
+        others = ", ".join(self._list_types([one for one in self.data.topics if one.topic == topic]))
+        text = f"{topic} carries two types: {count} messages of {columns.type_name}"
+        if count:
+            first, last = ((int(time) - self.data.index.start_ns) / 1e9 for time in columns.log_time[[0, -1]])
+            text += f", {first:.0f} to {last:.0f} s after the start of the log,"
+        text += f" are left out: they do not have what is read of {others}"
+        return Finding("type_left_out", "warning", text, where=topic, count=count)
 
     def _align(self) -> dict[str, TopicClock]:
         asked = self._asked_clocks()
@@ -281,7 +329,7 @@ class Extraction:
                 chain.position, chain.quaternion, chain.parent, chain.child, chain.corrected
             )
             arrays, log_times = arrays.take(order), chain.log_time
-            self.findings += pose_topics.report_chain(chain, topic)
+            self.findings += pose_topics.report_chain(chain, source)
         elif columns is None:
             raise self._nothing("pose", topic)
         elif source.content is PoseContent.POSE:
@@ -304,9 +352,9 @@ class Extraction:
         return stamp, log_time, arrays, breaks
 
     def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
-        pose = find_type(columns.type_name).pose
+        pose = source.fields or find_type(columns.type_name).pose
         if pose is None or not pose.names:
-            return reading.read_pose_topic(columns)
+            return reading.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)
         text = f"of the bodies of {source.topic}, {name!r} is the vehicle"
         self.findings.append(Finding("body_chosen", "info", text, where=source.topic))

@@ -10,12 +10,19 @@ import numpy as np
 
 from pipeline.core import format_share, rigid
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.logs import LogError, Ragged, RaggedStrings, TopicColumns, TransformBuffer, TransformSeries
+from pipeline.logs import (
+    TRANSFORM_TYPES,
+    LogError,
+    Ragged,
+    RaggedStrings,
+    TopicColumns,
+    TransformBuffer,
+    TransformSeries,
+)
 from pipeline.sources import PoseSource, Vehicle
 from pipeline.sources.candidates import LOCALIZED
 from pipeline.sources.configuration import VelocitySection
 from pipeline.sources.message_types import PoseFields, plain_type
-from pipeline.sources.topics import TRANSFORM_TYPES
 from pipeline.stages import Finding, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
@@ -293,6 +300,8 @@ def lacks_heading(arrays: PoseArrays) -> bool:
 
 _BASES = ("base_link", "base_footprint", "base")
 _FIXED = ("map", "world", "odom")
+_REFERENCE: Final = re.compile(r"(map|world|odom)")
+"""Start of the names of reference frames: ``odom_combined`` moves as it is corrected."""
 
 
 def is_transforms(columns: TopicColumns) -> bool:
@@ -300,40 +309,37 @@ def is_transforms(columns: TopicColumns) -> bool:
     return plain_type(columns.type_name) in TRANSFORM_TYPES
 
 
-def chain_poses(topics: Sequence[TopicColumns], source: PoseSource, where: str) -> TransformSeries:
+def chain_poses(
+    topics: Sequence[TopicColumns], source: PoseSource, where: str, *, drive: str = ""
+) -> TransformSeries:
     """Poses of base_link along the chain of transforms.
 
-    Without configured frames the child is base_link (or base_footprint, base); the parent is the first of
-    map, world and odom among the child's ancestors, else its topmost ancestor.
+    Without configured frames the child is base_link (or base_footprint, base), else the only frame that
+    moves, or the only one in the namespace of the drive; the parent is the first of map, world and odom among
+    the child's ancestors, else its topmost ancestor.
 
     Args:
         topics: all topics that were read; the transforms among them are used.
         source: the choice, with frames if configured.
         where: the log, for error messages.
+        drive: topic of the drive.
 
     Raises:
         StageError: the frames do not exist or are not connected.
     """
     buffer = TransformBuffer([columns for columns in topics if is_transforms(columns)])
-    parent, child = source.frames or _choose_frames(buffer, where)
+    parent, child = source.frames or _choose_frames(buffer, where, drive)
     try:
         return buffer.lookup_series(parent, child)
     except LogError as error:
         raise StageError(error.code, error.what, where=where, hint=error.hint) from error
 
 
-def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
+def _choose_frames(buffer: TransformBuffer, where: str, drive: str) -> tuple[str, str]:
     parents = {link.child: link.parent for link in buffer.links()}
     frames = buffer.frames()
     bases = [frame for base in _BASES for frame in frames if frame.rsplit("/", 1)[-1] == base]
-    if not bases:
-        raise StageError(
-            "no_base_frame",
-            "the transforms have no frame called base_link, base_footprint or base",
-            where=where,
-            hint=f"Name both: [pose] frames = [parent, child]. Known frames: {', '.join(frames) or 'none'}.",
-        )
-    child = bases[0]
+    child = bases[0] if bases else _find_moving_frame(buffer, where, drive)
     above = [child]
     while parents.get(above[-1]) is not None and parents[above[-1]] not in above:
         above.append(parents[above[-1]])
@@ -344,10 +350,39 @@ def _choose_frames(buffer: TransformBuffer, where: str) -> tuple[str, str]:
     return (named[0] if named else above[-1]), child
 
 
-def report_chain(series: TransformSeries, topic: str) -> list[Finding]:
+def _find_moving_frame(buffer: TransformBuffer, where: str, drive: str) -> str:
+    """The only frame that moves, or of several the only one in the namespace of the drive's topic."""
+    moving = [
+        link.child
+        for link in buffer.links()
+        if not link.fixed and _reaches(link.position) and not _REFERENCE.match(link.child.rsplit("/", 1)[-1])
+    ]
+    space = drive.strip("/").partition("/")[0] + "/"
+    chosen = moving if len(moving) == 1 else [frame for frame in moving if frame.startswith(space)]
+    if len(chosen) != 1:
+        moved = f"several frames move ({', '.join(moving[:_LISTED])})" if moving else "no frame moves"
+        raise StageError(
+            "no_base_frame",
+            f"the transforms have no frame called base_link, base_footprint or base, and {moved}",
+            where=where,
+            hint="Name both: [pose] frames = [parent, child]. "
+            f"Known frames: {', '.join(buffer.frames()) or 'none'}.",
+        )
+    return chosen[0]
+
+
+def report_chain(series: TransformSeries, source: PoseSource) -> list[Finding]:
     """Findings on a chain."""
+    topic = source.topic
     text = f"poses are the transform from {series.parent} to {series.child}"
     findings = [Finding("transforms", "info", text, where=topic)]
+    if source.frames is None and series.child.rsplit("/", 1)[-1] not in _BASES:
+        text = (
+            f"no frame is called base_link: {series.child}, the only one that moves"
+            f"{' in its namespace' * ('/' in series.child)}, is taken for the vehicle; "
+            "[pose] frames = [parent, child] names others"
+        )
+        findings.append(Finding("vehicle_frame", "info", text, where=topic))
     if series.parent.rsplit("/", 1)[-1] == "odom":
         text = (
             "the transforms end at odom: the poses are an odometry, which drifts and may come from the wheels"

@@ -25,8 +25,7 @@ from pipeline.sources import (
     Sources,
 )
 from pipeline.sources.configuration import IntervalSection, PoseSection
-from pipeline.sources.message_types import find_type, plain_type
-from pipeline.sources.topics import TRANSFORM_TYPES
+from pipeline.sources.message_types import PoseFields, find_alike, find_type
 from pipeline.stages import Finding, StageError
 
 _LARGEST = 1e12
@@ -142,6 +141,11 @@ def axis_fields(fields: str | list[str], axes: str) -> list[str]:
     return fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in axes]
 
 
+def _turn_fields(pose: PoseFields) -> list[str]:
+    """Fields of the orientation: the heading, or the four of the quaternion."""
+    return [pose.angle] if pose.angle else axis_fields(pose.orientation, "xyzw")
+
+
 def drive_fields(source: DriveSource, types: dict[str, str]) -> list[Signal]:
     """All fields of a drive source."""
     if source.form is DriveForm.JOINTS:
@@ -195,9 +199,10 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     if source.from_transforms:
         return []
     kind = find_type(types[source.topic])
-    if source.content is PoseContent.POSE and kind.pose is not None:
-        axes = (*axis_fields(kind.pose.position, "xyz"), *axis_fields(kind.pose.orientation, "xyzw"))
-        named = (*axes, kind.pose.parent, kind.pose.child, kind.pose.names)
+    pose = source.fields or kind.pose
+    if source.content is PoseContent.POSE and pose is not None:
+        axes = (*axis_fields(pose.position, "xyz"), *_turn_fields(pose))
+        named = (*axes, pose.parent, pose.child, pose.names)
         return [Signal(source.topic, name) for name in named if name]
     fields = [Signal(source.topic, _FRAME)]
     if kind.fix is not None:
@@ -246,7 +251,10 @@ def list_wanted(
         fields = by_topic.setdefault(signal.topic, [])
         if signal.field not in fields:
             fields.append(signal.field)
-    wanted = [Wanted(topic, _recorded_fields(types[topic], fields)) for topic, fields in by_topic.items()]
+    wanted = [
+        Wanted(topic, _recorded_fields(types[topic], fields), find_alike(types[topic], fields))
+        for topic, fields in by_topic.items()
+    ]
     return wanted + _list_wanted_transforms(every, types)
 
 
@@ -312,8 +320,7 @@ def _list_wanted_transforms(
     poses = [source for source in sources if isinstance(source, PoseSource)]
     if not poses:
         return []
-    transforms = [topic for topic, kind in types.items() if plain_type(kind) in TRANSFORM_TYPES]
-    wanted = wanted_transforms(transforms)
+    wanted = wanted_transforms(types)
     if any(source.from_transforms for source in poses):
         return wanted
     return [one for one in wanted if "static" in one.topic]
@@ -417,14 +424,22 @@ class Located:
     findings: tuple[Finding, ...]
 
 
-def read_pose_topic(columns: TopicColumns) -> PoseArrays:
-    """Poses of a topic whose type has a pose, axes ahead, left, up."""
-    pose = find_type(columns.type_name).pose
+def read_pose_topic(columns: TopicColumns, fields: PoseFields | None = None) -> PoseArrays:
+    """Poses of a topic by the given fields, or by those of its type; axes ahead, left, up."""
+    pose = fields or find_type(columns.type_name).pose
     if pose is None:
         raise _holds_no("pose", columns, "pose")
+    position = np.zeros((columns.log_time.size, 3))
+    for axis, name in enumerate(axis_fields(pose.position, "xyz")):
+        position[:, axis] = numbers(columns, name)
+    turns = [numbers(columns, name) for name in _turn_fields(pose)]
+    if pose.angle:
+        half = 0.5 * (np.radians(turns[0]) if pose.angle_unit == "deg" else turns[0])
+        still = np.zeros(half.size)
+        turns = [still, still, np.sin(half), np.cos(half)]
     arrays = PoseArrays(
-        np.stack([numbers(columns, name) for name in axis_fields(pose.position, "xyz")], axis=-1),
-        np.stack([numbers(columns, name) for name in axis_fields(pose.orientation, "xyzw")], axis=-1),
+        position,
+        np.stack(turns, axis=-1),
         first_text(columns, pose.parent) if pose.parent else "",
         first_text(columns, pose.child) if pose.child else "",
     )

@@ -67,6 +67,7 @@ def test_a_season_in_a_bucket(bucket: fsspec.AbstractFileSystem, season: Path, t
             "2026/logs/b.mcap": season / "b.mcap",
             "2026/split/split_0.mcap": season / "c.mcap",
             "2026/split/split_1.mcap": season / "c.mcap",
+            "2026/split/metadata.yaml": b"relative_file_paths:\n  - split_0.mcap\n  - split_1.mcap\n",
             "2026/fleet.toml": b'[run]\nterrain = "field"\n',
             "2026/logs/b.toml": b'[run]\nterrain = "lake"\n',
             "2026/notes.txt": b"x",

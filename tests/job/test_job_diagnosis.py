@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import polars as pl
@@ -10,7 +11,7 @@ import pytest
 
 from pipeline.job import Options, run_results
 from pipeline.job.analyze import Outcome, analyze_log
-from pipeline.simulate import simulate_case
+from pipeline.simulate import make_scenario, simulate_case, simulate_run, write_log
 
 
 def analyze(log: Path, out: Path, **options: object) -> Outcome:
@@ -67,6 +68,18 @@ def test_a_log_too_short_to_diagnose_has_its_slip(tmp_path: Path) -> None:
     diagnosis = outcome.summary["diagnosis"]
     assert diagnosis["effects"] == []
     assert diagnosis["findings"]
+
+
+def test_slow_poses_are_the_reason_where_nothing_can_be_diagnosed(tmp_path: Path) -> None:
+    scenario = make_scenario("ideal_husky", duration_s=60.0)
+    scenario = replace(scenario, pose=replace(scenario.pose, rate_hz=1.0, update_hz=1.0))
+    write_log(simulate_run(scenario), tmp_path / "slow.mcap")
+    diagnosis = analyze(tmp_path / "slow.mcap", tmp_path / "out").summary["diagnosis"]
+
+    assert diagnosis["effects"] == []
+    (said,) = [finding["text"] for finding in diagnosis["findings"] if finding["id"] == "slow_poses"]
+    assert "its poses come at 1 Hz: at least 4 Hz are needed" in said
+    assert "Drive longer" not in said
 
 
 def test_a_new_effect_asks_for_a_new_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -35,7 +35,7 @@ def transforms(parent: str, child: str, position: Any, yaw: Any) -> dict[str, An
 
 def buffer_of(path: Path) -> TransformBuffer:
     index = open_log(path)
-    return TransformBuffer(read_topics(index, wanted_transforms(index.topics())).topics)
+    return TransformBuffer(read_topics(index, wanted_transforms(index.types)).topics)
 
 
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

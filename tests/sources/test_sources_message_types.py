@@ -10,13 +10,13 @@ from pipeline.logs import bundled_types, field_names
 from pipeline.sources import ConfigurationError, Signal, convert_unit, find_preset
 from pipeline.sources.message_types import MessageType, find_type, list_types
 
-PARTS = ("drive", "number", "joints", "pose", "fix", "ground_velocity", "imu", "power")
+PARTS = ("drive", "number", "numbers", "joints", "pose", "fix", "ground_velocity", "imu", "power")
 KNOWN = sorted({kind for part in PARTS for kind in list_types(part)})
 BUNDLED = {name.replace("/msg/", "/") for name in bundled_types()}
 
 
 def list_paths(kind: MessageType) -> list[str]:
-    paths: list[str] = []
+    paths = [kind.numbers.field] if kind.numbers else []
     if kind.drive is not None:
         paths += [*kind.drive.first.split("+"), *kind.drive.second.split("+")]
         paths += [kind.drive.sideways] if kind.drive.sideways else []
@@ -35,12 +35,12 @@ def list_paths(kind: MessageType) -> list[str]:
     if kind.ground_velocity is not None:
         paths += [kind.ground_velocity.east, kind.ground_velocity.north]
     if kind.pose is not None:
-        paths += filter(None, [kind.pose.parent, kind.pose.child, kind.pose.names])
+        paths += filter(None, [kind.pose.parent, kind.pose.child, kind.pose.names, kind.pose.angle])
     for vectors in (
         kind.pose and (kind.pose.position, kind.pose.orientation),
         kind.imu and (kind.imu.rate, kind.imu.force),
     ):
-        for fields in vectors or ():
+        for fields in filter(None, vectors or ()):
             paths += fields if isinstance(fields, list) else [f"{fields}.{axis}" for axis in "xyz"]
     return paths
 

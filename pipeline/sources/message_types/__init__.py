@@ -6,6 +6,7 @@ of
 - ``drive``: two fields of the drive: ``sides`` (left, right), ``body`` (forward speed, yaw rate) or
   ``steering`` (speed, steering angle); fields joined by ``+`` are averaged;
 - ``number``: one field; ``quantity`` or the topic's name states its meaning;
+- ``numbers``: a sequence of numbers whose meaning only the user knows;
 - ``joints``, ``pose``, ``imu``: fields of wheels by name, of a pose, of a gyro;
 - ``fix``, ``ground_velocity``: a position on Earth, a velocity east and north;
 - ``power``: fields of currents and voltages;
@@ -16,6 +17,7 @@ of
 """
 
 import functools
+import re
 import tomllib
 from collections.abc import Iterable
 from importlib import resources
@@ -59,6 +61,12 @@ class NumberField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     per_turn: str = ""
 
 
+class NumbersField(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """A sequence of numbers without a stated meaning."""
+
+    field: str
+
+
 class JointFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Wheels by name.
 
@@ -80,8 +88,10 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A pose: structures with x, y, z(, w), or their fields one by one, the quaternion's w last.
 
     Attributes:
-        position: [m].
+        position: [m]; of two fields they are x and y, and z is zero.
         orientation: quaternion.
+        angle: field of the heading in place of a quaternion, counterclockwise from x.
+        angle_unit: unit of the heading.
         parent: field with the name of the reference frame.
         child: field with the name of the frame whose pose is given.
         names: field with the names of several bodies; position and orientation are sequences of equal length.
@@ -90,7 +100,9 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     position: str | list[str]
-    orientation: str | list[str]
+    orientation: str | list[str] = ""
+    angle: str = ""
+    angle_unit: Literal["rad", "deg"] = "rad"
     parent: str = ""
     child: str = ""
     names: str = ""
@@ -163,6 +175,7 @@ class MessageType(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     drive: DriveFields | None = None
     number: NumberField | None = None
+    numbers: NumbersField | None = None
     joints: JointFields | None = None
     pose: PoseFields | None = None
     fix: FixFields | None = None
@@ -211,6 +224,56 @@ def describe_types(type_names: Iterable[str]) -> dict[str, object]:
 def list_types(part: str) -> tuple[str, ...]:
     """Types that have a part (``pose``, ``drive``, ...)."""
     return tuple(name for name, kind in read_tables()[0].items() if getattr(kind, part) is not None)
+
+
+_AXES = {"position": "xyz", "orientation": "xyzw", "rate": "xyz", "force": "xyz"}
+_PATHS = {
+    "drive": ("first", "second", "sideways"),
+    "number": ("field", "per_turn"),
+    "joints": ("names", "velocity", "position"),
+    "pose": ("position", "orientation", "angle", "parent", "child"),
+    "imu": ("rate", "force", "orientation"),
+}
+"""Fields of a part that are paths; its other values state what these mean."""
+_OPTIONAL = re.compile(r"pose .*(?:parent|child)$")
+
+
+def _spell_fields(kind: MessageType) -> dict[str, str]:
+    """Paths of the fields of a type by their meaning."""
+    spelled: dict[str, str] = {}
+    for part, names in _PATHS.items():
+        values = msgspec.to_builtins(getattr(kind, part)) or {}
+        said = " ".join(f"{key}={value}" for key, value in values.items() if key not in names)
+        for name in names:
+            given = values.get(name) or []
+            if part != "joints" and isinstance(given, str) and name in _AXES:
+                given = [f"{given}.{axis}" for axis in _AXES[name]]
+            for number, path in enumerate([given] if isinstance(given, str) else given):
+                spelled[f"{part} {said} {number} {name}"] = path
+    return spelled
+
+
+def find_alike(type_name: str, fields: Iterable[str]) -> dict[str, dict[str, str]]:
+    """Other types with fields of the same meaning and unit.
+
+    Args:
+        type_name: a message type.
+        fields: paths of some of its fields.
+
+    Returns:
+        By type, its own path of each of the fields. Of a pose, the names of frames may be missing.
+    """
+    own = find_type(type_name)
+    meanings = {path: meaning for meaning, path in _spell_fields(own).items()}
+    wanted = {path: meanings[path] for path in fields if path in meanings}
+    alike: dict[str, dict[str, str]] = {}
+    for name, kind in read_tables()[0].items():
+        if not wanted or name == plain_type(type_name) or own.text or kind.text:
+            continue
+        theirs = _spell_fields(kind)
+        if all(meaning in theirs or _OPTIONAL.fullmatch(meaning) for meaning in wanted.values()):
+            alike[name] = {path: theirs[meaning] for path, meaning in wanted.items() if meaning in theirs}
+    return alike
 
 
 def list_pairs() -> tuple[Pair, ...]:

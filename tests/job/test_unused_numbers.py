@@ -1,0 +1,75 @@
+"""Topics of two numbers a message are named, with the lines that take them for wheels."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pytest
+from drawn_drives import (
+    DrawnDrive,
+    DrawnTopic,
+    draw_drive,
+    extract_drawn,
+    read_findings,
+    record_cdr,
+    record_twist,
+    write_drawn,
+)
+
+from pipeline.core import SlipError
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+POSE = "geometry_msgs/msg/PoseStamped"
+
+
+def wheel_speeds(drive: DrawnDrive) -> np.ndarray:
+    """Left and right [rad/s], of wheels of 0.1 m and a track of 0.5 m."""
+    return np.stack([(drive.speed + side * 0.25 * drive.turn) / 0.1 for side in (-1.0, 1.0)], axis=1)
+
+
+def record_numbers(drive: DrawnDrive, values: np.ndarray, topic: str = "/wheel_speeds") -> DrawnTopic:
+    return record_cdr(drive, topic, "std_msgs/msg/Float32MultiArray", {"data": values})
+
+
+@pytest.mark.parametrize(("topic", "role"), [("/wheel_speeds", "wheels"), ("/motor_cmd", "command")])
+def test_two_numbers_a_message_are_named_with_the_lines_that_use_them(
+    topic: str, role: str, tmp_path: Path
+) -> None:
+    drive = draw_drive()
+    speeds = wheel_speeds(drive)
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, record_numbers(drive, speeds, topic))
+    said = read_findings(log)["numbers_not_used"]
+    left, right = (
+        f'{side}_topic = "{topic}.data[{number}]"' for number, side in enumerate(("left", "right"))
+    )
+    assert said.startswith(f"not used: {topic} (two numbers a message)")
+    assert f"[{role}] {left}; {right}" in said
+    lines = "\n".join((f"[{role}]", left, right, 'unit = "rad/s"'))
+    (tmp_path / "run.toml").write_text(lines, encoding="utf-8")
+    table = extract_drawn(log, "wheels" if role == "wheels" else "commands")
+    for side, values in zip(("left", "right"), speeds.T, strict=True):
+        np.testing.assert_allclose(table[side], values, rtol=1e-6)
+    assert "numbers_not_used" not in read_findings(log)
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros((600, 2)), np.ones((600, 3)) * np.arange(600)[:, None]], ids=["still", "three"]
+)
+def test_other_numbers_are_not_named(values: np.ndarray, tmp_path: Path) -> None:
+    drive = draw_drive()
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, record_numbers(drive, values))
+    assert "numbers_not_used" not in read_findings(log)
+
+
+def test_without_commands_such_a_topic_may_be_named(tmp_path: Path) -> None:
+    drive = draw_drive()
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    log = write_drawn(tmp_path / "run.mcap", pose, record_numbers(drive, wheel_speeds(drive)))
+    with pytest.raises(SlipError, match=r"Name it in run\.toml") as caught:
+        extract_drawn(log)
+    assert caught.value.code == "no_command"
