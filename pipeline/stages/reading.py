@@ -194,6 +194,8 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     """All fields of a pose topic; empty if poses come from transforms."""
     if source.from_transforms:
         return []
+    if source.wheels is not None:
+        return drive_fields(source.wheels, types)
     kind = find_type(types[source.topic])
     if source.content is PoseContent.POSE and kind.pose is not None:
         axes = (*axis_fields(kind.pose.position, "xyz"), *axis_fields(kind.pose.orientation, "xyzw"))
@@ -251,7 +253,7 @@ def list_wanted(
 
 
 def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
-    return isinstance(source, PoseSource) and source.content is not PoseContent.POSE
+    return isinstance(source, PoseSource) and source.content in {PoseContent.FIX, PoseContent.VELOCITY}
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:
