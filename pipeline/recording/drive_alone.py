@@ -67,7 +67,7 @@ def _take_by_name(sources: Sources, configuration: Configuration) -> Recording |
     """The recording with the wheels that were chosen by type and name."""
     if sources.wheels is None or sources.command is None:
         return None
-    return Recording(_replace_pose(sources, sources.wheels), configuration, (_tell_ground(sources.wheels),))
+    return Recording(_replace_pose(sources, sources.wheels), configuration, (_report_ground(sources.wheels),))
 
 
 def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
@@ -78,7 +78,7 @@ def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
     return replace(sources, wheels=None, pose=pose, imu=None, others={**sources.others, "wheels": others})
 
 
-def _tell_ground(wheels: DriveSource) -> Finding:
+def _report_ground(wheels: DriveSource) -> Finding:
     text = (
         f"the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so that the "
         "drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
@@ -103,15 +103,15 @@ class _DriveExamination(_Examination):
             return None
         steered = wheels.reading.form == "steering"
         if wheels.reading.form == "sides":
-            self._tell_dead_side(wheels)
+            self._report_dead_side(wheels)
             self._find_unit(wheels, command)
         if not self.findings or self.findings[-1].severity != "error":
-            self._tell_opposite(command, wheels)
+            self._report_opposite(command, wheels)
         sources = replace(self.sources, command=command.source)
         return Recording(
             _replace_pose(sources, wheels.source),
             self._complete(),
-            (*self.findings, _tell_ground(wheels.source)),
+            (*self.findings, _report_ground(wheels.source)),
             "ackermann" if steered else "",
             self._measure_lengths(command, wheels),
             tuple(_describe(one.reading) for one in commands),
@@ -123,7 +123,7 @@ class _DriveExamination(_Examination):
     def _find_wheels(self) -> tuple[_Drive | None, Motion | None]:
         """The first candidate for wheels that turn, and their motion in its own units."""
         ranked = (self.sources.wheels, *self.sources.others.get("wheels", ()))
-        for place, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
             for kind in ("ackermann", "differential"):
                 if kind == "ackermann" and source.form is not DriveForm.JOINTS:
                     continue
@@ -135,7 +135,7 @@ class _DriveExamination(_Examination):
                     continue
                 motion = _roll(reading)
                 if motion is not None:
-                    return _Drive(source, reading, place, is_measured=True), motion
+                    return _Drive(source, reading, number, is_measured=True), motion
         return None, None
 
     def _read_commands(self, motion: Motion, wheels: _Drive) -> list[_Drive]:
@@ -143,18 +143,18 @@ class _DriveExamination(_Examination):
         taken = {signal.topic for signal in wheels.source.signals}
         ranked = (self.sources.command, *self.sources.others.get("command", ()))
         drives = []
-        for place, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
             if taken & {signal.topic for signal in source.signals}:
                 continue
             reading = self._read(source, is_measured=False, section=self.configuration.command)
             if reading is not None:
                 reading.explain(motion)
-                drives.append(_Drive(source, reading, place, is_measured=False))
+                drives.append(_Drive(source, reading, number, is_measured=False))
         return drives
 
     # Faults.
 
-    def _tell_dead_side(self, wheels: _Drive) -> None:
+    def _report_dead_side(self, wheels: _Drive) -> None:
         sides = {"left": wheels.reading.first, "right": wheels.reading.second}
         dead = [name for name, side in sides.items() if side is None or not side.moves]
         if len(dead) == 1:
@@ -164,7 +164,7 @@ class _DriveExamination(_Examination):
             )
             self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead[0]}"))
 
-    def _tell_opposite(self, command: _Drive, wheels: _Drive) -> None:
+    def _report_opposite(self, command: _Drive, wheels: _Drive) -> None:
         """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
         explained = command.reading.explained
         if explained is None or not command.is_sure:
