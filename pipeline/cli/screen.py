@@ -208,7 +208,11 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
+    from pipeline.estimation.verdict import has_no_pose  # noqa: PLC0415 - heavy
+
     named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
+    if has_no_pose(summary):
+        named += " of the drivetrain, not of the ground,"
     medians = _format_medians(by_input, "median_modulus")
     if not everything:
         return [_row("slip", f"{named} {medians}")] if medians else []

@@ -207,6 +207,8 @@ def _explore(
 
 def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
     search = search_body(context, source, known, budget)
+    if context.is_drive_alone:
+        return _gather_drive(search)
     final = search_formula(search.selection, search.final)
     # Where a formula explains the residual, boosting is skipped.
     features = None
@@ -220,7 +222,11 @@ def _explore_body(context: Context, source: Input, known: Sequence[Effect], budg
 def _explore_wheels(
     context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
 ) -> Explored:
-    search = search_wheels(context, known, body, budget)
+    return _gather_drive(search_wheels(context, known, body, budget))
+
+
+def _gather_drive(search: SearchResult) -> Explored:
+    """Results for the drivetrain, which no formula of place or heading can explain."""
     selection, final = search.selection, search.final
     remaining = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
     if not (remaining > LEAST_OF_DRIVE).any():

@@ -72,10 +72,11 @@ def measure_commanded_turn(run: MotionRun, vehicle: Vehicle) -> CommandedTurn | 
     """Measure the share of the commanded yaw rate that a run reaches.
 
     Returns:
-        None without a body command, with too few stretches of driving, or where the yaw rate does not follow.
+        None without a body command or a pose, with too few stretches of driving, or where the yaw rate does
+        not follow.
     """
     multiplier = run.alignment.body_multiplier
-    if multiplier is None or run.commands is None:
+    if multiplier is None or run.commands is None or run.is_drive_alone:
         return None
     with contextlib.suppress(SlipError):
         gained = _measure_gain(Comparison(run, vehicle, Input.COMMAND))

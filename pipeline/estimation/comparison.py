@@ -520,6 +520,13 @@ def choose_input(
         remedy = "--input command" if silent is None else f"{silent} has no command"
         idle += drivetrain
         warnings.append(f"not fitted from wheel encoders: {acts} ({remedy})")
+    alone = next((run.name for run in runs if run.is_drive_alone), None)
+    ground = [effect.id for effect in known if effect.place > Place.DRIVE] if alone is not None else []
+    if ground:
+        idle += ground
+        act = "act" if len(ground) > 1 else "acts"
+        warnings.append(f"not fitted: {', '.join(ground)} {act} behind the wheels, and {alone} has no pose")
+        known = tuple(effect for effect in known if effect.id not in ground)
     clock = find_late(known, Late.POSES)
     if clock is not None and all(run.gyro_fit is not None for run in runs):
         idle.append(clock.id)

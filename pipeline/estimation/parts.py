@@ -321,6 +321,8 @@ class BodyPart(Part):
             # A course is the direction of travel: no lateral motion is measured.
             self.channels = (0, 2)
         self.title = "Drivetrain and ground effects" if whole else "Ground effects"
+        if any(comparison.run.is_drive_alone for comparison in comparisons):
+            self.title, self.dates_poses = "Drivetrain effects", False
 
     def owns(self, effect: Effect) -> bool:
         """All effects if the input is the command; those after the wheels if it is the wheels."""
@@ -338,7 +340,8 @@ class BodyPart(Part):
     def _find_clock_error(self, comparison: Comparison) -> float:
         if comparison.heading.gyro is not None:
             return comparison.heading.gyro.delay_error_s
-        return 0.0 if self.whole else comparison.run.wheel_period_s / _SPREAD_OF_EVEN
+        is_exact = self.whole and not comparison.run.is_drive_alone
+        return 0.0 if is_exact else comparison.run.wheel_period_s / _SPREAD_OF_EVEN
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: the poses are later by ``late_s`` than assumed."""

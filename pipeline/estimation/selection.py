@@ -24,6 +24,7 @@ from pipeline.models.catalogue import list_effects
 from pipeline.models.effect import Effect, Place
 from pipeline.models.parameter import Conditions, Largest, is_of_one_run
 from pipeline.run import MotionError, MotionRun
+from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.sources import Vehicle
 
 
@@ -67,6 +68,11 @@ class Context:
         return all(run.wheels is not None for run in self.runs)
 
     @property
+    def is_drive_alone(self) -> bool:
+        """Whether the poses are the motion of the wheels, so that only the drivetrain is observable."""
+        return any(run.is_drive_alone for run in self.runs)
+
+    @property
     def has_gyro(self) -> bool:
         """Whether every run has a good gyro as heading and clock."""
         return all(comparison.has_gyro for comparison in self.problem.comparisons)
@@ -74,10 +80,11 @@ class Context:
     @cached_property
     def conditions(self) -> Conditions:
         """What the runs can show; every search looks at measured wheels where there are any."""
-        sampling = self.sampling_s if self.has_encoders else 0.0
+        encoders = self.has_encoders or self.is_drive_alone
+        sampling = self.sampling_s if encoders else 0.0
         exceeded = self.problem.exceeded
         slope = max(comparison.context.slope_rad for comparison in self.problem.comparisons)
-        return Conditions(self.largest, self.has_encoders, self.has_gyro, sampling, exceeded, slope)
+        return Conditions(self.largest, encoders, self.has_gyro, sampling, exceeded, slope)
 
     @property
     def sampling_s(self) -> float:
@@ -86,6 +93,8 @@ class Context:
 
     def list_candidates(self, source: Input) -> tuple[Candidate, ...]:
         """Effects that can be identified from an input of this vehicle."""
+        if self.is_drive_alone:
+            return self.list_drivetrain()
         hidden = _DRIVETRAIN if source is Input.MEASURED else frozenset()
         return tuple(
             cast("Candidate", effect)
@@ -123,12 +132,28 @@ def prepare(runs: Sequence[MotionRun], vehicle: Vehicle, source: Input) -> Conte
         other = Input.MEASURED if source is Input.COMMAND else Input.COMMAND
         what = f"there is no {'command' if source is Input.COMMAND else 'measured wheel'} to diagnose from"
         raise DiagnosisError("no_input", what, where=where, hint=f"Try --input {other.value}.") from error
+    _require_alike(runs)
     windows = problem.whole.run.size
     if windows < _FEWEST_WINDOWS:
         what = f"only {windows} stretches of half a second have both a live input and valid poses"
         hint = f"{_FEWEST_WINDOWS} are needed: drive longer, or check the poses with `slip inspect`."
         raise DiagnosisError("too_short", what, where=where, hint=hint)
     return Context(problem)
+
+
+def _require_alike(runs: Sequence[MotionRun]) -> None:
+    """Refuse to judge runs with poses and runs without together.
+
+    Raises:
+        DiagnosisError: ``ground_unobservable``.
+    """
+    alone = [run.name for run in runs if run.is_drive_alone]
+    if alone and len(alone) < len(runs):
+        what = (
+            "the log holds no pose, so that only its drivetrain is observable; others of these logs hold one"
+        )
+        hint = "Diagnose it without the others."
+        raise DiagnosisError(GROUND_UNOBSERVABLE, what, where=", ".join(alone), hint=hint)
 
 
 PRICE = 0.5 * LEAST_T**2

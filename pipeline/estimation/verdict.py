@@ -12,6 +12,7 @@ from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_error
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.models.catalogue import list_effects
 from pipeline.recording import FAULTS
+from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
@@ -31,6 +32,7 @@ CAUSE_NAMES = {"localization_noise": "localization noise"}
 """Causes of an error budget in words, where these differ from the id."""
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
+NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
 _MAIN_SHARE = 0.1
 """Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
 _MOST_CLAUSES = 3
@@ -41,6 +43,11 @@ _SAME_MULTIPLIER = 0.05
 """Absolute logarithm of a multiplier up to which the ideal yaw rate is the commanded one, but for errors."""
 _LONGEST = 400
 """Characters that a verdict may have: as much as is read at a glance."""
+
+
+def has_no_pose(run: Content) -> bool:
+    """Whether the log of a run, as JSON, holds no pose, so that only its drivetrain is observable."""
+    return any(one.get("id") == GROUND_UNOBSERVABLE for one in objects_in(run, "findings"))
 
 
 def find_refusal(run: Content) -> str:
@@ -68,10 +75,11 @@ def format_verdict(diagnosis: Content) -> str:
         why = (str(one["text"]).rstrip(".") for one in findings if one.get("where") == "diagnosis")
         return _join(f"No effect can be estimated: {next(why, NOT_FITTED_TO_RUN)}")
     opening = f"Over {HORIZON_S:g} s the ideal model is {format_errors(ladder[0])} off"
+    scope = [NO_GROUND] if has_no_pose(diagnosis) else []
     if len(ladder) == 1:
-        return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis))
+        return _join(f"{opening}{_compare(diagnosis, ', ')}", *_format_nothing(diagnosis), *scope)
     clauses = _list_clauses(diagnosis)
-    rest = _list_commanded(diagnosis)
+    rest = [*scope, *_list_commanded(diagnosis)]
     rest += [text] if (text := "; ".join(filter(None, _list_open_ends(diagnosis)))) else []
     remaining = f"{format_errors(ladder[-1])} remain{_compare(diagnosis, ', ')}"
     verdict = ""

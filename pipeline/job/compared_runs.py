@@ -10,6 +10,7 @@ from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet import ComparisonError, label_runs
 from pipeline.job.run_results import DIAGNOSED, DIAGNOSIS
 from pipeline.models.catalogue import list_effects
+from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.stages.checks import find_gain, is_grip
 from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.names import date_runs
@@ -75,7 +76,8 @@ def find_material(
     """Select the current runs of the results, each recording once.
 
     Excluded with a note are runs with a damaged table, whichever it is, duplicates of a recording, tables
-    of another contract version, and runs without a group; with ``trusted_only`` also runs with a finding
+    of another contract version, runs without a group, and runs without a pose, whose slip is that of the
+    wheels against their commands; with ``trusted_only`` also runs with a finding
     that forbids conclusions. Simulated runs are left out where there are recordings.
 
     Args:
@@ -102,6 +104,8 @@ def find_material(
         if refusal := find_run_refusal(manifest):
             refusals[manifest.run] = refusal
             reason = reason and f"no effect can be estimated: {refusal}"
+        if not reason and _lacks_pose(manifest):
+            reason = "its log holds no pose, and its slip is not that of the ground"
         if digest in holders:
             reason = f"the same recording as {holders[digest]}"
         if reason:
@@ -272,6 +276,13 @@ def find_run_refusal(manifest: Manifest) -> str:
     if "findings" not in manifest.tables or manifest.find_damage(["findings"]):
         return ""
     return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
+
+
+def _lacks_pose(manifest: Manifest) -> bool:
+    """Whether the poses of a run are the motion of its wheels; False if its findings are damaged."""
+    if "findings" not in manifest.tables or manifest.find_damage(["findings"]):
+        return False
+    return GROUND_UNOBSERVABLE in manifest.read("findings")["id"]
 
 
 def _describe_damage(manifest: Manifest, needed: Sequence[str]) -> str:

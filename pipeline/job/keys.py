@@ -71,6 +71,11 @@ class LogSetup:
         source = self.sources.command
         return source is not None and source.form is DriveForm.BODY
 
+    @property
+    def is_drive_alone(self) -> bool:
+        """Whether measured wheels stand in for a pose that is not recorded."""
+        return self.sources.pose is not None and self.sources.pose.wheels is not None
+
 
 def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> LogSetup:
     """Open a log and determine configuration, vehicle and topics.
@@ -146,9 +151,14 @@ def _require_sources(sources: Sources, index: LogIndex, options: Options) -> Non
     there += f". Without any message: {', '.join(sorted(empty))}" if empty else ""
     if sources.pose is None:
         what = "no topic can serve as pose (an odometry, a pose, or transforms)" + blame_damage(index.losses)
+        what += _describe_stand_in(sources, index)
         named = "Name it in run.toml ([pose] topic = ...)"
         named = named if _may_be_named(index, "pose", "fix") else _suggest_pose(index) or _RECORD_POSE
         hint = f"{named}. The log has: {there}."
+        raise JobError("no_pose", what, where=str(index.path), hint=hint)
+    if sources.pose.wheels is not None and "command" not in options.inputs:
+        what = f"the log holds no pose: its wheels ({sources.pose.wheels}) stand in for it, and are no input"
+        hint = "Analyze what the wheels do with the commands: --input command; or record a localization."
         raise JobError("no_pose", what, where=str(index.path), hint=hint)
     wanted = {"command": sources.command, "measured": sources.wheels}
     if all(wanted[name] is None for name in options.inputs):
@@ -182,6 +192,29 @@ def _suggest_pose(index: LogIndex) -> str:
     return ". ".join(lines or positions)
 
 
+def _describe_stand_in(sources: Sources, index: LogIndex) -> str:
+    """What a log without poses lacks for a diagnosis of its drive alone."""
+    if sources.command is None and sources.wheels is None:
+        return ""
+    if sources.wheels is None:
+        return f", and the log has commands without measured wheels: {_WITH_BOTH}"
+    if sources.command is None:
+        return f", and the log has measured wheels without commands: {_WITH_BOTH}"
+    silent = [
+        channel.topic
+        for channel in index.channels
+        if not channel.message_count
+        and (
+            plain_type(channel.type_name) in TRANSFORM_TYPES or find_type(channel.type_name).pose is not None
+        )
+    ]
+    if silent:
+        return f", and {', '.join(sorted(silent))} is without any message"
+    why = "they do not turn, or give no motion"
+    return f", and its measured wheels ({sources.wheels}) cannot stand in for it: {why}"
+
+
+_WITH_BOTH = "with both, the drive alone could be diagnosed"
 _RECORD_POSE = "None of its topics holds any: record a localization's odometry or poses, or the transforms"
 _RECORD_DRIVE = "None of its topics holds any: record the commands, or the speeds of the wheels"
 _KNOWN_PACKAGES = (

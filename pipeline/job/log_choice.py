@@ -248,20 +248,78 @@ def choose(index: LogIndex, configuration: Configuration, overrides: Mapping[str
         text = "the log contains no commands: it is analyzed from wheel encoders"
         findings.append(Finding("no_command", "info", text, where="command"))
     chosen = Choice(vehicle, source, sources, findings=tuple(findings))
+    chosen = _choose_pose(chosen, channels, index, configuration)
+    # The content may leave no drive: what was chosen by name is a drive all the same.
+    pose = chosen.sources.pose
+    fits = problem is not None and pose is not None and (sources.wheels or sources.command) is not None
+    # Missing data are reported before an unknown vehicle.
+    if problem is None or not fits:
+        return _release_columns(chosen)
+    return _fit_vehicle(chosen, configuration, problem, known)
+
+
+def _choose_pose(
+    chosen: Choice, channels: Sequence[ChannelInfo], index: LogIndex, configuration: Configuration
+) -> Choice:
+    """The choice with the pose by its content, or with wheels that stand in for it."""
+    sources = chosen.sources
+    if sources.pose is None:
+        if _lacks_pose(channels, configuration, chosen.vehicle, sources, str(index.path)):
+            return _let_wheels_stand_in(chosen, index, configuration)
+        return chosen
     rivals = [one for one in sources.others.get("pose", ()) if isinstance(one, PoseSource)]
     if len(rivals) >= MOST_POSES:
         rivals, finding = _leave_out_poses(index, rivals)
         sources = replace(sources, others={**sources.others, "pose": tuple(rivals)})
         chosen = replace(chosen, sources=sources, findings=(*chosen.findings, finding))
-    fits = (
-        problem is not None and sources.pose is not None and (sources.wheels or sources.command) is not None
+    return _compare(chosen, index, configuration, rivals)
+
+
+def _lacks_pose(
+    channels: Sequence[ChannelInfo],
+    configuration: Configuration,
+    vehicle: Vehicle,
+    sources: Sources,
+    where: str,
+) -> bool:
+    """Whether a log with commands and measured wheels was made without recording any pose.
+
+    A topic for poses without any message was meant to be recorded: the log is refused, and names it.
+    """
+    if sources.command is None or sources.wheels is None:
+        return False
+    announced = [replace(one, message_count=max(one.message_count, 1)) for one in channels]
+    return choose_sources(announced, configuration, vehicle, where=where).pose is None
+
+
+def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configuration) -> Choice:
+    """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
+    from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
+
+    drives = [
+        one
+        for role in ("command", "wheels")
+        for one in chosen.sources.others.get(role, ())
+        if isinstance(one, DriveSource)
+    ]
+    data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
+    recording = examine_drive(
+        data,
+        chosen.sources,
+        configuration,
+        chosen.vehicle,
+        is_known=chosen.vehicle.id != UNKNOWN_VEHICLE,
+        where=str(index.path),
     )
-    if sources.pose is not None:
-        chosen = _compare(chosen, index, configuration, rivals)
-    # Missing data are reported before an unknown vehicle.
-    if problem is None or not fits:
-        return _release_columns(chosen)
-    return _fit_vehicle(chosen, configuration, problem, known)
+    if recording is None:
+        return chosen
+    return replace(
+        chosen,
+        sources=recording.sources,
+        findings=(*chosen.findings, *recording.findings),
+        data=data,
+        recording=recording,
+    )
 
 
 MOST_POSES = 40
@@ -509,10 +567,13 @@ def _fit_vehicle(
     known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
     fitted = _list_lengths(recording.geometry, kind)
     values = {key: value for key, value in {**fitted, **known}.items() if key in _LENGTHS}
-    drives = [drive for drive in (sources.wheels, sources.command) if drive is not None]
+    standing_in = None if sources.pose is None else sources.pose.wheels
+    drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
     findings = list(chosen.findings)
     if not is_body and kind == "differential" and "wheel_radius_m" not in values:
+        if standing_in is not None:
+            return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
         text = (
@@ -522,6 +583,8 @@ def _fit_vehicle(
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
         sources, is_body = replace(sources, wheels=None), True
     if kind == "ackermann" and "wheelbase_m" not in values:
+        if standing_in is not None:
+            return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         raise problem
     assumed = {key: value for key, value in _STAND_INS.items() if key not in values}
     if kind == "ackermann":
@@ -543,6 +606,37 @@ def _fit_vehicle(
         findings=tuple(findings),
         extracted=None,
     )
+
+
+def _take_unit_wheels(
+    chosen: Choice, problem: ConfigurationError, kind: str, values: Mapping[str, object]
+) -> Choice:
+    """Usual lengths for a log without poses whose commands are of the same kind as what its wheels measure.
+
+    Args:
+        chosen: choice with a placeholder of unit geometry.
+        problem: error to raise if the commands are motion of the body, which the wheels do not follow.
+        kind: of the vehicle.
+        values: of the vehicle that were given, or that the signals show.
+    """
+    command = chosen.sources.command
+    if command is None or command.form is DriveForm.BODY:
+        why = "the wheels do not follow the commands, which would show its geometry"
+        what = f"{problem.what}, and {why}"
+        raise ConfigurationError(problem.code, what, where=problem.where, hint=problem.hint)
+    needed = (*_STAND_INS,) if kind == "differential" else ("wheel_radius_m", "wheelbase_m")
+    lengths = {**_STAND_INS, "wheelbase_m": 1.0}
+    assumed = {key: lengths[key] for key in needed if key not in values}
+    words = {"wheel_radius_m": "a wheel radius", "track_width_m": "a track", "wheelbase_m": "a wheelbase"}
+    taken = " and ".join(f"{words[key]} of {value:g} m" for key, value in assumed.items())
+    text = (
+        "no vehicle is given and none is needed: commands and measurements are of the same wheels; lengths "
+        f"in metres are for {taken} ([vehicle] {', '.join(assumed)} in run.toml: others)"
+    )
+    bare = {"name": "fitted vehicle", "wheelbase_m": None, "id": "fitted_wheels", "kind": kind}
+    vehicle = msgspec.structs.replace(chosen.vehicle, **{**bare, **assumed, **values}, stand_ins=[*assumed])
+    findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
+    return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
 
 
 _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")

@@ -308,6 +308,7 @@ class Watch:
             hold_s=setup.configuration.command.hold_s,
             body_commanded=setup.is_body_commanded,
             where=where,
+            is_drive_alone=setup.is_drive_alone,
         )
         tables, alignment = aligned.tables, aligned.alignment
         speeds = velocity.compute_velocities(

@@ -294,6 +294,7 @@ class Work:
             hold_s=self.setup.configuration.command.hold_s,
             body_commanded=self.setup.is_body_commanded,
             where=str(self.setup.path),
+            is_drive_alone=self.setup.is_drive_alone,
         )
         for name, checked in self._extracted.items():
             aligned = self._identify(name, made.tables.get(name, checked.valid))
@@ -342,7 +343,10 @@ class Work:
         self.write("windows", made.windows)
         outlier = velocities["outlier"].to_numpy()
         inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
-        samples = gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded)
+        samples = replace(
+            gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded),
+            is_drive_alone=self.setup.is_drive_alone,
+        )
         findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
         model = None if self.options.model is None else self.options.model.name
         return StageOutcome(

@@ -8,10 +8,11 @@ so that the stages after read a recording as a user could have described it by h
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from pipeline.recording.drive_alone import examine_drive
     from pipeline.recording.evidence import Length
     from pipeline.recording.examination import Geometry, Recording, examine
 
-__all__ = ["FAULTS", "Geometry", "Length", "Recording", "examine"]
+__all__ = ["FAULTS", "Geometry", "Length", "Recording", "examine", "examine_drive"]
 
 FAULTS = (
     "signs_contradict",
@@ -31,6 +32,10 @@ def __getattr__(name: str) -> object:
         from pipeline.recording.evidence import Length  # noqa: PLC0415
 
         return Length
+    if name == "examine_drive":
+        from pipeline.recording.drive_alone import examine_drive  # noqa: PLC0415
+
+        return examine_drive
     if name in __all__:
         from pipeline.recording import examination  # noqa: PLC0415
 

@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.core import INPUT_WORDS, format_recorded, naming_os_errors
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
 from pipeline.estimation.error_regions import format_errors
+from pipeline.estimation.verdict import has_no_pose
 from pipeline.report import (
     MISSING,
     Cell,
@@ -156,6 +157,9 @@ def _tabulate(report: RunReport) -> Table | None:
     scale = report.number("length_scale_m")
     caption = "Slip g = f(u) \u2212 v of the ideal model"
     caption += "" if scale is None else f"; slip modulus with L = {scale:g} m"
+    caption += (
+        "; v is that of the measured wheels: no pose is recorded" if has_no_pose(report.summary) else ""
+    )
     rows: list[list[str | Cell]] = [[words, *(c[i] for c in columns)] for i, words in enumerate(_QUANTITIES)]
     head = [Column("u"), *(Column(INPUT_WORDS[name], number=True) for name in report.inputs)]
     return Table(caption, head, rows)

@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.core import SlipError, arrays, rigid
 from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
-from pipeline.run.signals import DriveSeries, find_fastest_wheel, round_off
+from pipeline.run.signals import GROUND_UNOBSERVABLE, DriveSeries, find_fastest_wheel, round_off
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -161,6 +161,7 @@ class MotionRun:
             if each is new.
         corrected_s: time between corrections of an odometry by its localization [s]; zero if unknown.
         is_on_course: whether its heading is the course over ground, so that it never moves sideways.
+        is_drive_alone: whether its poses are the motion of its wheels, since none were recorded.
         origin: where its zero lies in the recording, see `anchored`.
     """
 
@@ -179,6 +180,7 @@ class MotionRun:
     repeats_s: float = 0.0
     corrected_s: float = 0.0
     is_on_course: bool = False
+    is_drive_alone: bool = False
     origin: Origin = Origin()
 
     @property
@@ -252,6 +254,8 @@ class MotionRun:
     @property
     def wheel_period_s(self) -> float:
         """Median period of the wheel measurements [s]; zero without wheels."""
+        if self.is_drive_alone:
+            return float(np.median(np.diff(self.track.times)))
         return 0.0 if self.wheels is None else float(np.median(np.diff(self.wheels.times)))
 
     def correct_vehicle(self, vehicle: Vehicle) -> Vehicle:
@@ -322,13 +326,13 @@ def make_run(
         alignment=alignment,
         repeats_s=rigid.measure_repeats(tables["poses"]),
         corrected_s=rigid.measure_period(_list_corrections(tables["poses"])),
-        is_on_course=_is_on_course(tables.get("findings")),
+        is_on_course=_has_finding(tables.get("findings"), "heading_from_course"),
+        is_drive_alone=_has_finding(tables.get("findings"), GROUND_UNOBSERVABLE),
     )
 
 
-def _is_on_course(findings: pl.DataFrame | None) -> bool:
-    """See `MotionRun.is_on_course`."""
-    return findings is not None and not findings.is_empty() and "heading_from_course" in findings["id"]
+def _has_finding(findings: pl.DataFrame | None, name: str) -> bool:
+    return findings is not None and not findings.is_empty() and name in findings["id"]
 
 
 def _list_corrections(poses: pl.DataFrame) -> Floats:

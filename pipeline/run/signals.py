@@ -32,6 +32,8 @@ Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 _STEPS = 2.0**20
 """Steps of a second, a metre, a radian: a millionth is less than any sensor resolves, and a million times
 the rounding of positions in a map."""
+GROUND_UNOBSERVABLE = "ground_unobservable"
+"""The finding of a run whose log holds no pose: the motion of its wheels stands in for it."""
 STILL = 1e-6
 """[rad/s] of wheels at rest: above the rounding of sums."""
 _OFF_TIE = 0.37

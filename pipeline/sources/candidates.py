@@ -90,6 +90,7 @@ class PoseContent(Enum):
     POSE = "poses"
     FIX = "places on Earth, without a heading"
     VELOCITY = "velocities over ground, without a place or a heading"
+    WHEELS = "measured wheels, whose motion stands in for a pose that is not recorded"
 
 
 @dataclass(frozen=True)
@@ -105,6 +106,7 @@ class PoseSource:
         velocity: topic with the velocities over ground that belong to a fix.
         name: of the body, if a message contains the poses of several.
         fields: the fields of the pose, if the configuration names them.
+        wheels: the measured wheels whose motion stands in for a pose; None of a recorded pose.
     """
 
     topic: str
@@ -115,8 +117,11 @@ class PoseSource:
     velocity: str = ""
     name: str = ""
     fields: PoseFields | None = None
+    wheels: DriveSource | None = None
 
     def __str__(self) -> str:
+        if self.wheels is not None:
+            return str(self.wheels)
         return f"{self.topic} ({' -> '.join(self.frames)})" if self.frames else self.topic
 
 
@@ -177,7 +182,7 @@ class Sources:
         """The body command that is recorded beside commanded wheels; None where there is none."""
         if self.command is None or self.command.form not in {DriveForm.SIDES, DriveForm.JOINTS}:
             return None
-        drives = (self.command, self.wheels)
+        drives = (self.command, self.wheels, None if self.pose is None else self.pose.wheels)
         taken = {signal.topic for one in drives if one is not None for signal in one.signals}
         for one in self.others.get("command", ()):
             if isinstance(one, DriveSource) and one.form is DriveForm.BODY:

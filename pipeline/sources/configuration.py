@@ -43,7 +43,7 @@ Unit = Literal[
 ]
 
 
-StandIn = Literal["wheel_radius_m", "track_width_m"]
+StandIn = Literal["wheel_radius_m", "track_width_m", "wheelbase_m"]
 
 
 class VehicleSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

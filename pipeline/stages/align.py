@@ -7,7 +7,7 @@ findings, and every reader of the run gets corrected data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -28,7 +28,7 @@ from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report
 from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_choice import find_steady_gain
 from pipeline.stages.pose_faults import align_poses, find_bad_stretches
-from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
+from pipeline.stages.slip_stage import Ideal, Steps, cut_steps, interpolate_wheels, keep_known, read_inputs
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
     ONE_SCALE,
@@ -97,6 +97,7 @@ def align_tables(
     hold_s: float | None,
     body_commanded: bool,
     where: str,
+    is_drive_alone: bool = False,
 ) -> Aligned:
     """Align a run.
 
@@ -107,6 +108,8 @@ def align_tables(
             `arrays.usual_hold`.
         body_commanded: whether the command is a body command, which the controller converts to wheel speeds.
         where: the run, for error messages.
+        is_drive_alone: whether the poses are the motion of the measured wheels, since none were recorded:
+            they have no faults of a localization.
 
     Raises:
         StageError: ``no_segment``, no stretch of the poses can be differentiated.
@@ -114,7 +117,15 @@ def align_tables(
     commands, wheels = (tables.get(name, pl.DataFrame()) for name in ("commands", "wheels"))
     echo = check_echo(commands, wheels, vehicle, body_commanded=body_commanded)
     used = {name: table for name, table in tables.items() if not (echo and name == "wheels")}
-    made = _align(used, wheels, vehicle, hold_s=hold_s, body_commanded=body_commanded, where=where)
+    made = _align(
+        used,
+        wheels,
+        vehicle,
+        hold_s=hold_s,
+        body_commanded=body_commanded,
+        where=where,
+        is_drive_alone=is_drive_alone,
+    )
     if not echo:
         return made
     # The readings stay as recorded; as aligned they are unknown, so that nothing evaluates them.
@@ -131,6 +142,7 @@ def _align(
     hold_s: float | None,
     body_commanded: bool,
     where: str,
+    is_drive_alone: bool,
 ) -> Aligned:
     """As `align_tables`; poses that are made of the wheels ``witness`` are reported even without wheels."""
     commands = tables.get("commands", pl.DataFrame())
@@ -154,18 +166,21 @@ def _align(
         cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
         incidents = find_incidents(velocities, tables, known, vehicle, hold)
         usual = {name: ideal.leave_out(incidents.excluded) for name, ideal in known.items()}
-        bad, contradictions = find_bad_stretches(
-            velocities, {name: ideal.velocity for name, ideal in usual.items()}, cut.step
-        )
-        events = find_events(velocities, known, vehicle, bad, incidents.spans)
+        bad, contradictions = _find_contradictions(velocities, {} if is_drive_alone else usual, cut)
+        if not is_drive_alone:
+            events = find_events(velocities, known, vehicle, bad, incidents.spans)
         bad |= incidents.excluded
         findings += [*contradictions, *incidents.findings, *events.findings]
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
-        scale = measure_command_scale(samples, vehicle)
+        scale = measure_command_scale(
+            replace(samples, measured=samples.velocity) if is_drive_alone else samples, vehicle
+        )
         independent = _check_poses(samples, witness, tables["poses"], vehicle)
         findings += [*scale.findings, *independent]
-        grid = replace(grid, recorded=_measure_moduli(samples, bad), is_localization=not independent)
+        grid = replace(
+            grid, recorded=_measure_moduli(samples, bad), is_localization=not (independent or is_drive_alone)
+        )
     aligned_vehicle = msgspec.structs.replace(vehicle, controller_track_multiplier=scale.track_multiplier)
     asked, late_starts = mark_late_starts(correct_commands(commands, vehicle, scale), wheels, aligned_vehicle)
     findings += late_starts
@@ -194,11 +209,19 @@ def _align(
         findings += _report_wheels(late)
     if not imu.is_empty():
         findings += report_gyro(alignment, velocities["v_w"].to_numpy())
-    if timeout is not None and hold is not None:
-        findings.append(report_timeout(timeout, hold))
+    findings += [report_timeout(timeout, hold)] if timeout is not None and hold is not None else []
     findings += _report_poses(alignment)
     made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment), "events": events.table}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))
+
+
+def _find_contradictions(
+    velocities: pl.DataFrame, inputs: Mapping[str, Ideal], cut: Steps
+) -> tuple[Flags, Sequence[Finding]]:
+    """Samples in stretches with implausible poses, and findings on them; none without an input."""
+    if not inputs:
+        return np.zeros(velocities.height, dtype=bool), ()
+    return find_bad_stretches(velocities, {name: ideal.velocity for name, ideal in inputs.items()}, cut.step)
 
 
 @dataclass(frozen=True)

@@ -290,13 +290,17 @@ def check_motion(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
     positions = samples.position[known]
     net = float(np.linalg.norm(positions.max(axis=0) - positions.min(axis=0)))
     still = all(abs(gain) < _GAIN_OF_NO_MOTION for gain in gains)
-    nowhere = net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
+    # Wheels on a stand, or in a test of steps, may turn as much back as ahead.
+    nowhere = not samples.is_drive_alone and net < _NET_OF_NO_MOTION and path > _PATH_OF_MOTION
     if not still and not (nowhere and abs(gains[2]) < 10.0 * _GAIN_OF_NO_MOTION):
         return []
     # Sideways motion counts only without a forward command.
     covered = gains[0] or gains[1]
     source = "turned by the wheels" if ideal is samples.measured else "commanded"
     driven = f"{path:.0f}" if path >= 10.0 else f"{path:.2g}"  # noqa: PLR2004 - two digits
+    if samples.is_drive_alone:
+        text = f"the wheels do not turn: they rolled {format_share(covered, 0)} of the {driven} m {source}"
+        return [Finding("not_moving", "error", text, value=covered)]
     text = (
         f"the vehicle does not move: it covered {format_share(covered, 0)} of the {driven} m {source} and "
         f"stayed within {net:.2g} m (wheels in the air, blocked, or stopped)"

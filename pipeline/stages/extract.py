@@ -30,6 +30,7 @@ from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_paus
 from pipeline.stages.drive import (
     Drive,
     differentiate_angle,
+    interpolate_readings,
     is_angle,
     read_joints,
     read_pair,
@@ -40,6 +41,7 @@ from pipeline.stages.drive import (
 from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.pose_topics import read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
+from pipeline.stages.trust import check_echo
 
 # The extract stage: from the columns of a log to tables of commands, wheels, poses and gyro.
 #
@@ -48,6 +50,9 @@ from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state,
 
 Stamps = Ints
 
+_LONGEST_STEP_S = 1.0
+"""Longest time between two readings of wheels over which their motion is integrated: a second, as that of a
+reading that is repeated."""
 _DEFAULT_SECTION = IntervalSection(topic=DEFAULT_INTERVAL[0], equals=DEFAULT_INTERVAL[1])
 
 
@@ -225,8 +230,11 @@ class Extraction:
         ):
             for signal in source.signals if source else ():
                 asked[signal.topic] = section.time
-        if self.sources.pose:
-            asked[self.sources.pose.topic] = self.configuration.pose.time
+        pose = self.sources.pose
+        if pose is not None and pose.wheels is not None:
+            asked |= {signal.topic: self.configuration.wheels.time for signal in pose.wheels.signals}
+        elif pose is not None:
+            asked[pose.topic] = self.configuration.pose.time
         if self.sources.imu:
             asked[self.sources.imu.topic] = self.configuration.imu.time
         return asked
@@ -305,6 +313,9 @@ class Extraction:
             times, position, quaternion, breaks, self.configuration.velocity, source.topic
         )
         self.findings += track.findings
+        if source.wheels is not None:
+            # Wheels at rest repeat their pose, and each reading is new all the same.
+            track = replace(track, held=np.zeros_like(track.held))
         return pl.DataFrame(
             {
                 **self._time_columns(times, stamp, log_time),
@@ -323,6 +334,8 @@ class Extraction:
         clock, columns = self.clocks.get(topic), self.columns.get(topic)
         if clock is None or not clock.usable.any():
             raise self._nothing("pose", topic)
+        if source.wheels is not None:
+            return self._follow_wheels(source.wheels, clock)
         if self.chain is not None:
             chain, order = self.chain, self._order(clock)
             arrays = reading.PoseArrays(
@@ -343,13 +356,61 @@ class Extraction:
             log_times = columns.log_time
         self.frames = (arrays.parent, arrays.child)
         stamp, log_time = clock.stamp[order], log_times[order]
-        breaks = np.zeros(order.size, dtype=bool)
-        for jump in clock.breaks:
-            breaks[np.flatnonzero(log_time >= jump)[:1]] = True
+        breaks = _find_breaks(clock, log_time)
         if self.chain is None and source.content is PoseContent.POSE:
             arrays, findings = pose_topics.to_base_link(arrays, self.data.topics, topic)
             self.findings += findings
         return stamp, log_time, arrays, breaks
+
+    def _follow_wheels(
+        self, source: DriveSource, clock: TopicClock
+    ) -> tuple[Stamps, Stamps, reading.PoseArrays, Flags]:
+        """Stamps, log times and poses of measured wheels that roll without slip, and clock jumps."""
+        wheels, findings = interpolate_readings(
+            self.read_drive(source, self.configuration.wheels, held=False)
+        )
+        self.findings += findings
+        self._refuse_echo(wheels)
+        kinematics = self.vehicle.kinematics
+        inputs = {
+            one.name: wheels[f"{one.name}_aligned"].cast(pl.Float64).fill_null(np.nan).to_numpy(writable=True)
+            for one in kinematics.inputs
+        }
+        known = np.logical_and.reduce([np.isfinite(values) for values in inputs.values()])
+        if known.sum() < reading.FEWEST_MESSAGES:
+            raise self._nothing("wheels", source.signals[0].topic)
+        ahead, aside, turning = kinematics.forward(
+            {name: values[known] for name, values in inputs.items()}, self.vehicle
+        )
+        stamp, log_time = (wheels[name].to_numpy()[known] for name in ("stamp", "log_time"))
+        elapsed = np.diff(self._seconds(stamp))
+        # Across a gap the segment is cut, and nothing is known of the motion.
+        elapsed[elapsed > _LONGEST_STEP_S] = 0.0
+        turned = 0.5 * (turning[1:] + turning[:-1]) * elapsed
+        yaw = np.append(0.0, np.cumsum(turned))
+        velocity = ahead + 1j * aside
+        moved = 0.5 * (velocity[1:] + velocity[:-1]) * elapsed * np.exp(1j * (yaw[:-1] + 0.5 * turned))
+        path = np.append(0.0, np.cumsum(moved))
+        flat = np.zeros(path.size)
+        arrays = reading.PoseArrays(
+            np.column_stack((path.real, path.imag, flat)),
+            np.column_stack((flat, flat, np.sin(0.5 * yaw), np.cos(0.5 * yaw))),
+            "",
+            "",
+        )
+        return stamp, log_time, arrays, _find_breaks(clock, log_time)
+
+    def _refuse_echo(self, wheels: pl.DataFrame) -> None:
+        """Refuse wheels that repeat the commands where nothing else is measured."""
+        command = self.sources.command
+        body_commanded = command is not None and command.form is DriveForm.BODY
+        if check_echo(self._commands, wheels, self.vehicle, body_commanded=body_commanded):
+            what = (
+                "the log holds no pose, and its measured wheels repeat the commands: a controller in open "
+                "loop reports what it was asked for, and nothing was measured"
+            )
+            hint = "Record the encoders, or a localization."
+            raise StageError("no_pose", what, where=self.where, hint=hint)
 
     def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
         pose = source.fields or find_type(columns.type_name).pose
@@ -583,3 +644,11 @@ class Extraction:
                 "active": is_inside(times, self._spans),
             }
         )
+
+
+def _find_breaks(clock: TopicClock, log_time: Stamps) -> Flags:
+    """Whether the clock jumped before each message, shape (n,)."""
+    breaks = np.zeros(log_time.size, dtype=bool)
+    for jump in clock.breaks:
+        breaks[np.flatnonzero(log_time >= jump)[:1]] = True
+    return breaks

@@ -198,6 +198,8 @@ def pose_fields(source: PoseSource, types: dict[str, str]) -> list[Signal]:
     """All fields of a pose topic; empty if poses come from transforms."""
     if source.from_transforms:
         return []
+    if source.wheels is not None:
+        return drive_fields(source.wheels, types)
     kind = find_type(types[source.topic])
     pose = source.fields or kind.pose
     if source.content is PoseContent.POSE and pose is not None:
@@ -259,7 +261,7 @@ def list_wanted(
 
 
 def _is_by_satellites(source: DriveSource | PoseSource) -> bool:
-    return isinstance(source, PoseSource) and source.content is not PoseContent.POSE
+    return isinstance(source, PoseSource) and source.content in {PoseContent.FIX, PoseContent.VELOCITY}
 
 
 def _recorded_fields(kind: str, fields: Iterable[str]) -> tuple[str, ...]:

@@ -114,6 +114,7 @@ class Samples:
         command: ideal velocity of the command, shape (n, 3); None without commands.
         measured: ideal velocity of the measured wheels, shape (n, 3); None without encoders.
         body_commanded: whether the command was a body command.
+        is_drive_alone: whether the motion is that of the measured wheels, since no pose was recorded.
     """
 
     times: Floats
@@ -127,6 +128,7 @@ class Samples:
     command: Floats | None
     measured: Floats | None
     body_commanded: bool
+    is_drive_alone: bool = False
 
 
 def gather_samples(

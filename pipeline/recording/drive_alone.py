@@ -1,0 +1,254 @@
+"""Examination of a log without poses: its command against its measured wheels, which stand in for the pose.
+
+What the wheels do with the command is observable without a pose; what the ground does is not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.core import enumerate_texts
+from pipeline.logs import LogData
+from pipeline.recording.evidence import Length, find_wheel_unit
+from pipeline.recording.examination import Geometry, Recording, _describe, _Drive, _Examination, _is_crossed
+from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.readings import Reading
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
+from pipeline.run.signals import GROUND_UNOBSERVABLE
+from pipeline.sources import (
+    Configuration,
+    DriveForm,
+    DriveSource,
+    PoseContent,
+    PoseSource,
+    Sources,
+    Vehicle,
+)
+from pipeline.stages import Finding
+from pipeline.stages.reading import find_sideways_share
+
+_REASON = "no pose is recorded: the motion of the wheels stands in"
+
+
+def examine_drive(
+    data: LogData,
+    sources: Sources,
+    configuration: Configuration,
+    vehicle: Vehicle,
+    *,
+    is_known: bool,
+    where: str,
+) -> Recording | None:
+    """Let the measured wheels of a log without poses stand in for its pose.
+
+    Args:
+        data: columns of every candidate for a command and for wheels.
+        sources: candidates by type and name, the likeliest first; no pose.
+        configuration: the user's.
+        vehicle: the log's, or any of its kind.
+        is_known: whether its geometry is known.
+        where: the log, for error messages.
+
+    Returns:
+        The recording; None if no candidate for wheels turns, or there is no command.
+    """
+    commands = [one for one in (sources.command, *sources.others.get("command", ())) if one is not None]
+    if vehicle.kinematics.has_inputs("sideways") or any(
+        isinstance(one, DriveSource) and find_sideways_share(data.topics, one) for one in commands
+    ):
+        # Of its motion to the side only the wheels of a known vehicle show anything.
+        return _take_by_name(sources, configuration) if is_known else None
+    return _DriveExamination(data, sources, configuration, vehicle, is_known=is_known, where=where).stand_in()
+
+
+def _take_by_name(sources: Sources, configuration: Configuration) -> Recording | None:
+    """The recording with the wheels that were chosen by type and name."""
+    if sources.wheels is None or sources.command is None:
+        return None
+    return Recording(_replace_pose(sources, sources.wheels), configuration, (_report_ground(sources.wheels),))
+
+
+def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
+    """Sources with these wheels in the place of a pose, and without a gyro, which measures the ground."""
+    ranked = (sources.wheels, *sources.others.get("wheels", ()))
+    others = tuple(one for one in ranked if isinstance(one, DriveSource) and one != wheels)
+    pose = PoseSource(wheels.signals[0].topic, _REASON, content=PoseContent.WHEELS, wheels=wheels)
+    return replace(sources, wheels=None, pose=pose, imu=None, others={**sources.others, "wheels": others})
+
+
+def _report_ground(wheels: DriveSource) -> Finding:
+    text = (
+        f"the log holds no pose: the motion of the wheels ({wheels}) stands in for it, so that the "
+        "drivetrain (delays, gains and limits between commands and wheels) is diagnosed; what the "
+        "ground does is not observable, and slip in these results is the difference between "
+        "commanded and measured wheels"
+    )
+    return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
+
+
+class _DriveExamination(_Examination):
+    """One log without poses."""
+
+    def stand_in(self) -> Recording | None:
+        """See `examine_drive`."""
+        wheels, motion = self._find_wheels()
+        if wheels is None or motion is None:
+            return None
+        commands = self._read_commands(motion, wheels)
+        self.sources = replace(self.sources, wheels=wheels.source)
+        command, _ = self._choose_roles(commands)
+        if command is None:
+            return None
+        steered = wheels.reading.form == "steering"
+        if wheels.reading.form == "sides":
+            self._report_dead_side(wheels)
+            self._find_unit(wheels, command)
+        if not self.findings or self.findings[-1].severity != "error":
+            self._report_opposite(command, wheels)
+        sources = replace(self.sources, command=command.source)
+        return Recording(
+            _replace_pose(sources, wheels.source),
+            self._complete(),
+            (*self.findings, _report_ground(wheels.source)),
+            "ackermann" if steered else "",
+            self._measure_lengths(command, wheels),
+            tuple(_describe(one.reading) for one in commands),
+            any(one.is_sure for one in commands),
+        )
+
+    # Signals.
+
+    def _find_wheels(self) -> tuple[_Drive | None, Motion | None]:
+        """The first candidate for wheels that turn, and their motion in its own units."""
+        ranked = (self.sources.wheels, *self.sources.others.get("wheels", ()))
+        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+            for kind in ("ackermann", "differential"):
+                if kind == "ackermann" and source.form is not DriveForm.JOINTS:
+                    continue
+                section = self.configuration.wheels
+                reading = self._read(source, is_measured=True, kind=kind, section=section)
+                if reading is None or not reading.inputs:
+                    continue
+                if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
+                    continue
+                motion = _roll(reading)
+                if motion is not None:
+                    return _Drive(source, reading, number, is_measured=True), motion
+        return None, None
+
+    def _read_commands(self, motion: Motion, wheels: _Drive) -> list[_Drive]:
+        """Candidates for the command, fitted to the motion of the wheels."""
+        taken = {signal.topic for signal in wheels.source.signals}
+        ranked = (self.sources.command, *self.sources.others.get("command", ()))
+        drives = []
+        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+            if taken & {signal.topic for signal in source.signals}:
+                continue
+            reading = self._read(source, is_measured=False, section=self.configuration.command)
+            if reading is not None:
+                reading.explain(motion)
+                drives.append(_Drive(source, reading, number, is_measured=False))
+        return drives
+
+    # Faults.
+
+    def _report_dead_side(self, wheels: _Drive) -> None:
+        sides = {"left": wheels.reading.first, "right": wheels.reading.second}
+        dead = [name for name, side in sides.items() if side is None or not side.moves]
+        if len(dead) == 1:
+            text = (
+                f"the {dead[0]} wheels' encoder reads the same throughout while the other wheels turn: it is "
+                "dead, and the log holds no pose in its place"
+            )
+            self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead[0]}"))
+
+    def _report_opposite(self, command: _Drive, wheels: _Drive) -> None:
+        """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
+        explained = command.reading.explained
+        if explained is None or not command.is_sure:
+            return
+        if _is_crossed(command):
+            what = "one side of the wheels runs backward against its command"
+            mend = 'reversed = "left" or "right" under [wheels] in run.toml'
+            margin: float | None = explained.sign_margin
+        else:
+            against = [
+                verb
+                for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
+                if sign < 0
+            ]
+            if not against:
+                return
+            what = f"the wheels {enumerate_texts(against)} the other way than {command.source} commands"
+            changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
+            change = changes[against[0]] if len(against) == 1 else "sign = -1"
+            if wheels.reading.form != "sides":
+                change = "sign = -1"
+            mend, margin = f"{change} under [wheels] in run.toml", explained.moves
+        text = (
+            f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
+            "command or the polarity of the motors, which are to be corrected on the robot"
+        )
+        self.findings.append(
+            Finding("signs_contradict", "error", text, where="command, wheels", value=margin)
+        )
+
+    # Units and geometry.
+
+    def _find_unit(self, wheels: _Drive, command: _Drive) -> None:
+        """Unit of the wheel speeds by the radius that each would mean."""
+        explained = command.reading.explained
+        if (
+            self.is_known
+            or self.configuration.wheels.unit is not None
+            or explained is None
+            or not command.sign("ahead")
+            or command.reading.form == "sides"
+            or wheels.source.signals[0].unit
+        ):
+            return
+        unit = find_wheel_unit(1.0 / abs(float(explained.ahead.gains[0])), str(wheels.source))
+        if unit != "rad/s":
+            what = f"the wheel speeds of {wheels.source} are in {unit}"
+            self._correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
+
+    def _measure_lengths(self, command: _Drive, wheels: _Drive) -> Geometry:
+        """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
+        explained, form = command.reading.explained, wheels.reading.form
+        if explained is None or not command.is_sure or form == "body" or command.reading.form == "sides":
+            return Geometry()
+        fits = {"ahead": explained.ahead, "turned": explained.turned}
+        gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
+        errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
+        if _is_crossed(command):
+            # With one side reversed, the mean of the sides is half their difference, and the other way round.
+            gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
+            errors = {"ahead": errors["turned"], "turned": errors["ahead"]}
+        elif not command.sign("ahead"):
+            return Geometry()
+        value = self._wheel_factor() / gains["ahead"]
+        radius, width = Length(value, errors["ahead"] * value), None
+        if command.reading.form == "body" and errors["turned"] < 1.0 / CLEAR:
+            value = gains["turned"] / gains["ahead"]
+            width = Length(value, value * float(np.hypot(errors["ahead"], errors["turned"])))
+        if form == "steering":
+            return Geometry(rolled=radius, wheelbase=width)
+        return Geometry(radius=radius, track=width)
+
+
+def _roll(wheels: Reading) -> Motion | None:
+    """Increments of wheels that roll without slip, in their own units; None if they hardly turn."""
+    start = max(float(one.times[0]) for one in wheels.inputs)
+    end = min(float(one.times[-1]) for one in wheels.inputs)
+    if end - start < FEWEST_STEPS * STEP_S:
+        return None
+    edges = np.arange(start, end, STEP_S)
+    steps = Steps(edges[:-1], edges[1:])
+    steps = steps.take(np.logical_and.reduce([one.is_there(steps) for one in wheels.inputs]))
+    if steps.start.size < FEWEST_STEPS:
+        return None
+    ahead, turned = wheels.columns(steps, 0.0, 0.0, crossed=False)
+    moved = np.asarray(ahead, dtype=np.complex128)
+    return Motion(steps, moved, np.zeros(turned.size), turned, "z")
