@@ -1,8 +1,8 @@
 """Logs written anew with one thing changed: the same medians, or a finding that names the change.
 
-Every log is analyzed as it is and with every change of `rewritten_logs.py` that it allows. An answer is `same`
-where the medians of slip differ by less than 2 %, `told` where a finding names the change (and, where the change
-is undone, the medians stay the same), `WRONG` otherwise.
+Every log is analyzed as it is and with every change of `rewritten_logs.py` that it allows. An answer is
+`same` where the medians of slip differ by less than 2 %, `told` where a finding names the change (and, where
+the change is undone, the medians stay the same), `WRONG` otherwise.
 """
 
 from __future__ import annotations
@@ -67,7 +67,8 @@ def judge(change: Change, before: Answer, after: Answer) -> str:
     """`same`, `told`, or `WRONG`."""
     shared = before.medians.keys() & after.medians.keys()
     same = bool(shared) and all(
-        abs(after.medians[name] - before.medians[name]) <= _SAME * before.medians[name] + 1e-4 for name in shared
+        abs(after.medians[name] - before.medians[name]) <= _SAME * before.medians[name] + 1e-4
+        for name in shared
     )
     news = set(after.told.splitlines()) - set(before.told.splitlines())
     if change.told and any(re.search(change.told, text) for text in news):

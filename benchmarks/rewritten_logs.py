@@ -1,7 +1,7 @@
 """Logs that are written anew with one thing changed, by the libraries of MCAP alone.
 
-What the change does to the answer is known beforehand: nothing, or it is to be told. Nothing here knows how the
-program reads a log or what it looks for.
+What the change does to the answer is known beforehand: nothing, or it is to be told. Nothing here knows how
+the program reads a log or what it looks for.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -51,6 +51,9 @@ IN_FRAME = {
         "pose": {"type": "object", "properties": {"position": _NUMBERS, "orientation": _NUMBERS}},
     },
 }
+
+Content: TypeAlias = Any
+"""A decoded message, or a part of it."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,13 @@ def write(log: Log, path: Path) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         schemas = {name: writer.register_msgdef(name, text) for name, text in log.definitions.items()}
-        inner = writer._writer  # noqa: SLF001 - the library's writer of ROS 2 has no other encoding
+        inner = writer._writer  # the library's writer of ROS 2 has no other encoding
         channels: dict[str, int] = {}
         for one in log.messages:
             if one.kind in schemas:
-                writer.write_message(one.topic, schemas[one.kind], one.content, one.log_time, one.publish_time)
+                writer.write_message(
+                    one.topic, schemas[one.kind], one.content, one.log_time, one.publish_time
+                )
                 continue
             if one.topic not in channels:
                 schema = inner.register_schema(one.kind, "jsonschema", json.dumps(IN_FRAME).encode())
@@ -160,19 +165,19 @@ def list_changes() -> list[Change]:
         Change("an arm beside the wheels", _add_arm),
         Change("20 s not recorded", _cut, "gap|too short|segment|paus|silen"),
         Change("poses turned by 90 degrees", _turn_poses, "heading_deg"),
-        Change("right wheels reversed", lambda log, roles: _scale_wheels(log, roles, right=-1.0), "right wheels' encoder counts backward"),
+        Change("right wheels reversed", _on_wheels(1.0, -1.0), "right wheels' encoder counts backward"),
         Change("base_link renamed", _rename),
         Change("poses in JSON", _to_json),
         Change("a measured twist beside", _add_twist),
         Change("clock back by 10 s", _step_clock, "put back|clock"),
         Change("sides exchanged", _exchange, "exchanged"),
-        Change("both encoders backward", lambda log, roles: _scale_wheels(log, roles, -1.0, -1.0), "counts? backward"),
-        Change("left encoder dead", lambda log, roles: _scale_wheels(log, roles, left=0.0), "left wheels' encoder"),
-        Change("wheels in rpm", lambda log, roles: _scale_wheels(log, roles, *(30.0 / math.pi,) * 2), "rpm"),
-        Change("wheels x 3", lambda log, roles: _scale_wheels(log, roles, 3.0, 3.0), "radius|unit"),
-        Change("command reversed", lambda log, roles: _scale_command(log, roles, -1.0, 1.0), "linear.x|sign"),
-        Change("command's turn reversed", lambda log, roles: _scale_command(log, roles, 1.0, -1.0), "angular.z|exchanged|sign"),
-        Change("yaw rate in degrees", lambda log, roles: _scale_command(log, roles, 1.0, 180.0 / math.pi), "deg/s"),
+        Change("both encoders backward", _on_wheels(-1.0, -1.0), "counts? backward"),
+        Change("left encoder dead", _on_wheels(0.0, 1.0), "left wheels' encoder"),
+        Change("wheels in rpm", _on_wheels(30.0 / math.pi, 30.0 / math.pi), "rpm"),
+        Change("wheels x 3", _on_wheels(3.0, 3.0), "radius|unit"),
+        Change("command reversed", _on_command(-1.0, 1.0), "linear.x|sign"),
+        Change("command's turn reversed", _on_command(1.0, -1.0), "angular.z|exchanged|sign"),
+        Change("yaw rate in degrees", _on_command(1.0, 180.0 / math.pi), "deg/s"),
     ]  # fmt: skip
 
 
@@ -181,7 +186,7 @@ def _each(log: Log, change: Callable[[Message], Message | None]) -> Log:
     return replace(log, messages=[one for one in made if one is not None])
 
 
-def _copy(content: Any) -> Any:
+def _copy(content: Content) -> Content:
     """A message as nested dictionaries, which the library writes as well."""
     if hasattr(content, "__slots__"):
         return {name: _copy(getattr(content, name)) for name in content.__slots__}
@@ -206,7 +211,8 @@ def _add_arm(log: Log, roles: Roles) -> Log | None:
         made.append(one)
         if one.topic == topic and index % 2:
             content = _copy(one.content) | {
-                "name": ["arm_joint_1", "gripper"], "position": [0.1, 0.2], "velocity": [0.0, 0.0], "effort": [],
+                "name": ["arm_joint_1", "gripper"], "effort": [],
+                "position": [0.1, 0.2], "velocity": [0.0, 0.0],
             }  # fmt: skip
             made.append(Message(topic, kind, content, one.log_time + 1_000_000, one.publish_time + 1_000_000))
     return replace(log, messages=made)
@@ -214,13 +220,13 @@ def _add_arm(log: Log, roles: Roles) -> Log | None:
 
 def _cut(log: Log, _: Roles) -> Log | None:
     first, last = log.length
-    if last - first < 60e9:  # noqa: PLR2004 - the rest must be long enough
+    if last - first < 60e9:
         return None
     start = first + 0.4 * (last - first)
     return _each(log, lambda one: None if start <= one.log_time < start + 20e9 else one)
 
 
-def _find_pose(content: Any) -> Any:
+def _find_pose(content: Content) -> Content:
     """The dictionary with position and orientation."""
     while isinstance(content, dict) and "orientation" not in content:
         content = content.get("pose")
@@ -248,8 +254,12 @@ def _has_pose(log: Log, roles: Roles) -> bool:
     return first is not None and _find_pose(_copy(first.content)) is not None
 
 
-def _scale_wheels(log: Log, roles: Roles, left: float = 1.0, right: float = 1.0) -> Log | None:
-    return _map_sides(log, roles.wheels, lambda values: (left * values[0], right * values[1]))
+def _on_wheels(left: float, right: float) -> Callable[[Log, Roles], Log | None]:
+    return lambda log, roles: _scale_sides(log, roles.wheels, (left, right))
+
+
+def _on_command(ahead: float, turn: float) -> Callable[[Log, Roles], Log | None]:
+    return lambda log, roles: _scale_command(log, roles, ahead, turn)
 
 
 def _exchange(log: Log, roles: Roles) -> Log | None:
@@ -267,27 +277,21 @@ def _exchange(log: Log, roles: Roles) -> Log | None:
             return replace(one, content=content)
         return replace(one, topic=swap(one.topic)) if one.topic in roles.wheels else one
 
-    if joints is None and len(roles.wheels) != 2:  # noqa: PLR2004 - two sides
+    if joints is None and len(roles.wheels) != 2:
         return None
     return _each(log, change)
 
 
-def _map_sides(
-    log: Log, topics: tuple[str, ...], change: Callable[[tuple[float, float]], tuple[float, float]]
-) -> Log | None:
+def _scale_sides(log: Log, topics: tuple[str, ...], factors: tuple[float, float]) -> Log | None:
     """Speeds (and positions) of the sides: of joints by name, or of two topics of one number."""
     joints = _joints(log, Roles("", topics, ()))
-    if joints is None and len(topics) != 2:  # noqa: PLR2004 - two sides
+    if joints is None and len(topics) != 2:
         return None
-    factors = change((1.0, 1.0))
 
     def scale(one: Message) -> Message:
         if one.topic == joints:
             content = _copy(one.content)
-            by_name = [
-                1.0 if "steer" in name else factors[0] if "left" in name else factors[1] if "right" in name else 1.0
-                for name in content["name"]
-            ]
+            by_name = [_find_factor(name, factors) for name in content["name"]]
             for field in ("velocity", "position"):
                 if len(content[field]) == len(by_name):
                     content[field] = [value * by for value, by in zip(content[field], by_name, strict=True)]
@@ -297,9 +301,18 @@ def _map_sides(
             return replace(one, content={"data": one.content.data * factor})
         return one
 
-    if joints is None and not all(hasattr(one.content, "data") for one in log.messages if one.topic in topics):
+    if joints is None and not all(
+        hasattr(one.content, "data") for one in log.messages if one.topic in topics
+    ):
         return None
     return _each(log, scale)
+
+
+def _find_factor(joint: str, factors: tuple[float, float]) -> float:
+    """Factor of a joint by its side; those that steer keep their angle."""
+    sides = {"left": factors[0], "right": factors[1]}
+    found = [factor for side, factor in sides.items() if side in joint and "steer" not in joint]
+    return found[0] if found else 1.0
 
 
 def _scale_command(log: Log, roles: Roles, ahead: float, turn: float) -> Log | None:
@@ -322,7 +335,7 @@ def _scale_command(log: Log, roles: Roles, ahead: float, turn: float) -> Log | N
 
 
 def _rename(log: Log, _: Roles) -> Log | None:
-    def rename(content: Any) -> Any:
+    def rename(content: Content) -> Content:
         if isinstance(content, dict):
             return {name: rename(value) for name, value in content.items()}
         if isinstance(content, list):
@@ -356,7 +369,7 @@ def _to_json(log: Log, roles: Roles) -> Log | None:
     return _each(log, change)
 
 
-def _yaw(pose: Any) -> float:
+def _yaw(pose: Content) -> float:
     x, y, z, w = (pose["orientation"][axis] for axis in "xyzw")
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -386,7 +399,9 @@ def _add_twist(log: Log, roles: Roles) -> Log | None:
             header = {"stamp": stamp, "frame_id": "base_link"}
             kind = "geometry_msgs/msg/TwistStamped"
             made.append(
-                Message("/body_motion", kind, {"header": header, "twist": twist}, one.log_time, one.publish_time)
+                Message(
+                    "/body_motion", kind, {"header": header, "twist": twist}, one.log_time, one.publish_time
+                )
             )
         before = (time, pose)
     definitions = {"geometry_msgs/msg/TwistStamped": TWIST} | log.definitions
@@ -395,7 +410,7 @@ def _add_twist(log: Log, roles: Roles) -> Log | None:
 
 def _step_clock(log: Log, _: Roles) -> Log | None:
     first, last = log.length
-    if last - first < 60e9:  # noqa: PLR2004 - both passes and the rest must be long enough
+    if last - first < 60e9:
         return None
     middle = first + 0.5 * (last - first)
 
@@ -405,12 +420,14 @@ def _step_clock(log: Log, _: Roles) -> Log | None:
         content = _copy(one.content)
         for stamp in _list_stamps(content):
             stamp["sec"] -= 10
-        return replace(one, content=content, log_time=one.log_time - 10**10, publish_time=one.publish_time - 10**10)
+        return replace(
+            one, content=content, log_time=one.log_time - 10**10, publish_time=one.publish_time - 10**10
+        )
 
     return _each(log, change)
 
 
-def _list_stamps(content: Any) -> Iterator[dict[str, int]]:
+def _list_stamps(content: Content) -> Iterator[dict[str, int]]:
     if isinstance(content, dict):
         for name, value in content.items():
             if name == "stamp" and isinstance(value, dict):

@@ -497,7 +497,8 @@ def _compare(
         if ratings and ratings[0].same_as:
             text = (
                 f"the pose of {ratings[0].source} is wheel odometry, not a localization: it is that of "
-                f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; record a "
+                f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; "
+                "record a "
                 "localization (lidar, camera, satellites, motion capture)"
             )
             findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
@@ -577,7 +578,8 @@ def _fit_vehicle(
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
         text = (
-            f"not used: {sources.wheels}: the vehicle is not known, and its motion does not show the radius of its "
+            f"not used: {sources.wheels}: the vehicle is not known, and its motion does not show the "
+            "radius of its "
             "wheels (--wheel-radius gives it)"
         )
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))

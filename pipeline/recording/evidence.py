@@ -1,8 +1,8 @@
-"""Which reading of a log's signals makes one rigid body move as it was asked to, and whether another is as likely.
+"""Roles, frame, signs, units and lengths of a log by one likelihood.
 
-The pose gives increments of the body. Every other signal is a reading of them with free gains and a free delay. All
-questions - role, sign, side, unit, frame of the pose, geometry - are answered by one likelihood, with names and types as
-priors in the same unit (nats).
+The question is always which reading of the signals makes one rigid body move as it was asked to, and whether
+another is as likely. The pose gives increments of the body; every other signal is a reading of them with free gains
+and a free delay; names and types are priors in the same unit (nats).
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, join_parts
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Steps, compare, fit
@@ -39,7 +39,8 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
         readings: readings that were fitted to it.
 
     Returns:
-        The motion in its likeliest frame, and Vuong's statistic against the recorded one; zero where that one stays.
+        The motion in its likeliest frame, and Vuong's statistic against the recorded one; zero where that one
+        stays.
     """
     fitted = [one for one in readings if one.form != "gyro" and one.explained is not None]
     known = [one for one in fitted if one.explained is not None and one.explained.is_sure]
@@ -261,7 +262,7 @@ def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None
         return None
     rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
     turned = rolled[1] - rolled[0]
-    motion = Motion(steps, 0.5 * (rolled[0] + rolled[1]) + 0j, np.zeros(turned.size), turned, "z")
+    motion = Motion(steps, join_parts(0.5 * (rolled[0] + rolled[1]), 0.0), np.zeros(turned.size), turned, "z")
     made = Reading("body", command.name, command.first, command.second).explain(motion)
     if made is None or not made.is_sure or made.crossed:
         return None
@@ -269,7 +270,7 @@ def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None
     errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
     radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
     track = (
-        Length(bent / ahead, bent / ahead * float(np.hypot(*errors)))
+        Length(bent / ahead, bent / ahead * float(np.hypot(errors[0], errors[1])))
         if radius is not None and bent > 0.0 and 1.0 / errors[1] > CLEAR
         else None
     )
@@ -282,7 +283,7 @@ def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
     errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (wheels.ahead, wheels.turned)]
     radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
     track = (
-        Length(ahead / bent, ahead / bent * float(np.hypot(*errors)))
+        Length(ahead / bent, ahead / bent * float(np.hypot(errors[0], errors[1])))
         if radius is not None and wheels.sign("turned")
         else None
     )

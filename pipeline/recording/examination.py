@@ -295,7 +295,7 @@ class _Examination:
         return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
 
     def _read_by_motion(self, source: DriveSource, motion: Motion) -> Reading | None:
-        """Joints whose names show no side, each put on the side on which the motion turns it; None without."""
+        """Joints whose names show no side, each put on the side on which it turns; None without."""
         columns = self.extraction.columns.get(source.signals[0].topic)
         if (
             source.form is not DriveForm.JOINTS
@@ -320,7 +320,10 @@ class _Examination:
         if not (sides["left"] and sides["right"]):
             return None
         names = {side: ", ".join(found) for side, found in sides.items()}
-        what = f"the joints of {source} do not name their side; by the motion {names['left']} are left and {names['right']} right"
+        what = (
+            f"the joints of {source} do not name their side; by the motion {names['left']} are left and "
+            f"{names['right']} right"
+        )
         line = "; ".join(
             f"{side} = [{', '.join(repr(one) for one in found)}]" for side, found in sides.items()
         )
@@ -340,7 +343,8 @@ class _Examination:
             return motion
         if turned.flip:
             text = (
-                f"the headings of {source} turn against its own path: its frame is of the other hand; correct what "
+                f"the headings of {source} turn against its own path: its frame is of the other hand; "
+                "correct what "
                 "publishes it"
             )
             self.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
@@ -404,7 +408,7 @@ class _Examination:
         )
 
     def _name_sources(self, command: _Drive | None, wheels: _Drive | None) -> Sources:
-        """The sources with these roles, and what was said of a choice by name that no longer holds left out."""
+        """The sources with these roles, without notes on a choice by name that no longer holds."""
         made = self.sources
         for role, drive in (("command", command), ("wheels", wheels)):
             before, source = getattr(made, role), None if drive is None else drive.source
@@ -421,13 +425,14 @@ class _Examination:
 
     def _tell_role(self, role: str, chosen: _Drive, other: _Drive) -> None:
         text = (
-            f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the first later, and "
+            f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the "
+            "first later, and "
             f"the second measures it or is not followed; [{role}] in run.toml names another"
         )
         self.findings.append(Finding("role_by_motion", "info", text, where=role))
 
     def _read_again(self, wheels: _Drive, motion: Motion, kind: str = "differential") -> bool:
-        """Read the wheels as corrected so far, or of another kind of vehicle; whether the body turns by them."""
+        """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
         section = self._complete().wheels if "wheels" in self.changes else None
         reading = self._read(wheels.source, is_measured=True, kind=kind, section=section)
         made = None if reading is None else reading.explain(motion)
@@ -480,7 +485,8 @@ class _Examination:
                 else "as far as commands and poses tell"
             )
             text = (
-                f"the {side} side of the drive runs backward against its command, {also}: the polarity of its motor "
+                f"the {side} side of the drive runs backward against its command, {also}: the polarity of "
+                "its motor "
                 "is wrong; exchange its wires, or turn its sign in the driver"
             )
             self.findings.append(
@@ -496,7 +502,8 @@ class _Examination:
             return False
         dead, other = sorted(moves, key=lambda name: moves[name])
         text = (
-            f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: it is dead (take "
+            f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: it is "
+            "dead (take "
             f"--input command, or correct [wheels] {dead})"
         )
         self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
@@ -534,101 +541,57 @@ class _Examination:
 
     def _tell_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
         source = self.sources.pose
-        if not offset and up == "z":
-            return
-        agree = [
-            name
-            for name in ("command", "wheels", "gyro")
-            if any(key[0] == name and sign for key, sign in signs.items())
-        ]
-        words = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
-        who = " and ".join(words[name] for name in agree) or "the other signals"
-        lines: dict[str, object] = {}
+        there = {name for (name, _), sign in signs.items() if sign}
+        who = " and ".join(word for name, word in _AGREE.items() if name in there) or "the other signals"
         if up != "z":
-            lines["up"] = up
-            what = (
-                "their z axis points down (north, east, down)"
-                if up == "-z"
-                else f"the {up.removeprefix('-')} axis of their frame points {'down' if up.startswith('-') else 'up'}, as "
-                "of motion capture or of a camera's optical frame: the body turns about it"
-            )
-            self._correct(
-                "pose", f"in the poses of {source} {what}, as {who} show", f'up = "{up}"', {"up": up}
-            )
+            way, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
+            what = f"the {axis} axis of the poses of {source} points {way}"
+            if axis == "z":
+                what += " (north, east, down)"
+            else:
+                what += ", as of motion capture or of a camera's optical frame: the body turns about it"
+            self._correct("pose", f"{what}, as {who} show", f'up = "{up}"', {"up": up})
         if offset:
-            lines["heading_deg"] = offset
+            side = "right" if offset > 0.0 else "left"
             what = (
-                f"the poses of {source} look to the rear where {who} drive ahead (a sensor mounted backward, or "
-                "base_link points to the rear)"
-                if abs(offset) == 180.0  # noqa: PLR2004 - half a turn
-                else f"the heading of {source} is {abs(offset):.0f} degrees to the "
-                f"{'right' if offset > 0.0 else 'left'} of the course on which {who} drive"
+                f"the heading of {source} is {abs(offset):.0f} degrees to the {side} of the course of {who}"
             )
+            if abs(offset) == _HALF_TURN:
+                what = (
+                    f"the poses of {source} look to the rear where {who} drive ahead (a sensor that is "
+                    "mounted "
+                    "backward, or base_link points to the rear)"
+                )
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
     def _tell_fault(self, fault: str, command: _Drive | None, wheels: _Drive | None) -> None:
-        if fault == "gyro":
+        drive = wheels if fault.startswith("wheels") else command
+        if fault == "gyro" or drive is None:
             return
-        if fault.startswith("command"):
-            axes = {"command_ahead": "ahead", "command_turned": "turned"}.get(fault, "both")
-            what = {
-                "ahead": "backward where the vehicle drives forward: the sign of linear.x, or of both motors, is wrong",
-                "turned": "the other way than the vehicle turns: the sign of angular.z or of the steering is inverted, or "
-                "left and right are exchanged after it",
-                "both": "the other way in everything: both motors are wired backward, or the sign of the command is wrong",
-            }[axes]
-            name = "" if command is None else str(command.source)
-            text = f"the commands of {name} point {what}"
-            self.findings.append(Finding("command_reversed", "error", text, where="command"))
-            return
-        if wheels is not None and (
-            wheels.reading.form == "sides" or (wheels.reading.form == "steering" and fault == "wheels_both")
-        ):
-            change: dict[str, object] = {}
-            what = "left and right encoders are exchanged"
-            if fault == "wheels_both":
-                change, what = {"sign": -1}, "both encoders count backward"
-                if wheels.reading.form == "steering":
-                    what = f"the speed of {wheels.source} counts backward"
-            elif fault == "wheels_exchanged":
-                change = {"exchanged": True}
-            else:
-                change, what = (
-                    {"sign": -1, "exchanged": True},
-                    "both encoders count backward, and are exchanged",
-                )
+        change: dict[str, object] = dict(_CHANGES.get(fault, {}))
+        is_car = drive.reading.form == "steering"
+        if change and (drive.reading.form == "sides" or (is_car and fault == "wheels_both")):
+            what = f"the speed of {drive.source} counts backward" if is_car else _FAULTS[fault]
             line = ", ".join(f"{key} = {str(value).lower()}" for key, value in change.items())
             self._correct("wheels", what, line, change)
             return
-        name = "the wheels" if wheels is None else str(wheels.source)
-        text = f"{name} runs the other way than commands and poses: its sign is wrong"
-        self.findings.append(Finding("wheels_reversed", "error", text, where="wheels"))
+        role = "wheels" if drive is wheels else "command"
+        text = f"{drive.source} contradicts all other signals: {_FAULTS[fault]}"
+        self.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
 
     def _tell_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
         """Two signals that contradict each other, with what mends the one and the other."""
-        words = {
-            "pose_backward": "the frame of the poses points to the rear, as that of a sensor that is mounted backward: "
-            "heading_deg = 180 under [pose] in run.toml",
-            "pose_mirrored": 'the poses\' frame is of the other hand, as north, east, down: up = "-z" under [pose] in '
-            "run.toml",
-            "command_ahead": "the sign of linear.x is wrong where it is sent",
-            "command_turned": "the sign of angular.z or of the steering is inverted where it is sent",
-            "command_both": "the sign of the command is wrong, or both motors are wired backward",
-            "wheels_both": "both encoders count backward: sign = -1 under [wheels] in run.toml",
-            "wheels_exchanged": "left and right encoders are exchanged: exchanged = true under [wheels] in run.toml",
-            "wheels_exchanged_both": "both encoders count backward and are exchanged",
-            "gyro": "the gyro is mounted upside down",
-        }
         against = sorted({name for (name, _), sign in signs.items() if sign < 0})
         verbs = {"ahead": "drive", "turned": "turn"}
         axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
+        remedies = {fault: f"{text}{_REMEDIES.get(fault, '')}" for fault, text in _FAULTS.items()}
         options = "; or ".join(
-            " and ".join(words[name] for name in names) for names in (made.faults, *made.rivals)
+            " and ".join(remedies[name] for name in names) for names in (made.faults, *made.rivals)
         )
         text = (
-            f"the {' and the '.join(_PLURAL[name] for name in against)} and the poses "
-            f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of them is "
-            f"wrong: either {options}"
+            f"{' and '.join(_AGAINST[name] for name in against)} and the poses "
+            f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of "
+            f"them is wrong: either {options}"
         )
         self.findings.append(Finding("signs_contradict", "error", text, where=f"{against[0]}, pose"))
 
@@ -753,7 +716,33 @@ class _Examination:
         return msgspec.structs.replace(self.configuration, **sections)
 
 
-_PLURAL = {"command": "commands", "wheels": "measured wheels", "gyro": "gyro"}
+_HALF_TURN = 180.0
+_AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
+_AGAINST = {"command": "the commands", "wheels": "the measured wheels", "gyro": "the gyro"}
+_FAULTS = {
+    "pose_backward": "the frame of the poses points to the rear, as that of a sensor that is mounted "
+    "backward",
+    "pose_mirrored": "the poses' frame is of the other hand, as north, east, down",
+    "command_ahead": "the sign of linear.x is wrong where it is sent, or both motors are reversed",
+    "command_turned": "the sign of angular.z or of the steering is inverted, or left and right are exchanged",
+    "command_both": "its sign is wrong where it is sent, or both motors are wired backward",
+    "wheels_both": "both encoders count backward",
+    "wheels_exchanged": "left and right encoders are exchanged",
+    "wheels_exchanged_both": "both encoders count backward, and are exchanged",
+    "gyro": "the gyro is mounted upside down",
+}
+_CHANGES: Mapping[str, Mapping[str, object]] = {
+    "wheels_both": {"sign": -1},
+    "wheels_exchanged": {"exchanged": True},
+    "wheels_exchanged_both": {"sign": -1, "exchanged": True},
+}
+_REMEDIES = {
+    "pose_backward": " (heading_deg = 180 under [pose] in run.toml)",
+    "pose_mirrored": ' (up = "-z" under [pose] in run.toml)',
+    "wheels_both": " (sign = -1 under [wheels] in run.toml)",
+    "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
+    "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",
+}
 
 
 def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:

@@ -1,4 +1,7 @@
-"""Motion of one rigid body by its poses: increments ahead, to the left and of the heading over short steps."""
+"""Motion of one rigid body by its poses: increments ahead, to the left and of the heading.
+
+They are measured over steps of a tenth of a second, or over those of the poses.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,7 @@ from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.recording.score import FEWEST_STEPS, Steps
 
 STEP_S = 0.1
+_Z = 2
 _PLANES = ((1, 2), (0, 2), (0, 1))
 """Axes of the plane across each axis, the body's own x first where it lies in the plane."""
 
@@ -46,7 +50,8 @@ class Motion:
     def body(self) -> Complex:
         """Displacements in the vehicle's frame [m]: ahead + 1j * left."""
         sense = -1.0 if self.flip else 1.0
-        return self.moved * np.exp(-1j * (sense * self.middle + np.radians(self.offset_deg)))
+        body: Complex = self.moved * np.exp(-1j * (sense * self.middle + np.radians(self.offset_deg)))
+        return body
 
     @property
     def yaw(self) -> Floats:
@@ -139,7 +144,8 @@ def _choose_rows(time: Floats, length: float) -> list[int]:
 def _find_plane(place: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
     """Index of the axis across the plane of motion, its name with the sign that points up, and the headings.
 
-    The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it least.
+    The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it
+    least.
     """
     before = quaternion[:-1] * np.array([-1.0, -1.0, -1.0, 1.0])
     change = rigid.multiply_quaternions(quaternion[1:], before)
@@ -148,9 +154,9 @@ def _find_plane(place: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
     apart = min(8, place.shape[0] // 4)
     reach = np.quantile(np.abs(place[apart:] - place[:-apart]), 0.8, axis=0)
     axis = int(np.argmax(turning))
-    if axis != 2 and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(reach)) == axis):
-        axis = 2
-    if axis == 2:
+    if axis != _Z and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(reach)) == axis):
+        axis = _Z
+    if axis == _Z:
         yaw = rigid.euler_from_quaternions(quaternion)[2]
     else:
         yaw = 2.0 * np.arctan2(quaternion[:, axis], quaternion[:, 3])

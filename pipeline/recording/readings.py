@@ -1,7 +1,7 @@
 """Signals that may explain a motion: a command, the wheels or a gyro, with free gains and a free delay.
 
-A reading has two inputs: speed and yaw rate of a body, speeds of the left and the right wheels, or speed and steering
-angle. They are held on a fine grid, delayed, and integrated over the steps of the motion.
+A reading has two inputs: speed and yaw rate of a body, speeds of the left and the right wheels, or speed and
+    steering angle. They are held on a fine grid, delayed, and integrated over the steps of the motion.
 """
 
 from __future__ import annotations
@@ -17,6 +17,11 @@ from pipeline.recording.motion import Motion
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
 
 GRID_S = 0.02
+_SLOW_S = 0.4
+"""Period [s] from which on a signal may be sent on changes only: then it holds until the next one."""
+_FEW_CELLS = 2.0
+"""Cells of the grid without a signal that are no gap."""
+_PAIR = 2
 _DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
 _MOST_ROWS = 2000
@@ -42,7 +47,8 @@ class Held:
         grid = np.arange(self._start, self.times[-1] + 2.0, GRID_S)
         before = np.searchsorted(self.times, grid, side="right") - 1
         period = float(np.median(np.diff(self.times)))
-        longest = np.inf if period > 0.4 or self.times.size < 60 else max(0.6, 6.0 * period)
+        is_steady = period < _SLOW_S and self.times.size > 2 * FEWEST_STEPS
+        longest = max(0.6, 6.0 * period) if is_steady else np.inf
         missing = (before < 0) | (grid - self.times[np.maximum(before, 0)] > longest)
         self._missing = np.append(0.0, np.cumsum(missing))
         self.grid = np.where(before < 0, 0.0, self.values[np.maximum(before, 0)])
@@ -61,7 +67,7 @@ class Held:
             for at in (steps.start - 0.4, steps.end)
         )
         inside = (steps.start >= self.times[0]) & (steps.end <= self.times[-1] + 1.0)
-        return np.asarray((last - first < 2.0) & inside)
+        return np.asarray((last - first < _FEW_CELLS) & inside)
 
     def lagged(self, lag: float) -> Floats:
         """The signal on its grid after a first-order lag."""
@@ -117,10 +123,12 @@ class Bent(Held):
             self._bent = np.where(at > 0, self._angle.values[np.maximum(at - 1, 0)], 0.0)
 
     def lagged(self, lag: float) -> Floats:
+        """The product on the grid, both factors after a first-order lag."""
         angle = np.clip(follow(self._bent, lag), -1.4, 1.4)
         return np.asarray(follow(self._speed.grid, lag) * np.tan(angle))
 
     def is_there(self, steps: Steps) -> Flags:
+        """Whether both factors are recorded over each step."""
         return np.asarray(super().is_there(steps) & self._angle.is_there(steps))
 
 
@@ -187,7 +195,8 @@ class Reading:
     """Two inputs that may explain a motion.
 
     Attributes:
-        form: ``body`` (speed, yaw rate), ``sides`` (left, right), ``steering`` (speed, speed times the tangent of the
+        form: ``body`` (speed, yaw rate), ``sides`` (left, right), ``steering`` (speed, speed times the
+            tangent of the
             angle) or ``gyro`` (nothing, yaw rate).
         name: for people.
         first, second: the inputs.
@@ -235,7 +244,7 @@ class Reading:
         if keep.sum() < FEWEST_STEPS:
             return None
         motion = whole.take(keep)
-        patterns = (False, True) if self.form in {"body", "sides"} and len(self.inputs) == 2 else (False,)
+        patterns = (False, True) if self.form in {"body", "sides"} and len(self.inputs) == _PAIR else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
         if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:
@@ -253,7 +262,7 @@ class Reading:
         for one in self.inputs:
             busy |= _is_large(one.integrate(steps, 0.0, 0.0) / elapsed, 0.02)
         wide = max(1, int(1.5 / float(np.median(elapsed))))
-        near = np.convolve(busy, np.ones(2 * wide + 1))[wide : wide + busy.size] > 0.5
+        near = np.convolve(busy, np.ones(2 * wide + 1))[wide : wide + busy.size] >= 1.0
         ahead, yaw = motion.body.real, motion.yaw
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 

@@ -1,9 +1,9 @@
 """Likelihood of a measured motion under one reading of the other signals.
 
-Increments of a pose are a disturbance plus differences of the localization's noise: each reading is judged by the
-innovations of an ARMA(1,1) process that is fitted to its own residuals, under Student's t with four degrees of
-freedom. Likelihoods are summed in blocks of five seconds, and two readings are compared by Vuong's statistic over the
-blocks (Vuong 1989, Econometrica 57), which needs no model of what the blocks have in common.
+Increments of a pose are a disturbance plus differences of the localization's noise: each reading is judged by
+the innovations of an ARMA(1,1) process that is fitted to its own residuals, under Student's t with four
+degrees of freedom. Likelihoods are summed in blocks of five seconds, and two readings are compared by Vuong's
+statistic over the blocks (Vuong 1989, Econometrica 57), which needs no model of what the blocks have in common.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ BLOCK_S = 5.0
 CLEAR = 3.0
 """Least Vuong statistic of a decision."""
 LEAST_NATS = 0.02
-"""Least gain in log-likelihood per step of a decision: below it a difference is certain, but of no importance."""
+"""Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
 _FREEDOM = 4.0
+_ROUNDING_S = 1e-6
 _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta in (0.0, 0.3, 0.6, 0.85)
                          if phi != theta))  # fmt: skip
 """Grid of the noise's (phi, theta)."""
@@ -48,7 +49,7 @@ class Steps:
     @cached_property
     def fresh(self) -> Flags:
         """Whether a step does not begin where the one before ended, shape (n,)."""
-        return np.append(True, np.abs(self.start[1:] - self.end[:-1]) > 1e-6)
+        return np.append(True, np.abs(self.start[1:] - self.end[:-1]) > _ROUNDING_S)
 
     @cached_property
     def block(self) -> Ints:
@@ -123,7 +124,7 @@ def _likelihoods(rest: Floats) -> tuple[float, Floats]:
 def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
     """Gains, residuals and square roots of the weights by reweighted least squares."""
     weight, gains = np.ones(values.size), np.zeros(columns.shape[1])
-    rest = values
+    rest: Floats = values
     for _ in range(rounds):
         if gains.size:
             weighted = columns * weight[:, None]
@@ -156,7 +157,7 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     design = white[:, 1:]
     gains, rest, weight = _solve(white[:, 0], design)
     scale, each_step = _likelihoods(rest)
-    blocks = np.bincount(steps.block, each_step)
+    blocks: Floats = np.bincount(steps.block, each_step).astype(np.float64)
     if not gains.size:
         return Fit(gains, gains, blocks, scale)
     inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))

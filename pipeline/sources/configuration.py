@@ -160,8 +160,8 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
         axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
-        up: axis of the poses' frames that points up, where it is not as ``axes`` says: ``y`` of motion capture,
-            ``-y`` of a camera's optical frame.
+        up: axis of the poses' frames that points up, where it is not as ``axes`` says: ``y`` of motion
+            capture, ``-y`` of a camera's optical frame.
         heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
         time: which of the message's times to use.
     """

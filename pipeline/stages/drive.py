@@ -414,11 +414,12 @@ def read_pair(
         StageError: the drive of this kind of vehicle has other inputs.
     """
     if form is DriveForm.SIDES:
-        left, right = (second, first) if section.exchanged else (first, second)
-        signs = (section.sign * (-1 if section.reversed == side else 1) for side in ("left", "right"))
-        return read_sides(
-            *(values * sign for values, sign in zip((left, right), signs, strict=True)), vehicle
-        )
+        if section.exchanged:
+            first, second = second, first
+        signs = {"left": section.sign, "right": section.sign}
+        if section.reversed is not None:
+            signs[section.reversed] *= -1
+        return read_sides(first * signs["left"], second * signs["right"], vehicle)
     if form is DriveForm.STEERING:
         return read_steering(first * section.sign, second, vehicle)
     if nominal:

@@ -303,6 +303,7 @@ class Extraction:
         return spans
 
     def poses(self) -> pl.DataFrame:
+        """Table of the poses, upright and cut into segments."""
         source, spans = self.sources.pose, self._spans
         if source is None:
             return pl.DataFrame()
@@ -505,6 +506,13 @@ class Extraction:
         )
 
     def read_drive(self, source: DriveSource | None, section: DriveSection, *, held: bool) -> pl.DataFrame:
+        """Table of a drive, in the inputs of `vehicle`; empty without one.
+
+        Args:
+            source: its topics.
+            section: units, signs and names of joints.
+            held: whether its values are commands, held until the next one.
+        """
         if source is None:
             return pl.DataFrame()
         if source.form is DriveForm.JOINTS:
@@ -629,6 +637,7 @@ class Extraction:
         return union, log_time, (a[at[0]], b[at[1]])
 
     def imu(self) -> pl.DataFrame:
+        """Table of the gyro; empty without one."""
         source = self.sources.imu
         ordered = self._ordered(source.topic) if source else None
         if ordered is None:

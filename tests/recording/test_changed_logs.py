@@ -19,7 +19,7 @@ from pipeline.simulate import simulate_case
 ROOT = Path(__file__).parents[2]
 CASES = ROOT / ".." / "shared" / "cases"
 CHANGES = {change.name: change for change in list_changes()}
-# Kinds of layouts: wheel commands beside body commands, a car by its joints, and a vehicle that nothing names.
+# Wheel commands beside body commands, a car by its joints, and a vehicle that nothing names.
 SAMPLES = ("husky_tile", "ackermann_gravel", "turtlebot4")
 QUICK = {
     ("husky_tile", "an arm beside the wheels"),
@@ -66,7 +66,8 @@ def test_a_changed_log_gives_the_same_answer_or_tells(
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("name", "change"), [(name, change) for name in SAMPLES for change in CHANGES if (name, change) not in QUICK]
+    ("name", "change"),
+    [(name, change) for name in SAMPLES for change in CHANGES if (name, change) not in QUICK],
 )
 def test_every_change_gives_the_same_answer_or_is_told(
     logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, tmp_path: Path

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
@@ -77,7 +77,8 @@ def tabulate(drive: Drive, *, turned: float = 0.0, axis: int = 2, backward: bool
     spin = {2: (zero, zero, np.sin(half)), 1: (zero, np.sin(half), zero)}[axis]
     return pl.DataFrame({
         "t": drive.time[drive.rows], "segment": np.zeros(half.size, dtype=np.int32),
-        **dict(zip("xyz", flat, strict=True)), "q_x": spin[0], "q_y": spin[1], "q_z": spin[2], "q_w": np.cos(half),
+        **dict(zip("xyz", flat, strict=True)),
+        "q_x": spin[0], "q_y": spin[1], "q_z": spin[2], "q_w": np.cos(half),
         "held": np.zeros(half.size, dtype=bool), "active": np.ones(half.size, dtype=bool),
     })  # fmt: skip
 
@@ -135,8 +136,10 @@ def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None
 
 def test_a_straight_drive_shows_a_radius_and_no_track() -> None:
     drive = draw(3)
-    straight = Drive(drive.time, drive.asked * [1.0, 0.0], drive.speed, 0.0 * drive.rate,
-                     (np.cumsum(drive.speed) * STEP)[drive.rows] + 0j, 0.0 * drive.yaw, drive.rows)  # fmt: skip
+    place = (np.cumsum(drive.speed) * STEP)[drive.rows] + 0j
+    straight = replace(
+        drive, asked=drive.asked * [1.0, 0.0], rate=0.0 * drive.rate, place=place, yaw=0.0 * drive.yaw
+    )
     made = sides(straight).explain(measured(tabulate(straight)))
     assert made is not None
     radius, track = measure_geometry(made)

@@ -29,8 +29,16 @@ def exchange(section: str, topic: str) -> str:
     ("text", "found", "line"),
     [
         (exchange("wheels", "/joint_states"), "wheels_corrected", "exchanged = true under [wheels]"),
-        ('[wheels]\ntopic = "/joint_states"\nsign = -1\n', "signs_contradict", "[wheels] in run.toml gives sign"),
-        (exchange("command", "/wheel_commands"), "command_reversed", "angular.z or of the steering is inverted"),
+        (
+            '[wheels]\ntopic = "/joint_states"\nsign = -1\n',
+            "signs_contradict",
+            "[wheels] in run.toml gives sign",
+        ),
+        (
+            exchange("command", "/wheel_commands"),
+            "command_reversed",
+            "angular.z or of the steering is inverted",
+        ),
         ('[command]\ntopic = "/controller/cmd_vel"\nsign = -1\n', "command_reversed", "the sign of linear.x"),
         ("", "", ""),
     ],
