@@ -623,7 +623,7 @@ def _take_unit_wheels(
     """
     command = chosen.sources.command
     if command is None or command.form is DriveForm.BODY:
-        why = "the wheels do not follow the commands, which would show its geometry"
+        why = "the wheels follow the commands too loosely to show its geometry"
         what = f"{problem.what}, and {why}"
         raise ConfigurationError(problem.code, what, where=problem.where, hint=problem.hint)
     needed = (*_STAND_INS,) if kind == "differential" else ("wheel_radius_m", "wheelbase_m")

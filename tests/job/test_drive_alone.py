@@ -176,9 +176,10 @@ def test_runs_with_and_without_a_pose_are_not_judged_together(unknown: Analyzed,
         ("husky_body_command", "husky", {"drive_lag": 0.3, "drive_gain": 0.9}),
         ("husky", "husky", {"drive_lag": 0.3, "transport_delay": 0.15}),
         ("ackermann", "car", {"drive_lag": 0.3, "steering_lag": 0.2}),
+        ("ackermann_status", "car", {"drive_lag": 0.3}),
         ("mecanum", "youbot", {"drive_lag": 0.3}),
     ],
-    ids=["body command", "wheel command", "car", "mecanum"],
+    ids=["body command", "wheel command", "car", "steering at once", "mecanum"],
 )
 def test_a_known_vehicle_shows_every_effect_of_its_drive(
     tmp_path: Path, layout: str, vehicle: str, effects: dict[str, float]

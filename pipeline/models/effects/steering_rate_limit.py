@@ -11,8 +11,13 @@ Source: the steering rate limit of vehicle models; Rajamani, Vehicle Dynamics an
 from dataclasses import replace
 
 from pipeline.models.effect import ACKERMANN, INF, DriveEffect, Excitation, Parameter
+from pipeline.models.effects.body_acceleration_limit import LEAST_RAMP_S
 from pipeline.models.filters import limit_rate
+from pipeline.models.parameter import Conditions
 from pipeline.run.signals import RunContext, Wheels
+
+_LARGEST_RAD = 0.6
+"""Largest steering angle of usual cars [rad]."""
 
 
 class SteeringRateLimit(DriveEffect):
@@ -39,6 +44,11 @@ class SteeringRateLimit(DriveEffect):
     confused_with = ("steering_lag", "transport_delay")
     python_state = ("turned",)
     python = "steering = turned = approach(turned, steering, {limit} * step_s)"
+
+    def is_degenerate(self, conditions: Conditions) -> bool:
+        """Whether every angle is reached within a ramp that the sampling of the wheels makes of a step."""
+        least = max(LEAST_RAMP_S, 2.0 * conditions.least_delay_s)
+        return self.values["limit"] * least >= _LARGEST_RAD
 
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
