@@ -12,7 +12,7 @@ import numpy as np
 from pipeline.core import enumerate_texts
 from pipeline.logs import LogData
 from pipeline.recording.evidence import Length, find_wheel_unit
-from pipeline.recording.examination import Geometry, Recording, _describe, _Drive, _Examination, _is_crossed
+from pipeline.recording.examination import Candidate, Examination, Geometry, Recording, describe, is_crossed
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
@@ -88,7 +88,7 @@ def _report_ground(wheels: DriveSource) -> Finding:
     return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
 
 
-class _DriveExamination(_Examination):
+class _DriveExamination(Examination):
     """One log without poses."""
 
     def stand_in(self) -> Recording | None:
@@ -114,13 +114,13 @@ class _DriveExamination(_Examination):
             (*self.findings, _report_ground(wheels.source)),
             "ackermann" if steered else "",
             self._measure_lengths(command, wheels),
-            tuple(_describe(one.reading) for one in commands),
+            tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
             any(one.is_sure for one in commands),
         )
 
     # Signals.
 
-    def _find_wheels(self) -> tuple[_Drive | None, Motion | None]:
+    def _find_wheels(self) -> tuple[Candidate | None, Motion | None]:
         """The first candidate for wheels that turn, and their motion in its own units."""
         ranked = (self.sources.wheels, *self.sources.others.get("wheels", ()))
         for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
@@ -135,10 +135,10 @@ class _DriveExamination(_Examination):
                     continue
                 motion = _roll(reading)
                 if motion is not None:
-                    return _Drive(source, reading, number, is_measured=True), motion
+                    return Candidate(source, reading, number, is_measured=True), motion
         return None, None
 
-    def _read_commands(self, motion: Motion, wheels: _Drive) -> list[_Drive]:
+    def _read_commands(self, motion: Motion, wheels: Candidate) -> list[Candidate]:
         """Candidates for the command, fitted to the motion of the wheels."""
         taken = {signal.topic for signal in wheels.source.signals}
         ranked = (self.sources.command, *self.sources.others.get("command", ()))
@@ -149,12 +149,12 @@ class _DriveExamination(_Examination):
             reading = self._read(source, is_measured=False, section=self.configuration.command)
             if reading is not None:
                 reading.explain(motion)
-                drives.append(_Drive(source, reading, number, is_measured=False))
+                drives.append(Candidate(source, reading, number, is_measured=False))
         return drives
 
     # Faults.
 
-    def _report_dead_side(self, wheels: _Drive) -> None:
+    def _report_dead_side(self, wheels: Candidate) -> None:
         sides = {"left": wheels.reading.first, "right": wheels.reading.second}
         dead = [name for name, side in sides.items() if side is None or not side.moves]
         if len(dead) == 1:
@@ -164,12 +164,12 @@ class _DriveExamination(_Examination):
             )
             self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead[0]}"))
 
-    def _report_opposite(self, command: _Drive, wheels: _Drive) -> None:
+    def _report_opposite(self, command: Candidate, wheels: Candidate) -> None:
         """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
         explained = command.reading.explained
         if explained is None or not command.is_sure:
             return
-        if _is_crossed(command):
+        if is_crossed(command):
             what = "one side of the wheels runs backward against its command"
             mend = 'reversed = "left" or "right" under [wheels] in run.toml'
             margin: float | None = explained.sign_margin
@@ -197,7 +197,7 @@ class _DriveExamination(_Examination):
 
     # Units and geometry.
 
-    def _find_unit(self, wheels: _Drive, command: _Drive) -> None:
+    def _find_unit(self, wheels: Candidate, command: Candidate) -> None:
         """Unit of the wheel speeds by the radius that each would mean."""
         explained = command.reading.explained
         if (
@@ -209,12 +209,13 @@ class _DriveExamination(_Examination):
             or wheels.source.signals[0].unit
         ):
             return
-        unit = find_wheel_unit(1.0 / abs(float(explained.ahead.gains[0])), str(wheels.source))
+        gain = 1.0 / abs(float(explained.ahead.gains[0]))
+        unit = find_wheel_unit(gain, explained.shares[0], str(wheels.source))
         if unit != "rad/s":
             what = f"the wheel speeds of {wheels.source} are in {unit}"
             self._correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
 
-    def _measure_lengths(self, command: _Drive, wheels: _Drive) -> Geometry:
+    def _measure_lengths(self, command: Candidate, wheels: Candidate) -> Geometry:
         """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
         explained, form = command.reading.explained, wheels.reading.form
         if explained is None or not command.is_sure or form == "body" or command.reading.form == "sides":
@@ -222,7 +223,7 @@ class _DriveExamination(_Examination):
         fits = {"ahead": explained.ahead, "turned": explained.turned}
         gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
         errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
-        if _is_crossed(command):
+        if is_crossed(command):
             # With one side reversed, the mean of the sides is half their difference, and the other way round.
             gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
             errors = {"ahead": errors["turned"], "turned": errors["ahead"]}

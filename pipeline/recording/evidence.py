@@ -1,8 +1,8 @@
 """Roles, frame, signs, units and lengths of a log by one likelihood.
 
 The question is always which reading of the signals makes one rigid body move as it was asked to, and whether
-another is as likely. The pose gives increments of the body; every other signal is a reading of them with free gains
-and a free delay; names and types are priors in the same unit (nats).
+another is as likely. The pose gives increments of the body; every other signal is a reading of them with free
+gains and a free delay; names and types are priors in the same unit (nats).
 """
 
 from __future__ import annotations

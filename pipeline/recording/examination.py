@@ -142,7 +142,7 @@ def examine(
     if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
         # A body that moves sideways has no course.
         return Recording(sources, configuration)
-    return _Examination(data, sources, configuration, vehicle, is_known=is_known, where=where).run()
+    return Examination(data, sources, configuration, vehicle, is_known=is_known, where=where).run()
 
 
 def _list_candidates(sources: Sources) -> list[DriveSource]:
@@ -156,7 +156,7 @@ def _list_candidates(sources: Sources) -> list[DriveSource]:
 
 
 @dataclass
-class _Drive:
+class Candidate:
     """A candidate for a command or for wheels.
 
     Attributes:
@@ -181,7 +181,7 @@ class _Drive:
         return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
 
 
-class _Examination:
+class Examination:
     """One log: its motion, its candidates, and what was decided so far."""
 
     def __init__(
@@ -241,13 +241,13 @@ class _Examination:
             tuple(self.findings),
             kind,
             self._measure(command, wheels),
-            tuple(_describe(one, roles) for one in readings),
+            tuple(describe(one, roles) for one in readings),
             any(drive.is_sure for drive in drives),
         )
 
     # Signals.
 
-    def _read_drives(self, motion: Motion) -> list[_Drive]:
+    def _read_drives(self, motion: Motion) -> list[Candidate]:
         commands = [self.sources.command, *self.sources.others.get("command", ())]
         wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
         drives, taken = [], set()
@@ -259,7 +259,7 @@ class _Examination:
                     reading = self._read_by_motion(source, motion)
                 taken.add(key)
                 if reading is not None:
-                    drives.append(_Drive(source, reading, place, is_measured))
+                    drives.append(Candidate(source, reading, place, is_measured))
         return drives
 
     def _read(
@@ -276,9 +276,14 @@ class _Examination:
             section = self.configuration.wheels if is_measured else self.configuration.command
         if source.form is DriveForm.STEERING:
             kind = "ackermann"
-        lengths = dict.fromkeys(("wheel_radius_m", "track_width_m", "wheelbase_m"), 1.0)
         self.extraction.vehicle = Vehicle(
-            id="unit", name="unit", kind=kind, units=self.vehicle.units, **lengths
+            id="unit",
+            name="unit",
+            kind=kind,
+            units=self.vehicle.units,
+            wheel_radius_m=1.0,
+            track_width_m=1.0,
+            wheelbase_m=1.0,
         )
         try:
             table = self.extraction.read_drive(source, section, held=True)
@@ -354,7 +359,7 @@ class _Examination:
 
     # Roles.
 
-    def _choose_roles(self, drives: Sequence[_Drive]) -> tuple[_Drive | None, _Drive | None]:
+    def _choose_roles(self, drives: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None]:
         """Command and wheels: those by type and name, unless the motion says otherwise."""
         if self._is_still(drives):
             for one in drives:
@@ -391,7 +396,7 @@ class _Examination:
                 wheels = wheels if _is_measured(wheels) else None
         return command, wheels
 
-    def _is_still(self, drives: Sequence[_Drive]) -> bool:
+    def _is_still(self, drives: Sequence[Candidate]) -> bool:
         """Whether the body hardly moves where the drive does: it is stuck, lifted, or another body."""
         first = self._find(drives, self.sources.command) or self._find(drives, self.sources.wheels)
         made = None if first is None else first.reading.explained
@@ -402,12 +407,12 @@ class _Examination:
         gains = max(abs(float(made.ahead.gains[0])), abs(float(made.turned.gains[0])))
         return gains < least and max(made.shares) < _EXPLAINED
 
-    def _find(self, drives: Sequence[_Drive], source: DriveSource | None) -> _Drive | None:
+    def _find(self, drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
         return next(
             (one for one in drives if source is not None and one.source.signals == source.signals), None
         )
 
-    def _name_sources(self, command: _Drive | None, wheels: _Drive | None) -> Sources:
+    def _name_sources(self, command: Candidate | None, wheels: Candidate | None) -> Sources:
         """The sources with these roles, without notes on a choice by name that no longer holds."""
         made = self.sources
         for role, drive in (("command", command), ("wheels", wheels)):
@@ -415,15 +420,12 @@ class _Examination:
             if source is None or source == before:
                 continue
             rest = [one for one in (before, *made.others.get(role, ())) if one is not None and one != source]
-            made = replace(
-                made,
-                others={**made.others, role: tuple(rest)},
-                notes=tuple(note for note in made.notes if not note.startswith(f"{role}:")),
-                **{role: source},
-            )
+            notes = tuple(note for note in made.notes if not note.startswith(f"{role}:"))
+            made = replace(made, others={**made.others, role: tuple(rest)}, notes=notes)
+            made = replace(made, command=source) if role == "command" else replace(made, wheels=source)
         return made
 
-    def _tell_role(self, role: str, chosen: _Drive, other: _Drive) -> None:
+    def _tell_role(self, role: str, chosen: Candidate, other: Candidate) -> None:
         text = (
             f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the "
             "first later, and "
@@ -431,7 +433,7 @@ class _Examination:
         )
         self.findings.append(Finding("role_by_motion", "info", text, where=role))
 
-    def _read_again(self, wheels: _Drive, motion: Motion, kind: str = "differential") -> bool:
+    def _read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
         """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
         section = self._complete().wheels if "wheels" in self.changes else None
         reading = self._read(wheels.source, is_measured=True, kind=kind, section=section)
@@ -441,7 +443,7 @@ class _Examination:
         wheels.reading = reading
         return True
 
-    def _find_kind(self, wheels: _Drive | None, motion: Motion) -> str:
+    def _find_kind(self, wheels: Candidate | None, motion: Motion) -> str:
         """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
         given = self.configuration.vehicle.list_values().get("kind")
         kind = str(given or (self.vehicle.kind if self.is_known else "ackermann"))
@@ -451,12 +453,12 @@ class _Examination:
 
     # Sides and signs.
 
-    def _tell_sides(self, command: _Drive | None, wheels: _Drive | None) -> bool:
+    def _tell_sides(self, command: Candidate | None, wheels: Candidate | None) -> bool:
         """A side that is dead or counts backward; whether one was found."""
         if wheels is not None and wheels.reading.form == "sides" and self._tell_dead(wheels):
             return True
-        of_wheels = wheels is not None and wheels.is_sure and _is_crossed(wheels)
-        of_command = command is not None and command.is_sure and _is_crossed(command)
+        of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
+        of_command = command is not None and command.is_sure and is_crossed(command)
         if of_wheels and wheels is not None and wheels.reading.explained is not None and not of_command:
             side = "right" if wheels.reading.explained.ahead.gains[0] > 0.0 else "left"
             margin = wheels.reading.explained.sign_margin
@@ -495,7 +497,7 @@ class _Examination:
             return True
         return False
 
-    def _tell_dead(self, wheels: _Drive) -> bool:
+    def _tell_dead(self, wheels: Candidate) -> bool:
         sides = dict(zip(("left", "right"), (wheels.reading.first, wheels.reading.second), strict=True))
         moves = {name: side is not None and side.moves for name, side in sides.items()}
         if any(moves.values()) == all(moves.values()):
@@ -510,7 +512,7 @@ class _Examination:
         return True
 
     def _tell_signs(
-        self, motion: Motion, command: _Drive | None, wheels: _Drive | None, gyro: Reading | None
+        self, motion: Motion, command: Candidate | None, wheels: Candidate | None, gyro: Reading | None
     ) -> None:
         signs: dict[tuple[str, Axis], int] = {}
         for name, drive in (("command", command), ("wheels", wheels)):
@@ -564,7 +566,7 @@ class _Examination:
                 )
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
-    def _tell_fault(self, fault: str, command: _Drive | None, wheels: _Drive | None) -> None:
+    def _tell_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
         drive = wheels if fault.startswith("wheels") else command
         if fault == "gyro" or drive is None:
             return
@@ -597,7 +599,7 @@ class _Examination:
 
     # Units.
 
-    def _find_units(self, command: _Drive | None, wheels: _Drive | None) -> None:
+    def _find_units(self, command: Candidate | None, wheels: Candidate | None) -> None:
         if command is not None and command.reading.form == "body" and self._is_usable(command):
             explained = command.reading.explained
             if explained is None:
@@ -641,12 +643,12 @@ class _Examination:
                     {"unit": unit},
                 )
 
-    def _is_usable(self, drive: _Drive) -> bool:
-        return drive.is_sure and not _is_crossed(drive)
+    def _is_usable(self, drive: Candidate) -> bool:
+        return drive.is_sure and not is_crossed(drive)
 
     # Geometry.
 
-    def _measure(self, command: _Drive | None, wheels: _Drive | None) -> Geometry:
+    def _measure(self, command: Candidate | None, wheels: Candidate | None) -> Geometry:
         made = Geometry()
         car = next(
             (one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None
@@ -665,7 +667,7 @@ class _Examination:
         if (
             sides is not None
             and sides.is_sure
-            and not _is_crossed(sides)
+            and not is_crossed(sides)
             and sides.reading.explained is not None
         ):
             rolled, effective = measure_geometry(sides.reading.explained)
@@ -750,14 +752,15 @@ def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
     return table["t"].to_numpy(), table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
 
 
-def _is_crossed(drive: _Drive) -> bool:
+def is_crossed(drive: Candidate) -> bool:
+    """Whether one side of a candidate counts backward, in both channels."""
     explained = drive.reading.explained
     if explained is None or not explained.crossed:
         return False
     return bool(min(abs(explained.ahead.t[0]), abs(explained.turned.t[0])) > CLEAR)
 
 
-def _is_measured(drive: _Drive) -> bool:
+def _is_measured(drive: Candidate) -> bool:
     name = drive.reading.name.lower()
     return bool(MEASURED.search(name)) and not COMMANDED.search(name)
 
@@ -766,7 +769,8 @@ def _scale(length: Length | None, factor: float) -> Length | None:
     return None if length is None else Length(length.value * factor, length.error * factor)
 
 
-def _describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
+def describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
+    """How the motion follows a reading, with its role by identity."""
     made, role = reading.explained, roles.get(id(reading), "")
     if made is None:
         return Evidence(reading.name, role, "" if role else "too little of it is recorded beside the poses")

@@ -2,8 +2,8 @@
 
 Increments of a pose are a disturbance plus differences of the localization's noise: each reading is judged by
 the innovations of an ARMA(1,1) process that is fitted to its own residuals, under Student's t with four
-degrees of freedom. Likelihoods are summed in blocks of five seconds, and two readings are compared by Vuong's
-statistic over the blocks (Vuong 1989, Econometrica 57), which needs no model of what the blocks have in common.
+degrees of freedom. Likelihoods are summed in blocks of five seconds, and two readings are compared by
+Vuong's statistic over the blocks (Vuong 1989, Econometrica 57).
 """
 
 from __future__ import annotations
@@ -129,7 +129,7 @@ def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Fl
         if gains.size:
             weighted = columns * weight[:, None]
             gains = np.linalg.lstsq(weighted.T @ weighted, weighted.T @ (values * weight), rcond=1e-12)[0]
-        rest = values - columns @ gains
+        rest = np.asarray(values - columns @ gains, dtype=np.float64)
         weight = np.sqrt((_FREEDOM + 1.0) / (_FREEDOM + (rest / _find_scale(rest)) ** 2))
         if not gains.size:
             break

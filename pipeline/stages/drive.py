@@ -106,20 +106,9 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         if not _is_known(joint, position, velocity):
             raise _no_wheels(columns.topic, joints)
         velocity[joint] = differentiate_angle(times, position[joint])
-    if section.unit is None:
-        both = [
-            joint
-            for joint in (*left, *right)
-            if joint not in missing and _is_known(joint, position, velocity)
-        ]
-        unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
-        if unit:
-            section = structs.replace(section, unit=unit)
-            text = (
-                f"the velocities of {columns.topic} are what its positions turn, in {unit}: they were "
-                'converted ([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
-            )
-            findings.append(Finding("unit_wrong", "warning", text, where=columns.topic))
+    recorded = [joint for joint in (*left, *right) if joint not in missing]
+    section, converted = _convert_unit(columns.topic, times, section, velocity, position, recorded)
+    findings += converted
     for joint in {"left": left, "right": right}.get(section.reversed or "", ()):
         velocity[joint] = -velocity[joint]
     if vehicle.kinematics.has_inputs("steering"):
@@ -139,6 +128,26 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     moves = vehicle.kinematics.has_inputs("sideways")
     sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
     return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(findings))
+
+
+def _convert_unit(
+    topic: str,
+    times: Floats,
+    section: DriveSection,
+    velocity: Mapping[str, Floats],
+    position: Mapping[str, Floats],
+    joints: Sequence[str],
+) -> tuple[DriveSection, list[Finding]]:
+    """The section with the unit in which velocities are what positions turn, unless it gives one."""
+    both = [joint for joint in joints if _is_known(joint, position, velocity)]
+    unit = _recognize_unit(times, [(velocity[joint], position[joint]) for joint in both])
+    if section.unit is not None or not unit:
+        return section, []
+    text = (
+        f"the velocities of {topic} are what its positions turn, in {unit}: they were converted "
+        '([wheels] unit = "rad/s" in run.toml where the positions are wrong)'
+    )
+    return structs.replace(section, unit=unit), [Finding("unit_wrong", "warning", text, where=topic)]
 
 
 def _mean_sideways(
@@ -416,7 +425,7 @@ def read_pair(
     if form is DriveForm.SIDES:
         if section.exchanged:
             first, second = second, first
-        signs = {"left": section.sign, "right": section.sign}
+        signs: dict[str, int] = {"left": section.sign, "right": section.sign}
         if section.reversed is not None:
             signs[section.reversed] *= -1
         return read_sides(first * signs["left"], second * signs["right"], vehicle)
