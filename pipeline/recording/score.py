@@ -123,7 +123,8 @@ def _likelihoods(rest: Floats) -> tuple[float, Floats]:
 
 def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
     """Gains, residuals and square roots of the weights by reweighted least squares."""
-    weight, gains = np.ones(values.size), np.zeros(columns.shape[1])
+    gains: Floats = np.zeros(columns.shape[1])
+    weight: Floats = np.ones(values.size)
     rest: Floats = values
     for _ in range(rounds):
         if gains.size:
