@@ -25,6 +25,8 @@ from pipeline.job.keys import set_up_log
 from pipeline.simulate import PLATFORMS, simulate_case
 
 SAMPLES = Path(__file__).parents[1] / "data_samples"
+STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
+"""Recordings of a robot that is lifted or stands: nothing can be said of its signals."""
 _SAME = 0.02
 
 
@@ -96,7 +98,8 @@ def list_logs(folder: Path, which: str) -> list[Path]:
     if which == "samples":
         return sorted(SAMPLES.glob("*.mcap"))
     if which == "recordings":
-        return sorted(RECORDINGS.glob("*.mcap"), key=lambda path: path.stat().st_size)
+        logs = [path for path in RECORDINGS.glob("*.mcap") if not path.stem.startswith(STANDING)]
+        return sorted(logs, key=lambda path: path.stat().st_size)
     for name in PLATFORMS:
         simulate_case(None, {}, out=folder / f"{name}.mcap", seed=5, duration_s=100.0, platform=name)
     return sorted(folder.glob("*.mcap"))

@@ -1,7 +1,8 @@
 """What is injected into recordings: faults of sensors and wiring, and effects with their formulas.
 
 Each change takes the tables of a run as they were extracted and returns changed ones. It uses numpy and
-polars alone: nothing here knows how the tool looks for what is injected.
+polars alone: nothing here knows how the tool looks for what is injected. Faults of the wiring, which are
+found before tables are extracted, are written into logs (`front`).
 """
 
 from __future__ import annotations
@@ -59,16 +60,12 @@ def list_injections() -> list[Injection]:
     """All of them."""
     shift = _add
     return [
-        Injection("sides of the wheels swapped", _on("wheels", _swap), ("sides_exchanged",)),
-        Injection("sides of the commands swapped", _on("commands", _swap), ("sides_exchanged",), both=True),
-        Injection("left encoder dead", _on("wheels", lambda t: _scale(t, left=0.0)), ("wheel_dead",)),
         Injection(
             "left encoder x .95", _on("wheels", lambda t: _scale(t, left=0.95)), ("wheel_scale",),
             {"wheel_asymmetry.e": shift(-0.051)},
             # Wheels that are read slower than they turn are so to their commands, too.
             along={"side_gain.e": shift(0.051), "drive_gain.g": lambda g: 0.975 * g}, both=True,
         ),
-        Injection("left encoder backward", _on("wheels", lambda t: _scale(t, left=-1.0)), ("wheel_sign",)),
         Injection(
             "wheels x 1.05", _on("wheels", lambda t: _scale(t, 1.05, 1.05)), ("wheel_radius_wrong",),
             {"wheel_radius.k": lambda k: k / 1.05},
@@ -161,11 +158,6 @@ def _on(name: str, change: Callable[[pl.DataFrame], pl.DataFrame]) -> Change:
         return {**tables, name: change(tables[name])} if has_any else tables
 
     return changed
-
-
-def _swap(table: pl.DataFrame) -> pl.DataFrame:
-    changed = table.with_columns(pl.col("right").alias("left"), pl.col("left").alias("right"))
-    return changed.with_columns(-pl.col("body_w")) if "body_w" in table.columns else changed
 
 
 def _scale(table: pl.DataFrame, left: float = 1.0, right: float = 1.0) -> pl.DataFrame:

@@ -71,7 +71,7 @@ def _take_by_name(sources: Sources, configuration: Configuration) -> Recording |
 
 
 def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
-    """Sources with these wheels in the place of a pose, and without a gyro, which measures the ground."""
+    """Sources with these wheels in the rank of a pose, and without a gyro, which measures the ground."""
     ranked = (sources.wheels, *sources.others.get("wheels", ()))
     others = tuple(one for one in ranked if isinstance(one, DriveSource) and one != wheels)
     pose = PoseSource(wheels.signals[0].topic, _REASON, content=PoseContent.WHEELS, wheels=wheels)
@@ -160,7 +160,7 @@ class _DriveExamination(Examination):
         if len(dead) == 1:
             text = (
                 f"the {dead[0]} wheels' encoder reads the same throughout while the other wheels turn: it is "
-                "dead, and the log holds no pose in its place"
+                "dead, and the log holds no pose in its rank"
             )
             self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead[0]}"))
 

@@ -115,16 +115,16 @@ def find_reversed(signs: Mapping[tuple[str, Axis], int]) -> Reversal:
         return Reversal()
     there = {signal for signal, _ in known}
     usable = [name for name in _FAULTS if name.split("_")[0] in {"pose", *there}]
-    found: list[tuple[float, tuple[str, ...]]] = []
+    matches: list[tuple[float, tuple[str, ...]]] = []
     for count in (1, 2, 3):
         for names in combinations(usable, count):
             parts = [_FAULTS[name][0] for name in names]
             if all(_sign_of(key, parts) == sign for key, sign in known.items()):
-                found.append((sum(_FAULTS[name][1] for name in names), names))
-    if not found:
+                matches.append((sum(_FAULTS[name][1] for name in names), names))
+    if not matches:
         return Reversal()
-    least = min(cost for cost, _ in found)
-    best = [names for cost, names in found if cost < least + 0.5]
+    least = min(cost for cost, _ in matches)
+    best = [names for cost, names in matches if cost < least + 0.5]
     return Reversal(best[0], tuple(best[1:]))
 
 
@@ -140,8 +140,8 @@ def _sign_of(key: tuple[str, Axis], parts: Iterable[frozenset[tuple[str, Axis]]]
 SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mm/s": 1e-3, "cm/s": 1e-2}
 RATES = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mrad/s": 1e-3}
 WHEELS = {"rad/s": 1.0, "rpm": np.pi / 30.0, "deg/s": np.pi / 180.0}
-_STRANGE = 4.0
-"""Surprise of a unit that a message type does not have [nats]."""
+_STRANGE = {"rpm": 4.0, "deg/s": 4.0, "km/h": 4.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0}
+"""Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
 _WIN = 5.0
 """Least gain of another unit [nats]."""
 
@@ -168,7 +168,8 @@ def find_body_units(gains: Sequence[float | None], shares: Sequence[float]) -> t
             costs[speed, rate] = (
                 common**2 / (2 * 0.6**2)
                 + sum((one - common) ** 2 for one in logs) / (2 * 0.35**2)
-                + _STRANGE * ((speed != "m/s") + (rate != "rad/s"))
+                + _STRANGE.get(speed, 0.0)
+                + _STRANGE.get(rate, 0.0)
             )
     best = min(costs, key=lambda key: costs[key])
     return best if costs["m/s", "rad/s"] - costs[best] > _WIN else ("m/s", "rad/s")
@@ -194,7 +195,7 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     spread = 0.7 if radius is None else 0.35
     costs = {
         unit: _shrink(float(np.log(abs(gain) / factor / (radius or 0.12))), share) ** 2 / (2 * spread**2)
-        + _STRANGE * (unit != "rad/s")
+        + _STRANGE.get(unit, 0.0)
         for unit, factor in WHEELS.items()
     }
     best = min(costs, key=lambda unit: costs[unit])
@@ -208,14 +209,14 @@ _USUAL = 3.0
 """Nats of a name that says what a topic is."""
 
 
-def rate_command(one: Reading, place: int, earliest: float) -> float:
+def rate_command(one: Reading, rank: int, earliest: float) -> float:
     """How likely a reading is the command, in nats.
 
     A command is followed late, and it is held: numbers that equal the motion at once measure it.
 
     Args:
         one: a reading that the motion follows.
-        place: its place by type and name.
+        rank: its place by type and name.
         earliest: least delay of all readings [s].
     """
     explained = one.explained
@@ -225,7 +226,7 @@ def rate_command(one: Reading, place: int, earliest: float) -> float:
     named = _USUAL * is_commanded - _USUAL * (bool(MEASURED.search(name)) and not is_commanded)
     lead = explained.lag + explained.delay - earliest
     held = float(np.mean([one.held_share for one in one.inputs]))
-    return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * place
+    return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * rank
 
 
 # Geometry.

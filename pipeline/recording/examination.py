@@ -142,7 +142,12 @@ def examine(
     if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
         # A body that moves sideways has no course.
         return Recording(sources, configuration)
-    return Examination(data, sources, configuration, vehicle, is_known=is_known, where=where).run()
+    try:
+        examination = Examination(data, sources, configuration, vehicle, is_known=is_known, where=where)
+    except SlipError:
+        # The stage `extract` raises it again.
+        return Recording(sources, configuration)
+    return examination.run()
 
 
 def _list_candidates(sources: Sources) -> list[DriveSource]:
@@ -162,13 +167,13 @@ class Candidate:
     Attributes:
         source: its topics.
         reading: its signals.
-        place: its place by type and name among those of its role.
+        rank: its place by type and name among those of its role.
         is_measured: whether type and name say that it is measured.
     """
 
     source: DriveSource
     reading: Reading
-    place: int
+    rank: int
     is_measured: bool
 
     @property
@@ -196,8 +201,9 @@ class Examination:
     ) -> None:
         self.is_known = is_known
         self.sources, self.configuration, self.vehicle = sources, configuration, vehicle
-        alone = replace(sources, command=None, wheels=None, power=None)
-        self.extraction = Extraction(data, alone, configuration, vehicle, where)
+        # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
+        equal = replace(sources, others={**sources.others, "command": ()}, power=None)
+        self.extraction = Extraction(data, equal, configuration, vehicle, where)
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
 
@@ -221,7 +227,7 @@ class Examination:
             one.explain(motion)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
-        is_told = self._tell_sides(command, wheels)
+        is_reported = self._report_sides(command, wheels)
         if (
             wheels is not None
             and wheels.source.form is DriveForm.JOINTS
@@ -229,8 +235,8 @@ class Examination:
         ):
             self._read_again(wheels, motion)
         kind = self._find_kind(wheels, motion)
-        if not is_told:
-            self._tell_signs(motion, command, wheels, gyro)
+        if not is_reported:
+            self._report_signs(motion, command, wheels, gyro)
         self._find_units(command, wheels)
         used = (("command", command), ("wheels", wheels))
         roles = {id(one.reading): role for role, one in used if one is not None}
@@ -252,14 +258,14 @@ class Examination:
         wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
         drives, taken = [], set()
         for is_measured, sources in ((False, commands), (True, wheels)):
-            for place, source in enumerate(one for one in sources if isinstance(one, DriveSource)):
+            for rank, source in enumerate(one for one in sources if isinstance(one, DriveSource)):
                 key = (source.form, source.signals)
                 reading = None if key in taken else self._read(source, is_measured=is_measured)
                 if reading is None and key not in taken and is_measured and source == self.sources.wheels:
                     reading = self._read_by_motion(source, motion)
                 taken.add(key)
                 if reading is not None:
-                    drives.append(Candidate(source, reading, place, is_measured))
+                    drives.append(Candidate(source, reading, rank, is_measured))
         return drives
 
     def _read(
@@ -324,13 +330,13 @@ class Examination:
                 sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
         if not (sides["left"] and sides["right"]):
             return None
-        names = {side: ", ".join(found) for side, found in sides.items()}
+        names = {side: ", ".join(joined) for side, joined in sides.items()}
         what = (
             f"the joints of {source} do not name their side; by the motion {names['left']} are left and "
             f"{names['right']} right"
         )
         line = "; ".join(
-            f"{side} = [{', '.join(repr(one) for one in found)}]" for side, found in sides.items()
+            f"{side} = [{', '.join(repr(one) for one in listed)}]" for side, listed in sides.items()
         )
         self._correct("wheels", what, line.replace("'", '"'), dict(sides))
         section = self._complete().wheels
@@ -376,11 +382,11 @@ class Examination:
         command = self._find(drives, self.sources.command)
         rivals = [one for one in sure if not one.is_measured]
         if rivals and (command is None or command.source.reason != CONFIGURED):
-            rates = {id(one): rate_command(one.reading, one.place, earliest) for one in rivals}
+            rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
             best = max(rivals, key=lambda one: rates[id(one)])
             if command is None or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
                 if command is not None:
-                    self._tell_role("command", best, command)
+                    self._report_role("command", best, command)
                 command = best
         wheels = self._find(drives, self.sources.wheels)
         if wheels is None and self.sources.wheels is None:
@@ -391,7 +397,7 @@ class Examination:
                 for one in spare
                 if command is None or _is_measured(one) or one.source.form is DriveForm.SIDES
             ]
-            wheels = max(spare, key=lambda one: -one.place, default=None)
+            wheels = max(spare, key=lambda one: -one.rank, default=None)
             if wheels is not None and command is not None and command.reading.form == "sides":
                 wheels = wheels if _is_measured(wheels) else None
         return command, wheels
@@ -425,7 +431,7 @@ class Examination:
             made = replace(made, command=source) if role == "command" else replace(made, wheels=source)
         return made
 
-    def _tell_role(self, role: str, chosen: Candidate, other: Candidate) -> None:
+    def _report_role(self, role: str, chosen: Candidate, other: Candidate) -> None:
         text = (
             f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the "
             "first later, and "
@@ -453,9 +459,9 @@ class Examination:
 
     # Sides and signs.
 
-    def _tell_sides(self, command: Candidate | None, wheels: Candidate | None) -> bool:
+    def _report_sides(self, command: Candidate | None, wheels: Candidate | None) -> bool:
         """A side that is dead or counts backward; whether one was found."""
-        if wheels is not None and wheels.reading.form == "sides" and self._tell_dead(wheels):
+        if wheels is not None and wheels.reading.form == "sides" and self._report_dead(wheels):
             return True
         of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
         of_command = command is not None and command.is_sure and is_crossed(command)
@@ -497,7 +503,7 @@ class Examination:
             return True
         return False
 
-    def _tell_dead(self, wheels: Candidate) -> bool:
+    def _report_dead(self, wheels: Candidate) -> bool:
         sides = dict(zip(("left", "right"), (wheels.reading.first, wheels.reading.second), strict=True))
         moves = {name: side is not None and side.moves for name, side in sides.items()}
         if any(moves.values()) == all(moves.values()):
@@ -511,7 +517,7 @@ class Examination:
         self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
         return True
 
-    def _tell_signs(
+    def _report_signs(
         self, motion: Motion, command: Candidate | None, wheels: Candidate | None, gyro: Reading | None
     ) -> None:
         signs: dict[tuple[str, Axis], int] = {}
@@ -530,7 +536,7 @@ class Examination:
             signs = {key: -sign if key[1] == "ahead" else sign for key, sign in signs.items()}
         made = find_reversed(signs)
         if made.rivals:
-            self._tell_either(made, signs)
+            self._report_either(made, signs)
         else:
             for fault in made.faults:
                 if fault == "pose_backward":
@@ -538,16 +544,16 @@ class Examination:
                 elif fault == "pose_mirrored":
                     up, offset = up.removeprefix("-") if up.startswith("-") else f"-{up}", -offset
                 else:
-                    self._tell_fault(fault, command, wheels)
-        self._tell_frame(up, 180.0 - (180.0 - offset) % 360.0, signs)
+                    self._report_fault(fault, command, wheels)
+        self._report_frame(up, 180.0 - (180.0 - offset) % 360.0, signs)
 
-    def _tell_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
+    def _report_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
         source = self.sources.pose
         there = {name for (name, _), sign in signs.items() if sign}
         who = " and ".join(word for name, word in _AGREE.items() if name in there) or "the other signals"
         if up != "z":
-            way, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
-            what = f"the {axis} axis of the poses of {source} points {way}"
+            direction, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
+            what = f"the {axis} axis of the poses of {source} points {direction}"
             if axis == "z":
                 what += " (north, east, down)"
             else:
@@ -566,7 +572,7 @@ class Examination:
                 )
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
-    def _tell_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
+    def _report_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
         drive = wheels if fault.startswith("wheels") else command
         if fault == "gyro" or drive is None:
             return
@@ -581,7 +587,7 @@ class Examination:
         text = f"{drive.source} contradicts all other signals: {_FAULTS[fault]}"
         self.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
 
-    def _tell_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
+    def _report_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
         """Two signals that contradict each other, with what mends the one and the other."""
         against = sorted({name for (name, _), sign in signs.items() if sign < 0})
         verbs = {"ahead": "drive", "turned": "turn"}
@@ -626,22 +632,28 @@ class Examination:
                     f'yaw_unit = "{rate}"',
                     {"yaw_unit": rate},
                 )
-        if wheels is not None and wheels.reading.form == "sides" and self._is_usable(wheels):
-            signal = wheels.source.signals[0]
-            explained = wheels.reading.explained
-            if explained is None or signal.unit or not wheels.sign("ahead"):
-                return
-            gain, radius = float(explained.ahead.gains[0]), self.vehicle.wheel_radius_m
-            unit = find_wheel_unit(
-                gain, explained.shares[0], str(wheels.source), radius if self.is_known else None
-            )
-            if unit != "rad/s":
-                self._correct(
-                    "wheels",
-                    f"the wheel speeds of {wheels.source} are in {unit}",
-                    f'unit = "{unit}"',
-                    {"unit": unit},
-                )
+        if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
+            self._find_wheel_unit(command, wheels)
+
+    def _find_wheel_unit(self, command: Candidate | None, wheels: Candidate) -> None:
+        """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
+        explained, share = wheels.reading.explained, 1.0
+        lengths = None
+        if self.is_known and command is not None:
+            lengths = measure_controller(command.reading, wheels.reading)
+        if lengths is not None and lengths[0] is not None:
+            gain = lengths[0].value
+        elif explained is not None and wheels.is_sure and wheels.sign("ahead"):
+            gain, share = float(explained.ahead.gains[0]), explained.shares[0]
+        else:
+            return
+        if wheels.source.signals[0].unit:
+            return
+        radius = self.vehicle.wheel_radius_m if self.is_known else None
+        unit = find_wheel_unit(gain, share, str(wheels.source), radius)
+        if unit != "rad/s":
+            what = f"the wheel speeds of {wheels.source} are in {unit}"
+            self._correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
 
     def _is_usable(self, drive: Candidate) -> bool:
         return drive.is_sure and not is_crossed(drive)
@@ -679,9 +691,9 @@ class Examination:
             and wheels.reading.form == "sides"
             and command.reading.form == "body"
         ):
-            found = measure_controller(command.reading, wheels.reading)
-            if found is not None:
-                made = replace(made, radius=_scale(found[0], self._wheel_factor()), track=found[1])
+            lengths = measure_controller(command.reading, wheels.reading)
+            if lengths is not None:
+                made = replace(made, radius=_scale(lengths[0], self._wheel_factor()), track=lengths[1])
         return made
 
     def _wheel_factor(self) -> float:
@@ -753,11 +765,12 @@ def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
 
 
 def is_crossed(drive: Candidate) -> bool:
-    """Whether one side of a candidate counts backward, in both channels."""
+    """Whether one side counts backward: by the motion ahead, of a body command by turning, too."""
     explained = drive.reading.explained
     if explained is None or not explained.crossed:
         return False
-    return bool(min(abs(explained.ahead.t[0]), abs(explained.turned.t[0])) > CLEAR)
+    sizes = [abs(float(explained.ahead.t[0])), abs(float(explained.turned.t[0]))]
+    return sizes[0] > CLEAR and (drive.reading.form == "sides" or sizes[1] > CLEAR)
 
 
 def _is_measured(drive: Candidate) -> bool:

@@ -97,17 +97,17 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
     if fresh.height <= FEWEST_STEPS:
         return None
     time = fresh["t"].to_numpy()
-    place = fresh.select("x", "y", "z").to_numpy()
+    position = fresh.select("x", "y", "z").to_numpy()
     quaternion = fresh.select("q_x", "q_y", "q_z", "q_w").to_numpy()
     period = float(np.median(np.diff(time)))
     length = max(STEP_S, period)
     rows = _choose_rows(time, 0.95 * length)
-    time, place, quaternion = time[rows], place[rows], quaternion[rows]
+    time, position, quaternion = time[rows], position[rows], quaternion[rows]
     segment = fresh["segment"].to_numpy()[rows]
-    axis, up, yaw = _find_plane(place, quaternion)
+    axis, up, yaw = _find_plane(position, quaternion)
     first, second = _PLANES[axis]
     # A positive turn about y leads from x to -z.
-    plane = place[:, first] + (-1j if axis == 1 else 1j) * place[:, second]
+    plane = position[:, first] + (-1j if axis == 1 else 1j) * position[:, second]
     if up.startswith("-"):
         # Seen from above, the second axis of the plane points the other way.
         plane, yaw = plane.conj(), -yaw
@@ -141,7 +141,7 @@ def _choose_rows(time: Floats, length: float) -> list[int]:
     return rows
 
 
-def _find_plane(place: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
+def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
     """Index of the axis across the plane of motion, its name with the sign that points up, and the headings.
 
     The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it
@@ -151,10 +151,10 @@ def _find_plane(place: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
     change = rigid.multiply_quaternions(quaternion[1:], before)
     rotation = 2.0 * change[:, :3] * np.sign(change[:, 3:])
     turning = (np.clip(rotation, -0.5, 0.5) ** 2).sum(axis=0)
-    apart = min(8, place.shape[0] // 4)
-    reach = np.quantile(np.abs(place[apart:] - place[:-apart]), 0.8, axis=0)
+    apart = min(8, position.shape[0] // 4)
+    extent = np.quantile(np.abs(position[apart:] - position[:-apart]), 0.8, axis=0)
     axis = int(np.argmax(turning))
-    if axis != _Z and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(reach)) == axis):
+    if axis != _Z and not (turning[axis] > 4.0 * turning[2] and int(np.argmin(extent)) == axis):
         axis = _Z
     if axis == _Z:
         yaw = rigid.euler_from_quaternions(quaternion)[2]

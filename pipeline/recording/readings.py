@@ -61,9 +61,9 @@ class Held:
 
     def is_there(self, steps: Steps) -> Flags:
         """Whether the signal is recorded over each step and .4 s before."""
-        place = np.arange(self._missing.size)
+        index = np.arange(self._missing.size)
         first, last = (
-            np.interp((at - self._start) / GRID_S, place, self._missing)
+            np.interp((at - self._start) / GRID_S, index, self._missing)
             for at in (steps.start - 0.4, steps.end)
         )
         inside = (steps.start >= self.times[0]) & (steps.end <= self.times[-1] + 1.0)
@@ -101,10 +101,10 @@ def follow(values: Floats, lag: float) -> Floats:
     return made
 
 
-def _look_up(total: Floats, place: Floats) -> Floats:
-    place = np.clip(place, 0.0, total.size - 1.001)
-    cell = place.astype(np.int64)
-    return np.asarray(total[cell] + (place - cell) * (total[cell + 1] - total[cell]))
+def _look_up(total: Floats, at: Floats) -> Floats:
+    at = np.clip(at, 0.0, total.size - 1.001)
+    cell = at.astype(np.int64)
+    return np.asarray(total[cell] + (at - cell) * (total[cell + 1] - total[cell]))
 
 
 class Bent(Held):
@@ -318,9 +318,9 @@ class Reading:
                 score(lag, float(delay))
         for step in (0.03, 0.01):
             lag, delay = max(scores, key=lambda key: scores[key])
-            for more in (-step, 0.0, step):
+            for longer in (-step, 0.0, step):
                 for later in (-step, 0.0, step):
-                    score(max(0.0, lag + more), delay + later)
+                    score(max(0.0, lag + longer), delay + later)
         return max(scores, key=lambda key: scores[key])
 
 

@@ -129,7 +129,8 @@ def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Fl
     for _ in range(rounds):
         if gains.size:
             weighted = columns * weight[:, None]
-            gains = np.linalg.lstsq(weighted.T @ weighted, weighted.T @ (values * weight), rcond=1e-12)[0]
+            normal, right = weighted.T @ weighted, weighted.T @ (values * weight)
+            gains = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0], dtype=np.float64)
         rest = np.asarray(values - columns @ gains, dtype=np.float64)
         weight = np.sqrt((_FREEDOM + 1.0) / (_FREEDOM + (rest / _find_scale(rest)) ** 2))
         if not gains.size:

@@ -292,7 +292,7 @@ def test_a_planted_sentence_is_found_where_it_would_be_shown(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     "text",
     [
-        "Drive lag: time constant 0.30 s",
+        "Lag of the drive: the wheels follow commands with a time constant of 0.30 s",
         "remaining error 1.6 cm, at the noise floor",
         "not observable in this log: slope_drift",
         "there is no run with a date",

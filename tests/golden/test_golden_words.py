@@ -16,10 +16,10 @@ from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Valu
 from pipeline.estimation.diagnosis_lines import choose_lines, list_lines
 from pipeline.estimation.verdict import format_verdict
 from pipeline.models import find_effect, list_effects
+from pipeline.recording import FAULTS
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
 from pipeline.sources import list_presets
-from pipeline.stages.checks import FAULTS
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -167,7 +167,11 @@ def test_lines_of_a_diagnosis(check_golden: Check) -> None:
         effects=(
             name_effect("wheel_servo", servo, "Wheel servo: lag 0.68 s"),
             name_effect("torque_limit", {"limit": Value(14.4, math.nan, math.nan, "m/s^2")}, "Torque limit"),
-            name_effect("drive_lag", {"tau": Value(0.3, 0.2, 0.4, "s")}, "Drive lag: time constant 0.30 s"),
+            name_effect(
+                "drive_lag",
+                {"tau": Value(0.3, 0.2, 0.4, "s")},
+                "Lag of the drive: the wheels follow commands with a time constant of 0.30 s",
+            ),
         ),
         detectable=(
             Detectable("yaw_drift", "c", "rad/s", 0.016),

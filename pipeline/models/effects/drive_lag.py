@@ -43,7 +43,7 @@ class DriveLag(DriveEffect):
             quantities=(Quantity.SPEED_LAG, Quantity.TURN_LAG),
         ),
     )
-    motion = "Drive lag: time constant {tau:.2f} s"
+    motion = "Lag of the drive: the wheels follow commands with a time constant of {tau:.2f} s"
     clause = "follows commands with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("transport_delay", "turn_lag", "acceleration_limit")
