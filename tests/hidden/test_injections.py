@@ -101,8 +101,6 @@ def test_a_gyro_ahead_of_the_poses_stays_ahead(tables: Tables) -> None:
 
 def test_the_rest_changes_one_table_alone(tables: Tables) -> None:
     for name, table in (
-        ("sides of the wheels swapped", "wheels"),
-        ("left encoder dead", "wheels"),
         ("wheels x 1.05", "wheels"),
         ("commands x 1.5", "commands"),
         ("commands .2 s early", "commands"),
