@@ -142,6 +142,8 @@ RATES = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mrad/s": 1e-3}
 WHEELS = {"rad/s": 1.0, "rpm": np.pi / 30.0, "deg/s": np.pi / 180.0}
 _STRANGE = {"rpm": 4.0, "deg/s": 4.0, "km/h": 4.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0}
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
+_GOOD = 0.7
+"""Least share of the motion that a signal explains whose unit is in question."""
 _WIN = 5.0
 """Least gain of another unit [nats]."""
 
@@ -149,21 +151,19 @@ _WIN = 5.0
 def find_body_units(gains: Sequence[float | None], shares: Sequence[float]) -> tuple[str, str]:
     """Units of a body command by its gains, which slip and a wrong radius change by a factor of two at most.
 
-    A poor fit attenuates: the true gain is between the fitted one and that divided by the share explained.
+    A poor fit attenuates a gain, and shows no unit.
 
     Args:
         gains: motion over command, ahead and turning; None where it is not excited.
         shares: part of the motion that is explained, of both.
     """
+    gains = [gain if share > _GOOD else None for gain, share in zip(gains, shares, strict=True)]
     costs = {}
     for speed, of_speed in SPEEDS.items():
         for rate, of_rate in RATES.items():
             # A gain is the motion in SI units over the command in its own unit.
-            logs = [
-                _shrink(float(np.log(abs(gain) / of)), share)
-                for gain, share, of in zip(gains, shares, (of_speed, of_rate), strict=True)
-                if gain
-            ]
+            pairs = zip(gains, (of_speed, of_rate), strict=True)
+            logs = [float(np.log(abs(gain) / of)) for gain, of in pairs if gain]
             common = float(np.mean(logs)) if logs else 0.0
             costs[speed, rate] = (
                 common**2 / (2 * 0.6**2)
