@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from pipeline.core import format_share
 from pipeline.logs import (
     ChannelInfo,
     LogData,
@@ -47,7 +46,6 @@ from pipeline.sources import (
     VehicleSource,
     apply_parameters,
     choose_sources,
-    find_alike,
     find_preset,
     list_contradictions,
     list_metadata,
@@ -59,7 +57,6 @@ from pipeline.sources import (
     resolve_vehicle,
 )
 from pipeline.sources.candidates import LOCALIZED
-from pipeline.sources.configuration import RANGES
 from pipeline.sources.message_types import find_type, plain_type
 from pipeline.sources.topics import list_topics
 from pipeline.stages import Finding
@@ -68,7 +65,7 @@ from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
-    from pipeline.recording import Geometry, Recording
+    from pipeline.recording import Recording
     from pipeline.stages.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
@@ -557,6 +554,8 @@ def _fit_vehicle(
         problem: error to raise if wheels have no known radius, and nothing else drives the vehicle.
         recorded: geometry recorded in the log.
     """
+    from pipeline.recording.geometry import LENGTHS, describe_vehicle  # noqa: PLC0415 - heavy
+
     recording, sources = chosen.recording, chosen.sources
     if recording is None or chosen.data is None:
         raise problem
@@ -566,8 +565,8 @@ def _fit_vehicle(
         # The arrangement of the rollers is unknown: only body motion can be evaluated.
         kind = "omni"
     known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
-    fitted = _list_lengths(recording.geometry, kind)
-    values = {key: value for key, value in {**fitted, **known}.items() if key in _LENGTHS}
+    fitted = {key: length.value for key, length in recording.geometry.list_lengths(kind).items()}
+    values = {key: value for key, value in {**fitted, **known}.items() if key in LENGTHS}
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
@@ -591,7 +590,7 @@ def _fit_vehicle(
     assumed = {key: value for key, value in _STAND_INS.items() if key not in values}
     if kind == "ackermann":
         assumed.pop("track_width_m", None)
-    name, text = _describe_vehicle(recording.geometry, kind, values, [*known], assumed, is_body=is_body)
+    name, text = describe_vehicle(recording.geometry, kind, values, [*known], is_body=is_body)
     bare = {"name": "fitted vehicle", "track_width_m": None, "wheelbase_m": None}
     vehicle = msgspec.structs.replace(
         chosen.vehicle,
@@ -639,97 +638,3 @@ def _take_unit_wheels(
     vehicle = msgspec.structs.replace(chosen.vehicle, **{**bare, **assumed, **values}, stand_ins=[*assumed])
     findings = (*chosen.findings, Finding("vehicle_fitted", "warning", text, where="vehicle"))
     return replace(chosen, vehicle=vehicle, vehicle_source="fitted", findings=findings)
-
-
-_LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
-
-
-def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
-    """Lengths that an analysis of this kind of vehicle takes from its signals [m]: the controller's first."""
-    if kind == "ackermann":
-        lengths = {"wheelbase_m": seen.wheelbase, "wheel_radius_m": seen.rolled}
-    elif seen.radius is not None:
-        lengths = {"wheel_radius_m": seen.radius, "track_width_m": seen.track}
-    else:
-        lengths = {"wheel_radius_m": seen.rolled, "track_width_m": seen.effective}
-    return {
-        key: length.value
-        for key, length in lengths.items()
-        if length is not None and RANGES[key][0] < length.value < RANGES[key][1]
-    }
-
-
-def _describe_vehicle(
-    seen: Geometry,
-    kind: str,
-    values: Mapping[str, object],
-    given: Sequence[str],
-    assumed: Mapping[str, float],
-    *,
-    is_body: bool,
-) -> tuple[str, str]:
-    """A name that depends only on the geometry, and the text of the finding."""
-    if is_body and kind != "ackermann":
-        text = (
-            "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
-            "whose slip does not depend on wheel radius and track width"
-        )
-        if kind == "omni":
-            text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
-        return "fitted_body", text
-    lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
-    errors = _list_errors(seen, kind)
-    words = {
-        "wheel_radius_m": "a wheel radius of",
-        "track_width_m": "a track of",
-        "wheelbase_m": "a wheelbase of",
-    }
-    if kind == "differential" and seen.radius is None:
-        words["track_width_m"] = "an effective track of"
-    parts = {
-        key: f"{words[key]} {lengths[key]:.3g} m"
-        + (
-            f" (+- {format_share(errors[key] / lengths[key])})"
-            if key not in given and errors.get(key, 0.0) > 2e-3 * lengths[key]
-            else ""
-        )
-        for key in _LENGTHS
-        if key in lengths
-    }
-    own = " and ".join(text for key, text in parts.items() if key in given)
-    shown = " and ".join(text for key, text in parts.items() if key not in given)
-    if not shown:
-        text = f"the vehicle has {own}, as given or recorded"
-    else:
-        text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
-    if shown and kind == "differential" and seen.radius is not None:
-        text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
-    elif shown:
-        text += f"; {shown} fits the motion, so that it is not reported as an effect"
-    if "track_width_m" in assumed:
-        text += "; there is too little turning for a track: give --track-width"
-    if kind == "ackermann":
-        return (
-            f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
-            f"{text} (wheelbase_m under [vehicle] gives another)",
-        )
-    radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
-    alike = None if track is None else find_alike(radius, track)
-    guess = (
-        f"a {alike.name}? then --vehicle {alike.id}"
-        if alike
-        else "--wheel-radius and --track-width give others"
-    )
-    name = alike.id if alike else f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
-    return f"fitted_{name}", f"{text} ({guess})"
-
-
-def _list_errors(seen: Geometry, kind: str) -> dict[str, float]:
-    """Standard errors of the lengths of `_list_lengths` [m]."""
-    if kind == "ackermann":
-        pairs = [("wheelbase_m", seen.wheelbase), ("wheel_radius_m", seen.rolled)]
-    elif seen.radius is not None:
-        pairs = [("wheel_radius_m", seen.radius), ("track_width_m", seen.track)]
-    else:
-        pairs = [("wheel_radius_m", seen.rolled), ("track_width_m", seen.effective)]
-    return {key: length.error for key, length in pairs if length is not None}

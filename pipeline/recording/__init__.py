@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.recording.drive_alone import examine_drive
-    from pipeline.recording.evidence import Length
-    from pipeline.recording.examination import Geometry, Recording, examine
+    from pipeline.recording.examination import Recording, examine
 
-__all__ = ["FAULTS", "Geometry", "Length", "Recording", "examine", "examine_drive"]
+__all__ = ["FAULTS", "Recording", "examine", "examine_drive"]
 
 FAULTS = (
     "signs_contradict",
@@ -28,16 +27,8 @@ FAULTS = (
 
 def __getattr__(name: str) -> object:
     # The verdict on a stored run needs the names of faults only.
-    if name == "Length":
-        from pipeline.recording.evidence import Length  # noqa: PLC0415
+    if name not in __all__:
+        raise AttributeError(name)
+    from pipeline.recording import drive_alone, examination  # noqa: PLC0415
 
-        return Length
-    if name == "examine_drive":
-        from pipeline.recording.drive_alone import examine_drive  # noqa: PLC0415
-
-        return examine_drive
-    if name in __all__:
-        from pipeline.recording import examination  # noqa: PLC0415
-
-        return getattr(examination, name)
-    raise AttributeError(name)
+    return getattr(drive_alone if name == "examine_drive" else examination, name)

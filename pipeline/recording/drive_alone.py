@@ -11,8 +11,9 @@ import numpy as np
 
 from pipeline.core import enumerate_texts
 from pipeline.logs import LogData
-from pipeline.recording.evidence import Length, find_wheel_unit
-from pipeline.recording.examination import Candidate, Examination, Geometry, Recording, describe, is_crossed
+from pipeline.recording.evidence import find_wheel_unit
+from pipeline.recording.examination import Candidate, Examination, Recording, describe, is_crossed
+from pipeline.recording.geometry import Geometry, Length
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
@@ -115,7 +116,6 @@ class _DriveExamination(Examination):
             "ackermann" if steered else "",
             self._measure_lengths(command, wheels),
             tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
-            any(one.is_sure for one in commands),
         )
 
     # Signals.

@@ -15,10 +15,10 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, join_parts
-from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import Explained, Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Steps, compare, fit
+from pipeline.core.arrays import Floats
+from pipeline.recording.motion import Motion
+from pipeline.recording.readings import Reading
+from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
 from pipeline.sources.candidates import COMMANDED, MEASURED
 
 # Frame of the pose.
@@ -227,65 +227,3 @@ def rate_command(one: Reading, rank: int, earliest: float) -> float:
     lead = explained.lag + explained.delay - earliest
     held = float(np.mean([one.held_share for one in one.inputs]))
     return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * rank
-
-
-# Geometry.
-
-
-@dataclass(frozen=True)
-class Length:
-    """A length with its standard error, both [m]."""
-
-    value: float
-    error: float
-
-
-def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
-    """Wheel radius and track by which a controller turns body commands into wheel speeds.
-
-    Args:
-        command: speed [m/s] and yaw rate [rad/s].
-        wheels: speeds of both sides [rad/s].
-
-    Returns:
-        Radius and track, each None where it is not excited; None if the wheels do not follow the command.
-    """
-    left, right = wheels.first, wheels.second
-    if left is None or right is None or not (left.moves and right.moves) or command.form != "body":
-        return None
-    start, end = max(left.times[0], right.times[0]), min(left.times[-1], right.times[-1])
-    if end - start < FEWEST_STEPS * STEP_S:
-        return None
-    edges = np.arange(start, end, STEP_S)
-    steps = Steps(edges[:-1], edges[1:])
-    steps = steps.take(left.is_there(steps) & right.is_there(steps))
-    if steps.start.size < FEWEST_STEPS:
-        return None
-    rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
-    turned = rolled[1] - rolled[0]
-    motion = Motion(steps, join_parts(0.5 * (rolled[0] + rolled[1]), 0.0), np.zeros(turned.size), turned, "z")
-    made = Reading("body", command.name, command.first, command.second).explain(motion)
-    if made is None or not made.is_sure or made.crossed:
-        return None
-    ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
-    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
-    radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
-    track = (
-        Length(bent / ahead, bent / ahead * float(np.hypot(errors[0], errors[1])))
-        if radius is not None and bent > 0.0 and 1.0 / errors[1] > CLEAR
-        else None
-    )
-    return radius, track
-
-
-def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
-    """Wheel radius and effective track by the motion, each None where it is not excited."""
-    ahead, bent = abs(float(wheels.ahead.gains[0])), abs(float(wheels.turned.gains[0]))
-    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (wheels.ahead, wheels.turned)]
-    radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
-    track = (
-        Length(ahead / bent, ahead / bent * float(np.hypot(errors[0], errors[1])))
-        if radius is not None and wheels.sign("turned")
-        else None
-    )
-    return radius, track

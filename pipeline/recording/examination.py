@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -14,16 +14,14 @@ from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
 from pipeline.recording.evidence import (
     Axis,
-    Length,
     Reversal,
     find_body_units,
     find_frame,
     find_reversed,
     find_wheel_unit,
-    measure_controller,
-    measure_geometry,
     rate_command,
 )
+from pipeline.recording.geometry import Geometry, Length, measure_controller, measure_geometry
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Bent, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
@@ -41,24 +39,6 @@ from pipeline.sources.candidates import COMMANDED, MEASURED
 from pipeline.stages import Finding
 from pipeline.stages.extract import Extraction
 from pipeline.stages.reading import find_sideways_share
-
-
-@dataclass(frozen=True)
-class Geometry:
-    """Lengths of a vehicle that its signals show; None where they do not.
-
-    Attributes:
-        radius, track: by which the controller turns commands into wheel speeds.
-        rolled: wheel radius by the motion.
-        effective: track by the motion.
-        wheelbase: of a car, by the motion.
-    """
-
-    radius: Length | None = None
-    track: Length | None = None
-    rolled: Length | None = None
-    effective: Length | None = None
-    wheelbase: Length | None = None
 
 
 @dataclass(frozen=True)
@@ -95,16 +75,14 @@ class Recording:
         kind: kind of vehicle that the signals show; empty if they show none.
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
-        moves: whether the motion follows any of them.
     """
 
     sources: Sources
     configuration: Configuration
     findings: tuple[Finding, ...] = ()
     kind: str = ""
-    geometry: Geometry = Geometry()
+    geometry: Geometry = field(default_factory=Geometry)
     evidence: tuple[Evidence, ...] = ()
-    moves: bool = False
 
 
 _STILL = 0.1
@@ -248,7 +226,6 @@ class Examination:
             kind,
             self._measure(command, wheels),
             tuple(describe(one, roles) for one in readings),
-            any(drive.is_sure for drive in drives),
         )
 
     # Signals.

@@ -13,10 +13,9 @@ from pipeline.recording.evidence import (
     find_frame,
     find_reversed,
     find_wheel_unit,
-    measure_controller,
-    measure_geometry,
     rate_command,
 )
+from pipeline.recording.geometry import measure_controller, measure_geometry
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit

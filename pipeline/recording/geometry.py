@@ -1,0 +1,186 @@
+"""Lengths of a vehicle by its signals: wheel radius, track and wheelbase, with standard errors.
+
+They come last: no decision on roles, signs and frames needs them, and what is not excited is missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core import format_share
+from pipeline.core.arrays import join_parts
+from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.readings import Explained, Reading
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
+from pipeline.sources import find_alike
+from pipeline.sources.configuration import RANGES
+
+LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
+_ROUGH = 2e-3
+"""Relative standard error from which on it is stated."""
+
+
+@dataclass(frozen=True)
+class Length:
+    """A length with its standard error, both [m]."""
+
+    value: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """Lengths of a vehicle that its signals show; None where they do not.
+
+    Attributes:
+        radius, track: by which the controller turns commands into wheel speeds.
+        rolled: wheel radius by the motion.
+        effective: track by the motion.
+        wheelbase: of a car, by the motion.
+    """
+
+    radius: Length | None = None
+    track: Length | None = None
+    rolled: Length | None = None
+    effective: Length | None = None
+    wheelbase: Length | None = None
+
+    def list_lengths(self, kind: str) -> dict[str, Length]:
+        """Plausible lengths of that kind of vehicle by name, those of its controller first."""
+        if kind == "ackermann":
+            lengths = {"wheelbase_m": self.wheelbase, "wheel_radius_m": self.rolled}
+        elif self.radius is not None:
+            lengths = {"wheel_radius_m": self.radius, "track_width_m": self.track}
+        else:
+            lengths = {"wheel_radius_m": self.rolled, "track_width_m": self.effective}
+        return {
+            key: length
+            for key, length in lengths.items()
+            if length is not None and RANGES[key][0] < length.value < RANGES[key][1]
+        }
+
+
+def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
+    """Wheel radius and track by which a controller turns body commands into wheel speeds.
+
+    Args:
+        command: speed [m/s] and yaw rate [rad/s].
+        wheels: speeds of both sides [rad/s].
+
+    Returns:
+        Radius and track, each None where it is not excited; None if the wheels do not follow the command.
+    """
+    left, right = wheels.first, wheels.second
+    if left is None or right is None or not (left.moves and right.moves) or command.form != "body":
+        return None
+    start, end = max(left.times[0], right.times[0]), min(left.times[-1], right.times[-1])
+    if end - start < FEWEST_STEPS * STEP_S:
+        return None
+    edges = np.arange(start, end, STEP_S)
+    steps = Steps(edges[:-1], edges[1:])
+    steps = steps.take(left.is_there(steps) & right.is_there(steps))
+    if steps.start.size < FEWEST_STEPS:
+        return None
+    rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
+    turned = rolled[1] - rolled[0]
+    motion = Motion(steps, join_parts(0.5 * (rolled[0] + rolled[1]), 0.0), np.zeros(turned.size), turned, "z")
+    made = Reading("body", command.name, command.first, command.second).explain(motion)
+    if made is None or not made.is_sure or made.crossed:
+        return None
+    ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
+    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
+    radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
+    track = (
+        Length(bent / ahead, bent / ahead * float(np.hypot(errors[0], errors[1])))
+        if radius is not None and bent > 0.0 and 1.0 / errors[1] > CLEAR
+        else None
+    )
+    return radius, track
+
+
+def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
+    """Wheel radius and effective track by the motion, each None where it is not excited."""
+    ahead, bent = abs(float(wheels.ahead.gains[0])), abs(float(wheels.turned.gains[0]))
+    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (wheels.ahead, wheels.turned)]
+    radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
+    track = (
+        Length(ahead / bent, ahead / bent * float(np.hypot(errors[0], errors[1])))
+        if radius is not None and wheels.sign("turned")
+        else None
+    )
+    return radius, track
+
+
+def describe_vehicle(
+    seen: Geometry,
+    kind: str,
+    values: Mapping[str, object],
+    given: Sequence[str],
+    *,
+    is_body: bool,
+) -> tuple[str, str]:
+    """An id that depends only on the geometry of an unidentified vehicle, and a sentence on it.
+
+    Args:
+        seen: lengths by the signals.
+        kind: of the vehicle.
+        values: lengths that are used [m].
+        given: names of those that the user or the log gives.
+        is_body: whether commands and measurements are body motion alone.
+    """
+    if is_body and kind != "ackermann":
+        text = (
+            "no vehicle is given and none is needed: commands and measurements of the drive are body motion, "
+            "whose slip does not depend on wheel radius and track width"
+        )
+        if kind == "omni":
+            text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
+        return "fitted_body", text
+    lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
+    errors = {key: length.error for key, length in seen.list_lengths(kind).items()}
+    words = {
+        "wheel_radius_m": "a wheel radius of",
+        "track_width_m": "a track of",
+        "wheelbase_m": "a wheelbase of",
+    }
+    if kind == "differential" and seen.radius is None:
+        words["track_width_m"] = "an effective track of"
+    parts = {
+        key: f"{words[key]} {lengths[key]:.3g} m"
+        + (
+            f" (+- {format_share(errors[key] / lengths[key])})"
+            if key not in given and errors.get(key, 0.0) > _ROUGH * lengths[key]
+            else ""
+        )
+        for key in LENGTHS
+        if key in lengths
+    }
+    own = " and ".join(text for key, text in parts.items() if key in given)
+    shown = " and ".join(text for key, text in parts.items() if key not in given)
+    if not shown:
+        text = f"the vehicle has {own}, as given or recorded"
+    else:
+        text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
+    if shown and kind == "differential" and seen.radius is not None:
+        text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
+    elif shown:
+        text += f"; {shown} fits the motion, so that it is not reported as an effect"
+    if kind == "differential" and "track_width_m" not in lengths:
+        text += "; there is too little turning for a track: give --track-width"
+    if kind == "ackermann":
+        return (
+            f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
+            f"{text} (wheelbase_m under [vehicle] gives another)",
+        )
+    radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
+    alike = None if track is None else find_alike(radius, track)
+    guess = (
+        f"a {alike.name}? then --vehicle {alike.id}"
+        if alike
+        else "--wheel-radius and --track-width give others"
+    )
+    name = alike.id if alike else f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
+    return f"fitted_{name}", f"{text} ({guess})"
