@@ -21,7 +21,13 @@ from pipeline.recording.evidence import (
     find_wheel_unit,
     rate_command,
 )
-from pipeline.recording.geometry import Geometry, Length, measure_controller, measure_geometry
+from pipeline.recording.geometry import (
+    Geometry,
+    Length,
+    explain_wheels,
+    measure_controller,
+    measure_geometry,
+)
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Bent, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
@@ -615,18 +621,19 @@ class Examination:
     def _find_wheel_unit(self, command: Candidate | None, wheels: Candidate) -> None:
         """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
         explained, share = wheels.reading.explained, 1.0
-        lengths = None
-        if self.is_known and command is not None:
-            lengths = measure_controller(command.reading, wheels.reading)
-        if lengths is not None and lengths[0] is not None:
-            gain = lengths[0].value
+        radius = self.vehicle.wheel_radius_m if self.is_known else None
+        driven = None
+        if radius is not None and command is not None:
+            driven = explain_wheels(command.reading, wheels.reading)
+        if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
+            # Wheels follow a command closely on any ground.
+            gain = (radius if command.reading.form == "sides" else 1.0) / float(driven.ahead.gains[0])
         elif explained is not None and wheels.is_sure and wheels.sign("ahead"):
             gain, share = float(explained.ahead.gains[0]), explained.shares[0]
         else:
             return
         if wheels.source.signals[0].unit:
             return
-        radius = self.vehicle.wheel_radius_m if self.is_known else None
         unit = find_wheel_unit(gain, share, str(wheels.source), radius)
         if unit != "rad/s":
             what = f"the wheel speeds of {wheels.source} are in {unit}"

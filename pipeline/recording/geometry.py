@@ -63,18 +63,23 @@ class Geometry:
         }
 
 
-def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
-    """Wheel radius and track by which a controller turns body commands into wheel speeds.
+def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
+    """What wheels do of a command: their mean and the difference of their sides in place of a pose's motion.
 
     Args:
-        command: speed [m/s] and yaw rate [rad/s].
-        wheels: speeds of both sides [rad/s].
+        command: of the body or of both sides.
+        wheels: speeds of both sides.
 
     Returns:
-        Radius and track, each None where it is not excited; None if the wheels do not follow the command.
+        The fit; None if the wheels do not follow the command, or one of its sides counts backward.
     """
     left, right = wheels.first, wheels.second
-    if left is None or right is None or not (left.moves and right.moves) or command.form != "body":
+    if (
+        left is None
+        or right is None
+        or not (left.moves and right.moves)
+        or command.form not in {"body", "sides"}
+    ):
         return None
     start, end = max(left.times[0], right.times[0]), min(left.times[-1], right.times[-1])
     if end - start < FEWEST_STEPS * STEP_S:
@@ -87,8 +92,22 @@ def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None
     rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
     turned = rolled[1] - rolled[0]
     motion = Motion(steps, join_parts(0.5 * (rolled[0] + rolled[1]), 0.0), np.zeros(turned.size), turned, "z")
-    made = Reading("body", command.name, command.first, command.second).explain(motion)
-    if made is None or not made.is_sure or made.crossed:
+    made = Reading(command.form, command.name, command.first, command.second).explain(motion)
+    return None if made is None or not made.is_sure or made.crossed else made
+
+
+def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
+    """Wheel radius and track by which a controller turns body commands into wheel speeds.
+
+    Args:
+        command: speed [m/s] and yaw rate [rad/s].
+        wheels: speeds of both sides [rad/s].
+
+    Returns:
+        Radius and track, each None where it is not excited; None if the wheels do not follow a body command.
+    """
+    made = explain_wheels(command, wheels) if command.form == "body" else None
+    if made is None:
         return None
     ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
     errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
