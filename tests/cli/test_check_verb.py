@@ -44,7 +44,7 @@ def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
     late = check(place, "husky.toml", "logs/late.mcap", code=4)
 
     assert same.startswith("No change shown in 1 quantity.")
-    assert late.startswith("Changed: drive lag 0.3")
+    assert late.startswith("Changed: lag of the drive 0.3")
     assert "-> 1.19 s" in late
     rows = late.splitlines()[1:]
     assert max(map(len, rows)) <= 80
@@ -83,7 +83,7 @@ def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
     assert 'failures="0"' in kept
     assert 'failures="1"' in broken
     markdown = check(place, "husky.toml", "logs/late.mcap", "--to", "markdown", code=4)
-    assert markdown.startswith("**Changed: drive lag")
+    assert markdown.startswith("**Changed: lag of the drive")
 
 
 def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
@@ -92,14 +92,14 @@ def test_a_baseline_is_kept_and_renewed(place: Path) -> None:
     late = check(place, "robot.json", "logs/late.mcap", code=4)
 
     assert [run["run"].rpartition("/")[2] for run in first["runs"]] == ["a", "b"]
-    assert late.startswith("Changed: drive lag")
+    assert late.startswith("Changed: lag of the drive")
     shared = run_verb("check", "robot.json", "logs/a.mcap", cwd=place)
     assert shared.returncode == 1
     assert "a run is on both sides: logs/a. Give" in shared.stderr
     stays = run_verb("check", "robot.json", "logs/late.mcap", "--keep", "robot.json", cwd=place)
     assert stays.returncode == 1
     assert "the baseline stays as it is" in stays.stderr
-    assert stays.stdout.startswith("Changed: drive lag")
+    assert stays.stdout.startswith("Changed: lag of the drive")
     assert json.loads((place / "robot.json").read_text(encoding="utf-8")) == first
 
 

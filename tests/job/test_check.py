@@ -84,7 +84,7 @@ def test_the_number_that_changed_is_named_and_the_others_are_not(late: Sides) ->
     assert change.low < 0.15 < change.high
     assert found.code == BROKEN
     verdict = format_verdict(found)
-    assert verdict.startswith("Changed: drive lag 0.")
+    assert verdict.startswith("Changed: lag of the drive 0.")
     assert "ground unchanged" in verdict
     assert found.moves is not None
     assert found.moves[0] > 0.005
@@ -140,7 +140,7 @@ def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
     assert found.code == UNDETERMINED
     assert found.list_status("differs") == ["drive_lag.tau"]
     verdict = format_verdict(found)
-    assert verdict.startswith("No conclusion: the recordings differ in drive lag")
+    assert verdict.startswith("No conclusion: the recordings differ in lag of the drive")
     assert "at the default spread between runs" in verdict
     assert "more run" in verdict
 

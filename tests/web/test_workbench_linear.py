@@ -32,7 +32,7 @@ READERS: dict[str, tuple[str, Callable[[str], object]]] = {
     "idl": ('"', lambda text: idl.parse_idl("a/B", text)),
     "msg": ("a", lambda text: schema.parse_msg("a/B", text)),
     "metadata.yaml": ("relative_file_paths:\n", index._listed_files),
-    "file name": ("_", lambda text: index._split_number(Path(text))),
+    "file name": ("_", lambda text: index.split_number(Path(text))),
     "indexed field": ("[", columns._INDEXED.match),
     "unit": ("m", lambda text: parse_unit(text, "")),
     "configuration": ("[", sources._read_header),
