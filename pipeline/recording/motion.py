@@ -102,6 +102,8 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
     period = float(np.median(np.diff(time)))
     length = max(STEP_S, period)
     rows = _choose_rows(time, 0.95 * length)
+    if len(rows) <= FEWEST_STEPS:
+        return None
     time, position, quaternion = time[rows], position[rows], quaternion[rows]
     segment = fresh["segment"].to_numpy()[rows]
     axis, up, yaw = _find_plane(position, quaternion)

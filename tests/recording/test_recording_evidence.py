@@ -291,3 +291,8 @@ def test_two_alike_readings_are_not_told_apart() -> None:
 def test_too_few_poses_say_nothing() -> None:
     drive = draw(11)
     assert measure_motion(tabulate(drive).head(FEWEST_STEPS)) is None
+
+
+def test_poses_that_were_all_stamped_at_once_say_nothing() -> None:
+    poses = tabulate(draw(12))
+    assert measure_motion(poses.with_columns(t=pl.lit(3.0))) is None
