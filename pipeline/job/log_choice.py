@@ -2,8 +2,8 @@
 
 1. Words of names, message types and a robot description identify the vehicle unless the user names it.
 2. Types and names rank the topics of every role.
-3. If several topics may be the pose, or the vehicle is unknown, the candidates are read with all data that
-   the run needs, and compared by their content; the stages reuse the columns.
+3. All candidates are read with the data that the run needs. Their content decides which of several is the
+   pose, and by its motion `pipeline.recording` decides the rest; the stages reuse the columns.
 4. The geometry of an unidentified vehicle is estimated from the wheels and the pose.
 """
 
@@ -68,7 +68,7 @@ from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
-    from pipeline.recording import Geometry, Recording
+    from pipeline.recording import Geometry, Length, Recording
     from pipeline.stages.pose_choice import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
@@ -566,7 +566,7 @@ def _fit_vehicle(
         # The arrangement of the rollers is unknown: only body motion can be evaluated.
         kind = "omni"
     known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
-    fitted = _list_lengths(recording.geometry, kind)
+    fitted = {key: length.value for key, length in _list_lengths(recording.geometry, kind).items()}
     values = {key: value for key, value in {**fitted, **known}.items() if key in _LENGTHS}
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
@@ -644,7 +644,7 @@ def _take_unit_wheels(
 _LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 
 
-def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
+def _list_lengths(seen: Geometry, kind: str) -> dict[str, Length]:
     """Lengths that an analysis of this kind of vehicle takes from its signals [m]: the controller's first."""
     if kind == "ackermann":
         lengths = {"wheelbase_m": seen.wheelbase, "wheel_radius_m": seen.rolled}
@@ -653,7 +653,7 @@ def _list_lengths(seen: Geometry, kind: str) -> dict[str, float]:
     else:
         lengths = {"wheel_radius_m": seen.rolled, "track_width_m": seen.effective}
     return {
-        key: length.value
+        key: length
         for key, length in lengths.items()
         if length is not None and RANGES[key][0] < length.value < RANGES[key][1]
     }
@@ -678,7 +678,7 @@ def _describe_vehicle(
             text += " (sideways motion is commanded: --vehicle reads joints as mecanum wheels)"
         return "fitted_body", text
     lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
-    errors = _list_errors(seen, kind)
+    errors = {key: length.error for key, length in _list_lengths(seen, kind).items()}
     words = {
         "wheel_radius_m": "a wheel radius of",
         "track_width_m": "a track of",
@@ -723,14 +723,3 @@ def _describe_vehicle(
     )
     name = alike.id if alike else f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
     return f"fitted_{name}", f"{text} ({guess})"
-
-
-def _list_errors(seen: Geometry, kind: str) -> dict[str, float]:
-    """Standard errors of the lengths of `_list_lengths` [m]."""
-    if kind == "ackermann":
-        pairs = [("wheelbase_m", seen.wheelbase), ("wheel_radius_m", seen.rolled)]
-    elif seen.radius is not None:
-        pairs = [("wheel_radius_m", seen.radius), ("track_width_m", seen.track)]
-    else:
-        pairs = [("wheel_radius_m", seen.rolled), ("track_width_m", seen.effective)]
-    return {key: length.error for key, length in pairs if length is not None}
