@@ -115,7 +115,6 @@ class _DriveExamination(Examination):
             "ackermann" if steered else "",
             self._measure_lengths(command, wheels),
             tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
-            any(one.is_sure for one in commands),
         )
 
     # Signals.

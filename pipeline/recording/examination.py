@@ -95,7 +95,6 @@ class Recording:
         kind: kind of vehicle that the signals show; empty if they show none.
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
-        moves: whether the motion follows any of them.
     """
 
     sources: Sources
@@ -104,7 +103,6 @@ class Recording:
     kind: str = ""
     geometry: Geometry = Geometry()
     evidence: tuple[Evidence, ...] = ()
-    moves: bool = False
 
 
 _STILL = 0.1
@@ -230,11 +228,12 @@ class Examination:
         command, wheels = self._choose_roles(drives)
         if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
             self._read_again(wheels, motion)
-        is_reported = self._report_sides(command, wheels)
+        is_judged = self._report_sides(motion, command, wheels)
         if wheels is not None and "reversed" in self.changes.get("wheels", {}):
-            self._read_again(wheels, motion)
+            # What is wrong beside a side that is corrected shows now.
+            is_judged = not self._read_again(wheels, motion)
         kind = self._find_kind(wheels, motion)
-        if not is_reported:
+        if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
             self._read_again(wheels, motion, kind or "differential")
@@ -249,7 +248,6 @@ class Examination:
             kind,
             self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
-            any(drive.is_sure for drive in drives),
         )
 
     # Signals.
@@ -465,14 +463,17 @@ class Examination:
 
     # Sides and signs.
 
-    def _report_sides(self, command: Candidate | None, wheels: Candidate | None) -> bool:
+    def _report_sides(self, motion: Motion, command: Candidate | None, wheels: Candidate | None) -> bool:
         """A side that is dead or counts backward; whether one was found."""
         if wheels is not None and wheels.reading.form == "sides" and self._report_dead(wheels):
             return True
         of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
         of_command = command is not None and command.is_sure and is_crossed(command)
         if of_wheels and wheels is not None and wheels.reading.explained is not None and not of_command:
-            side = "right" if wheels.reading.explained.ahead.gains[0] > 0.0 else "left"
+            # Of a heading that was turned the command tells which way is ahead.
+            is_behind = bool(motion.offset_deg) and command is not None and command.sign("ahead") < 0
+            is_right = (wheels.reading.explained.ahead.gains[0] > 0.0) != is_behind
+            side = "right" if is_right else "left"
             margin = wheels.reading.explained.sign_margin
             self._correct(
                 "wheels",
@@ -675,7 +676,8 @@ class Examination:
             ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
             scale = ahead if car is wheels else 1.0
             error = scale / bent / abs(float(explained.turned.t[0]))
-            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if car is wheels else None
+            is_rolled = car is wheels and car.sign("ahead")
+            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if is_rolled else None
             return Geometry(rolled=rolled, wheelbase=Length(scale / bent, error))
         if wheels is None or wheels.reading.form != "sides":
             sides = command if command is not None and command.reading.form == "sides" else None

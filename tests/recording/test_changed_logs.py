@@ -97,6 +97,19 @@ def test_the_line_that_is_offered_settles_it(
         assert roles >= {"command", "wheels"}
 
 
+def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path) -> None:
+    path, log, _ = logs["husky_tile"]
+    roles = find_roles(path)
+    for name in ("poses turned by 90 degrees", "right wheels reversed"):
+        made = CHANGES[name].make(log, roles)
+        assert made is not None
+        log = made
+    choice = set_up_log(write(log, tmp_path / path.name), Options(out=tmp_path)).choice
+    assert choice.recording is not None
+    assert choice.recording.configuration.wheels.reversed == "right"
+    assert choice.recording.configuration.pose.heading_deg == pytest.approx(-90.0)
+
+
 def test_a_unit_that_the_user_gives_is_not_decided_otherwise(
     logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
 ) -> None:
