@@ -577,11 +577,14 @@ def _fit_vehicle(
             return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
-        text = (
-            f"not used: {sources.wheels}: the vehicle is not known, and its motion does not show the "
-            "radius of its "
-            "wheels (--wheel-radius gives it)"
+        why = (
+            "the vehicle is not known, and its motion does not show the radius of its wheels (--wheel-radius "
+            "gives it)"
         )
+        read = {one.name for one in recording.evidence}
+        if read and str(sources.wheels) not in read:
+            why = "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
+        text = f"not used: {sources.wheels}: {why}"
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
         sources, is_body = replace(sources, wheels=None), True
     if kind == "ackermann" and "wheelbase_m" not in values:

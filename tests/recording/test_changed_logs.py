@@ -177,6 +177,16 @@ def test_a_case_of_the_field_is_told(name: str, tmp_path: Path) -> None:
     assert TOLD[name] in " ".join(one.text for one in setup.choice.findings)
 
 
+@pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
+def test_joints_that_are_not_there_are_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "joints.toml").write_text('[wheels]\nleft = ["no_such"]\nright = ["nor_this"]')
+    options = Options(out=tmp_path, config=tmp_path / "joints.toml")
+    told = set_up_log(CASES / "logs" / "y_up.mcap", options).choice.findings
+    (text,) = [one.text for one in told if one.id == "wheels_left_out"]
+    assert "[wheels]" in text
+    assert "radius" not in text
+
+
 @pytest.mark.long
 @pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
 def test_cases_of_the_field_say_what_they_must(tmp_path: Path) -> None:
