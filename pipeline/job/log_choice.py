@@ -2,8 +2,8 @@
 
 1. Words of names, message types and a robot description identify the vehicle unless the user names it.
 2. Types and names rank the topics of every role.
-3. If several topics may be the pose, or the vehicle is unknown, the candidates are read with all data that
-   the run needs, and compared by their content; the stages reuse the columns.
+3. All candidates are read with the data that the run needs. Their content decides which of several is the
+   pose, and by its motion `pipeline.recording` decides the rest; the stages reuse the columns.
 4. The geometry of an unidentified vehicle is estimated from the wheels and the pose.
 """
 
@@ -576,11 +576,14 @@ def _fit_vehicle(
             return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         if sources.command is None or sources.command.form is not DriveForm.BODY:
             raise problem
-        text = (
-            f"not used: {sources.wheels}: the vehicle is not known, and its motion does not show the "
-            "radius of its "
-            "wheels (--wheel-radius gives it)"
+        why = (
+            "the vehicle is not known, and its motion does not show the radius of its wheels (--wheel-radius "
+            "gives it)"
         )
+        read = {one.name for one in recording.evidence}
+        if read and str(sources.wheels) not in read:
+            why = "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
+        text = f"not used: {sources.wheels}: {why}"
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
         sources, is_body = replace(sources, wheels=None), True
     if kind == "ackermann" and "wheelbase_m" not in values:

@@ -127,8 +127,7 @@ class _DriveExamination(Examination):
             for kind in ("ackermann", "differential"):
                 if kind == "ackermann" and source.form is not DriveForm.JOINTS:
                     continue
-                section = self.configuration.wheels
-                reading = self._read(source, is_measured=True, kind=kind, section=section)
+                reading = self._read(source, is_measured=True, kind=kind)
                 if reading is None or not reading.inputs:
                     continue
                 if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
@@ -146,7 +145,7 @@ class _DriveExamination(Examination):
         for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
             if taken & {signal.topic for signal in source.signals}:
                 continue
-            reading = self._read(source, is_measured=False, section=self.configuration.command)
+            reading = self._read(source, is_measured=False)
             if reading is not None:
                 reading.explain(motion)
                 drives.append(Candidate(source, reading, number, is_measured=False))

@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError
+from pipeline.core import SlipError, enumerate_texts
 from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
 from pipeline.recording.evidence import (
@@ -54,7 +54,7 @@ class Evidence:
     Attributes:
         name: its topics.
         role: ``command``, ``wheels``, ``gyro``, or empty if it is not used.
-        reason: why it is not used; empty if it is.
+        reason: why it is not used, or nothing is known of it; else empty.
         margin: Vuong's statistic of the motion with it against the motion alone; None if too little of it is
             recorded.
         ahead, turned: motion over signal, in the signal's units; zero where it is not excited.
@@ -206,21 +206,23 @@ class Examination:
             else None
         )
         drives = self._read_drives(motion)
-        readings = [drive.reading for drive in drives] + ([gyro] if gyro else [])
+        gyros = [] if gyro is None else [gyro]
+        readings = [*(drive.reading for drive in drives), *gyros]
         for one in readings:
             one.explain(motion)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
-        is_reported = self._report_sides(command, wheels)
-        if (
-            wheels is not None
-            and wheels.source.form is DriveForm.JOINTS
-            and "reversed" in self.changes.get("wheels", {})
-        ):
+        if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
             self._read_again(wheels, motion)
+        is_judged = self._report_sides(motion, command, wheels)
+        if wheels is not None and "reversed" in self.changes.get("wheels", {}):
+            # What is wrong beside a side that is corrected shows now.
+            is_judged = not self._read_again(wheels, motion)
         kind = self._find_kind(wheels, motion)
-        if not is_reported:
+        if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
+        if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
+            self._read_again(wheels, motion, kind or "differential")
         self._find_units(command, wheels)
         used = (("command", command), ("wheels", wheels))
         roles = {id(one.reading): role for role, one in used if one is not None}
@@ -231,7 +233,7 @@ class Examination:
             tuple(self.findings),
             kind,
             self._measure(command, wheels),
-            tuple(describe(one, roles) for one in readings),
+            tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
         )
 
     # Signals.
@@ -259,10 +261,8 @@ class Examination:
         kind: str = "differential",
         section: DriveSection | None = None,
     ) -> Reading | None:
-        """The signals of a source with unit lengths; None if they cannot be read."""
-        section = section or DriveSection()
-        if source.reason == CONFIGURED:
-            section = self.configuration.wheels if is_measured else self.configuration.command
+        """The signals of a source, with unit lengths; None if they cannot be read as the user says."""
+        section = section or self._find_section(source, is_measured=is_measured)
         if source.form is DriveForm.STEERING:
             kind = "ackermann"
         self.extraction.vehicle = Vehicle(
@@ -287,6 +287,13 @@ class Examination:
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
         return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
+
+    def _find_section(self, source: DriveSource, *, is_measured: bool) -> DriveSection:
+        """What the user says of a source: of the topic that is named, or of any if none is."""
+        of_role = self.configuration.wheels if is_measured else self.configuration.command
+        chosen = self.sources.wheels if is_measured else self.sources.command
+        is_another = chosen is not None and chosen.reason == CONFIGURED and chosen.signals != source.signals
+        return DriveSection() if is_another else of_role
 
     def _read_by_motion(self, source: DriveSource, motion: Motion) -> Reading | None:
         """Joints whose names show no side, each put on the side on which it turns; None without."""
@@ -424,7 +431,7 @@ class Examination:
 
     def _read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
         """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
-        section = self._complete().wheels if "wheels" in self.changes else None
+        section = self._complete().wheels
         reading = self._read(wheels.source, is_measured=True, kind=kind, section=section)
         made = None if reading is None else reading.explain(motion)
         if reading is None or made is None or (kind == "ackermann" and not made.sign("turned")):
@@ -442,14 +449,17 @@ class Examination:
 
     # Sides and signs.
 
-    def _report_sides(self, command: Candidate | None, wheels: Candidate | None) -> bool:
+    def _report_sides(self, motion: Motion, command: Candidate | None, wheels: Candidate | None) -> bool:
         """A side that is dead or counts backward; whether one was found."""
         if wheels is not None and wheels.reading.form == "sides" and self._report_dead(wheels):
             return True
         of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
         of_command = command is not None and command.is_sure and is_crossed(command)
         if of_wheels and wheels is not None and wheels.reading.explained is not None and not of_command:
-            side = "right" if wheels.reading.explained.ahead.gains[0] > 0.0 else "left"
+            # Of a heading that was turned the command tells which way is ahead.
+            is_behind = bool(motion.offset_deg) and command is not None and command.sign("ahead") < 0
+            is_right = (wheels.reading.explained.ahead.gains[0] > 0.0) != is_behind
+            side = "right" if is_right else "left"
             margin = wheels.reading.explained.sign_margin
             self._correct(
                 "wheels",
@@ -532,8 +542,7 @@ class Examination:
 
     def _report_frame(self, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
         source = self.sources.pose
-        there = {name for (name, _), sign in signs.items() if sign}
-        who = " and ".join(word for name, word in _AGREE.items() if name in there) or "the other signals"
+        who, drivers = _name_witnesses(signs, "turned"), _name_witnesses(signs, "ahead")
         if up != "z":
             direction, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
             what = f"the {axis} axis of the poses of {source} points {direction}"
@@ -544,12 +553,11 @@ class Examination:
             self._correct("pose", f"{what}, as {who} show", f'up = "{up}"', {"up": up})
         if offset:
             side = "right" if offset > 0.0 else "left"
-            what = (
-                f"the heading of {source} is {abs(offset):.0f} degrees to the {side} of the course of {who}"
-            )
+            off = f"{abs(offset):.0f} degrees to the {side}"
+            what = f"the heading of {source} is {off} of the course of {drivers}"
             if abs(offset) == _HALF_TURN:
                 what = (
-                    f"the poses of {source} look to the rear where {who} drive ahead (a sensor that is "
+                    f"the poses of {source} look to the rear where {drivers} drive ahead (a sensor that is "
                     "mounted "
                     "backward, or base_link points to the rear)"
                 )
@@ -601,14 +609,15 @@ class Examination:
                 )
             ]
             speed, rate = find_body_units(gains, explained.shares)
-            if speed != "m/s":
+            section = self.configuration.command
+            if speed != "m/s" and section.unit is None:
                 self._correct(
                     "command",
                     f"the speed of {command.source} is in {speed}",
                     f'unit = "{speed}"',
                     {"unit": speed},
                 )
-            if rate != "rad/s":
+            if rate != "rad/s" and section.yaw_unit is None:
                 self._correct(
                     "command",
                     f"the yaw rate of {command.source} is in {rate}",
@@ -632,7 +641,7 @@ class Examination:
             gain, share = float(explained.ahead.gains[0]), explained.shares[0]
         else:
             return
-        if wheels.source.signals[0].unit:
+        if wheels.source.signals[0].unit or self.configuration.wheels.unit is not None:
             return
         unit = find_wheel_unit(gain, share, str(wheels.source), radius)
         if unit != "rad/s":
@@ -654,7 +663,8 @@ class Examination:
             ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
             scale = ahead if car is wheels else 1.0
             error = scale / bent / abs(float(explained.turned.t[0]))
-            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if car is wheels else None
+            is_rolled = car is wheels and car.sign("ahead")
+            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if is_rolled else None
             return Geometry(rolled=rolled, wheelbase=Length(scale / bent, error))
         if wheels is None or wheels.reading.form != "sides":
             sides = command if command is not None and command.reading.form == "sides" else None
@@ -698,12 +708,16 @@ class Examination:
             if getattr(getattr(self.configuration, section), key) != getattr(default, key)
         ]
         names = {"pose": "pose_turned", "wheels": "wheels_corrected", "command": "command_corrected"}
+        if "up" in change and not given and self.configuration.pose.axes != default.axes:
+            given = ["axes"]
         if given:
             text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
             self.findings.append(Finding("signs_contradict", "error", text, where=section))
             return
         self.changes.setdefault(section, {}).update(change)
-        text = f"{what}: corrected ({line} under [{section}] in run.toml; its default takes them as recorded)"
+        lines = [line for key, line in _AS_RECORDED[section].items() if key in change]
+        otherwise = "".join(f"; {line} takes them as recorded" for line in lines)
+        text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
         self.findings.append(Finding(names[section], "warning", text, where=section, value=margin))
 
     def _complete(self) -> Configuration:
@@ -715,6 +729,12 @@ class Examination:
 
 
 _HALF_TURN = 180.0
+_AS_RECORDED: Mapping[str, Mapping[str, str]] = {
+    "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0"},
+    "wheels": {"unit": 'unit = "rad/s"'},
+    "command": {"unit": 'unit = "m/s"', "yaw_unit": 'yaw_unit = "rad/s"'},
+}
+"""Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
 _AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
 _AGAINST = {"command": "the commands", "wheels": "the measured wheels", "gyro": "the gyro"}
 _FAULTS = {
@@ -741,6 +761,12 @@ _REMEDIES = {
     "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
     "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",
 }
+
+
+def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:
+    """The signals that show in which way a body turns, or drives."""
+    there = {name for (name, of), sign in signs.items() if sign and of == axis}
+    return enumerate_texts([word for name, word in _AGREE.items() if name in there]) or "the other signals"
 
 
 def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
@@ -770,7 +796,10 @@ def describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
     """How the motion follows a reading, with its role by identity."""
     made, role = reading.explained, roles.get(id(reading), "")
     if made is None:
-        return Evidence(reading.name, role, "" if role else "too little of it is recorded beside the poses")
+        sizes = [one.values.size for one in (reading.first, reading.second) if one is not None]
+        is_constant = not reading.inputs and max(sizes, default=0) >= FEWEST_STEPS
+        why = "it is the same throughout" if is_constant else "too little of it is recorded beside the motion"
+        return Evidence(reading.name, role, why)
     gains = (float(made.ahead.gains[0]), float(made.turned.gains[0]))
     reason = "" if role else "another is likelier" if made.is_sure else "the motion does not follow it"
     if not role and made.is_sure and max(abs(gain - 1.0) for gain in gains) < _EQUAL:

@@ -186,7 +186,8 @@ def describe_vehicle(
     if shown and kind == "differential" and seen.radius is not None:
         text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
     elif shown:
-        text += f"; {shown} fits the motion, so that it is not reported as an effect"
+        verb = "fit" if " and " in shown else "fits"
+        text += f"; {shown} {verb} the motion, so that no effect is reported of it"
     if kind == "differential" and "track_width_m" not in lengths:
         text += "; there is too little turning for a track: give --track-width"
     if kind == "ackermann":

@@ -29,11 +29,9 @@ class Motion:
         moved: displacements in the plane of motion, shape (n,), as complex numbers [m].
         middle: recorded heading in the middle of each step [rad].
         turned: change of the recorded heading [rad].
-        up: axis that points up, ``z`` or ``-y``, as the rotation and the path show it.
+        up: axis across the plane of motion, ``x``, ``y`` or ``z``; whether it points up, other signals tell.
         flip: whether the heading is read the other way round.
         offset_deg: angle that is added to the heading.
-        rate_hz: poses per second.
-        odd: number of steps that are left out since the pose jumps.
     """
 
     steps: Steps
@@ -43,8 +41,6 @@ class Motion:
     up: str
     flip: bool = False
     offset_deg: float = 0.0
-    rate_hz: float = 0.0
-    odd: int = 0
 
     @property
     def body(self) -> Complex:
@@ -102,15 +98,14 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
     period = float(np.median(np.diff(time)))
     length = max(STEP_S, period)
     rows = _choose_rows(time, 0.95 * length)
+    if len(rows) <= FEWEST_STEPS:
+        return None
     time, position, quaternion = time[rows], position[rows], quaternion[rows]
     segment = fresh["segment"].to_numpy()[rows]
     axis, up, yaw = _find_plane(position, quaternion)
     first, second = _PLANES[axis]
     # A positive turn about y leads from x to -z.
     plane = position[:, first] + (-1j if axis == 1 else 1j) * position[:, second]
-    if up.startswith("-"):
-        # Seen from above, the second axis of the plane points the other way.
-        plane, yaw = plane.conj(), -yaw
     elapsed, moved, turned = np.diff(time), np.diff(plane), np.diff(yaw)
     whole = (elapsed > 0.3 * length) & (elapsed < 3.0 * length) & (np.diff(segment) == 0)
     if whole.sum() < FEWEST_STEPS:
@@ -127,8 +122,6 @@ def measure_motion(poses: pl.DataFrame) -> Motion | None:
         middle[sane],
         turned[sane],
         up,
-        rate_hz=1.0 / period if period > 0.0 else 0.0,
-        odd=int((whole & ~sane).sum()),
     )
 
 
@@ -142,7 +135,7 @@ def _choose_rows(time: Floats, length: float) -> list[int]:
 
 
 def _find_plane(position: Floats, quaternion: Floats) -> tuple[int, str, Floats]:
-    """Index of the axis across the plane of motion, its name with the sign that points up, and the headings.
+    """Index of the axis across the plane of motion, its name, and the headings about it.
 
     The usual axis is z. Another one counts if the body turns about it four times as much, and moves along it
     least.

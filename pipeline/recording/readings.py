@@ -1,7 +1,7 @@
 """Signals that may explain a motion: a command, the wheels or a gyro, with free gains and a free delay.
 
 A reading has two inputs: speed and yaw rate of a body, speeds of the left and the right wheels, or speed and
-    steering angle. They are held on a fine grid, delayed, and integrated over the steps of the motion.
+steering angle. They are held on a fine grid, delayed, and integrated over the steps of the motion.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ _SLOW_S = 0.4
 """Period [s] from which on a signal may be sent on changes only: then it holds until the next one."""
 _FEW_CELLS = 2.0
 """Cells of the grid without a signal that are no gap."""
+_LONGEST_S = 6.0 * 3600.0
+"""Distance [s] from the middle message beyond which a stamp is wrong, or more of a drive adds nothing."""
 _PAIR = 2
 _DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
@@ -38,6 +40,8 @@ class Held:
 
     def __init__(self, times: Floats, values: Floats) -> None:
         known = np.isfinite(values)
+        if known.any():
+            known &= np.abs(times - np.median(times[known])) < _LONGEST_S
         self.times, self.values = times[known], values[known]
         self.moves = self.values.size >= FEWEST_STEPS and bool(np.ptp(self.values) > 0.0)
         self._sums: dict[float, Floats] = {}
@@ -72,6 +76,10 @@ class Held:
     def lagged(self, lag: float) -> Floats:
         """The signal on its grid after a first-order lag."""
         return follow(self.grid, lag)
+
+    def forget(self) -> None:
+        """Free the integrals, one for every lag that was tried: of many long signals they fill the memory."""
+        self._sums.clear()
 
     def integrate(self, steps: Steps, lag: float, delay: float) -> Floats:
         """Integral over each step."""
@@ -141,7 +149,6 @@ class Explained:
         crossed: whether one side of the drive counts backward.
         lag, delay: [s].
         ahead, turned: fits of both channels.
-        lever: distance of the pose to the left of the axle's middle that fits [m].
         none: likelihoods of both channels without the reading.
         other: likelihood with (or without) one side reversed; None where it was not tried.
         shares: of both channels, the part of their size that is explained, from 0 to 1.
@@ -196,8 +203,7 @@ class Reading:
 
     Attributes:
         form: ``body`` (speed, yaw rate), ``sides`` (left, right), ``steering`` (speed, speed times the
-            tangent of the
-            angle) or ``gyro`` (nothing, yaw rate).
+            tangent of the angle) or ``gyro`` (nothing, yaw rate).
         name: for people.
         first, second: the inputs.
     """
@@ -252,6 +258,8 @@ class Reading:
         self.explained = tried[best]
         if len(tried) > 1:
             self.explained.other = tried[not best].blocks
+        for one in self.inputs:
+            one.forget()
         return self.explained
 
     def _find_busy(self, motion: Motion) -> Flags:

@@ -71,13 +71,11 @@ class Fit:
         gains: coefficients, shape (k,).
         t: their ratios to standard errors that are robust to correlation within blocks, shape (k,).
         blocks: log-likelihood of every block, shape (m,).
-        scale: of the innovations.
     """
 
     gains: Floats
     t: Floats
     blocks: Floats
-    scale: float
 
 
 @compiled("void(float64[:, ::1], float64, float64, boolean[::1])")
@@ -115,10 +113,11 @@ def _find_scale(rest: Floats) -> float:
     return float(np.sqrt(_reweigh_scale(rest, max(1.5 * float(np.median(rest * rest)), 1e-16))))
 
 
-def _likelihoods(rest: Floats) -> tuple[float, Floats]:
-    """Scale and log-likelihood of every residual, up to a constant."""
+def _list_likelihoods(rest: Floats) -> Floats:
+    """Log-likelihood of every residual, up to a constant."""
     scale = _find_scale(rest)
-    return scale, -np.log(scale) - 0.5 * (_FREEDOM + 1.0) * np.log1p((rest / scale) ** 2 / _FREEDOM)
+    made: Floats = -np.log(scale) - 0.5 * (_FREEDOM + 1.0) * np.log1p((rest / scale) ** 2 / _FREEDOM)
+    return made
 
 
 def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:
@@ -152,20 +151,19 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     some = steps.block % max(1, rest.size // _MOST_ROWS) == 0
     part, few = rest[some][:, None], steps.take(some)
     for each in _NOISES:
-        score = float(_likelihoods(_whiten(part, each, few)[:, 0])[1].sum())
+        score = float(_list_likelihoods(_whiten(part, each, few)[:, 0]).sum())
         if score > best + 2.0:
             noise, best = each, score
     white = _whiten(np.column_stack([values, columns]), noise, steps)
     design = white[:, 1:]
     gains, rest, weight = _solve(white[:, 0], design)
-    scale, each_step = _likelihoods(rest)
-    blocks: Floats = np.bincount(steps.block, each_step).astype(np.float64)
+    blocks: Floats = np.bincount(steps.block, _list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
-        return Fit(gains, gains, blocks, scale)
+        return Fit(gains, gains, blocks)
     inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
     pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
     error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
-    return Fit(gains, gains / error, blocks, scale)
+    return Fit(gains, gains / error, blocks)
 
 
 def measure_share(values: Floats, model: Floats) -> float:

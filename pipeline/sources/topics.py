@@ -459,6 +459,7 @@ _ALONG = re.compile(r"(?:p|pos|pose|position)?_?(x)(?:_m)?|(east)(?:ing)?")
 _ACROSS = {"x": "y", "east": "north"}
 _ANGLE = re.compile(r"(?:theta|yaw|heading|psi|phi|bearing)(?!.*(?:rate|vel|acc|cov)).*")
 _NOT_A_POSITION = re.compile(r"vel|twist|linear|angular|accel|cov|gyro|mag|goal|target|cmd|error|std")
+_TURN = re.compile(r"orient|quat|rotation")
 
 
 def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str] | None:
@@ -478,7 +479,7 @@ def find_pose_fields(topic: str, fields: Collection[str]) -> tuple[str, str, str
     for path in usable:
         space, dot, name = path.rpartition(".")
         match = _ALONG.fullmatch(name.lower())
-        if match is None:
+        if match is None or _TURN.search(space.lower()):
             continue
         start = match.start(match.lastindex or 0)
         along = match[match.lastindex or 0]

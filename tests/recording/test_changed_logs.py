@@ -64,6 +64,66 @@ def test_a_changed_log_gives_the_same_answer_or_tells(
     check(logs, name, CHANGES[change], tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("name", "change", "line"),
+    [
+        ("husky_tile", "right wheels reversed", '[wheels]\nreversed = "right"'),
+        ("husky_tile", "both encoders backward", "[wheels]\nsign = -1"),
+        ("husky_tile", "sides exchanged", "[wheels]\nexchanged = true"),
+        ("husky_tile", "wheels in rpm", '[wheels]\nunit = "rpm"'),
+        ("turtlebot4", "yaw rate in degrees", '[command]\nyaw_unit = "deg/s"'),
+        ("husky_tile", "poses turned by 90 degrees", "[pose]\nheading_deg = -90"),
+    ],
+)
+def test_the_line_that_is_offered_settles_it(
+    logs: dict[str, tuple[Path, Log, Answer]], name: str, change: str, line: str, tmp_path: Path
+) -> None:
+    path, log, _ = logs[name]
+    made = CHANGES[change].make(log, find_roles(path))
+    assert made is not None
+    changed = write(made, tmp_path / path.name)
+    (tmp_path / "line.toml").write_text(line)
+    found, settled = (
+        set_up_log(changed, Options(out=tmp_path, config=config)).choice
+        for config in (None, tmp_path / "line.toml")
+    )
+    codes = {"wheels_corrected", "command_corrected", "pose_turned", "signs_contradict"}
+    told = [one.text for one in found.findings if one.id in codes]
+    assert line.split("\n")[1] in " ".join(told)
+    assert not [one.text for one in settled.findings if one.id in codes]
+    for choice in (found, settled):
+        assert choice.recording is not None
+        roles = {one.role for one in choice.recording.evidence}
+        assert roles >= {"command", "wheels"}
+
+
+def test_of_two_faults_both_are_corrected(logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path) -> None:
+    path, log, _ = logs["husky_tile"]
+    roles = find_roles(path)
+    for name in ("poses turned by 90 degrees", "right wheels reversed"):
+        made = CHANGES[name].make(log, roles)
+        assert made is not None
+        log = made
+    choice = set_up_log(write(log, tmp_path / path.name), Options(out=tmp_path)).choice
+    assert choice.recording is not None
+    assert choice.recording.configuration.wheels.reversed == "right"
+    assert choice.recording.configuration.pose.heading_deg == pytest.approx(-90.0)
+
+
+def test_a_unit_that_the_user_gives_is_not_decided_otherwise(
+    logs: dict[str, tuple[Path, Log, Answer]], tmp_path: Path
+) -> None:
+    path, log, _ = logs["turtlebot4"]
+    made = CHANGES["yaw rate in degrees"].make(log, find_roles(path))
+    assert made is not None
+    (tmp_path / "line.toml").write_text('[command]\nyaw_unit = "rad/s"')
+    options = Options(out=tmp_path, config=tmp_path / "line.toml")
+    choice = set_up_log(write(made, tmp_path / path.name), options).choice
+    assert choice.recording is not None
+    assert choice.recording.configuration.command.yaw_unit == "rad/s"
+    assert not [one for one in choice.findings if one.severity == "error"]
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("name", "change"),
@@ -115,6 +175,16 @@ def test_a_case_of_the_field_is_told(name: str, tmp_path: Path) -> None:
     log = CASES / "logs" / f"{name}.mcap"
     setup = set_up_log(log, Options(out=tmp_path))
     assert TOLD[name] in " ".join(one.text for one in setup.choice.findings)
+
+
+@pytest.mark.skipif(not CASES.is_dir(), reason="../shared/cases is not here")
+def test_joints_that_are_not_there_are_the_reason(tmp_path: Path) -> None:
+    (tmp_path / "joints.toml").write_text('[wheels]\nleft = ["no_such"]\nright = ["nor_this"]')
+    options = Options(out=tmp_path, config=tmp_path / "joints.toml")
+    told = set_up_log(CASES / "logs" / "y_up.mcap", options).choice.findings
+    (text,) = [one.text for one in told if one.id == "wheels_left_out"]
+    assert "[wheels]" in text
+    assert "radius" not in text
 
 
 @pytest.mark.long

@@ -290,3 +290,16 @@ def test_two_alike_readings_are_not_told_apart() -> None:
 def test_too_few_poses_say_nothing() -> None:
     drive = draw(11)
     assert measure_motion(tabulate(drive).head(FEWEST_STEPS)) is None
+
+
+def test_poses_that_were_all_stamped_at_once_say_nothing() -> None:
+    poses = tabulate(draw(12))
+    assert measure_motion(poses.with_columns(t=pl.lit(3.0))) is None
+
+
+def test_a_stamp_of_another_epoch_is_left_out() -> None:
+    times, values = np.arange(0.0, 100.0, 0.05), np.sin(np.arange(2000))
+    times[1000] = 2e9
+    held = Held(np.sort(times), values)
+    assert held.times[-1] < 100.0
+    assert held.grid.size < 10_000

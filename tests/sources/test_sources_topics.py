@@ -17,6 +17,7 @@ from pipeline.sources import (
     convert,
     find_preset,
 )
+from pipeline.sources.topics import find_pose_fields
 
 JOINTS = "sensor_msgs/msg/JointState"
 FLOAT = "std_msgs/msg/Float64"
@@ -322,3 +323,9 @@ def test_both_generations_of_autoware_are_read(control: str, vehicle: str, speed
         "/vehicle/status/velocity_status.longitudinal_velocity, "
         "/vehicle/status/steering_status.steering_tire_angle"
     )
+
+
+def test_an_orientation_is_no_position() -> None:
+    turned = ["orientation.x", "orientation.y", "orientation.z", "orientation.w"]
+    assert find_pose_fields("/imu/data", turned) is None
+    assert find_pose_fields("/tracker", [*turned, "p.x", "p.y"]) == ("p.x", "p.y", "")
