@@ -299,7 +299,8 @@ def _format_evidence(recording: Recording | None) -> list[str]:
         gains = (f"{one.ahead:.4g}" if one.ahead else "-", f"{one.turned:.4g}" if one.turned else "-")
         rows.append((*used, f"{one.margin:.1f}", *gains, f"{one.late_s:.2f} s", one.reason))
     widths = [max(len(row[column]) for row in rows) for column in range(6)]
-    about = "          z: how certain it is that the motion follows the signal; above 3 it is clear"
+    follows = "          z: how certain it is that the motion follows the signal, above 3 it is clear"
+    about = f"{follows}; x: motion over signal"
     return [
         "",
         *(

@@ -142,6 +142,8 @@ RATES = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mrad/s": 1e-3}
 WHEELS = {"rad/s": 1.0, "rpm": np.pi / 30.0, "deg/s": np.pi / 180.0}
 _STRANGE = {"rpm": 4.0, "deg/s": 4.0, "km/h": 4.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0}
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
+_NAMED = 4.0
+"""Surprise of another unit than that which a topic's name says [nats]."""
 _GOOD = 0.7
 """Least share of the motion that a signal explains whose unit is in question."""
 _WIN = 5.0
@@ -186,20 +188,22 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     Args:
         gain: path over the wheels' angle.
         share: part of the motion that is explained; a poor fit attenuates the gain.
-        name: of the signals, which may name the unit.
+        name: of the signals; a unit that it names is no surprise, and "rad/s" is one then.
         radius: of the wheels, if it is known; else about .12 m within a factor of two.
     """
-    for word, unit in (("rpm", "rpm"), ("deg", "deg/s")):
-        if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower()):
-            return unit
+    words = {"rpm": "rpm", "deg/s": "deg"}
+    named = {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
+    surprise = {unit: _STRANGE.get(unit, 0.0) for unit in WHEELS}
+    if named:
+        surprise = {unit: 0.0 if unit in named else _NAMED for unit in WHEELS}
     spread = 0.7 if radius is None else 0.35
     costs = {
         unit: _shrink(float(np.log(abs(gain) / factor / (radius or 0.12))), share) ** 2 / (2 * spread**2)
-        + _STRANGE.get(unit, 0.0)
+        + surprise[unit]
         for unit, factor in WHEELS.items()
     }
     best = min(costs, key=lambda unit: costs[unit])
-    return best if costs["rad/s"] - costs[best] > _WIN else "rad/s"
+    return best if best in named or costs["rad/s"] - costs[best] > _WIN else "rad/s"
 
 
 # Roles.

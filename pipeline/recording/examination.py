@@ -99,6 +99,8 @@ _SMALLEST_M = 0.1
 """Radius of a wheel [m] that counts as small."""
 _EQUAL = 0.02
 """Deviation of both gains from one within which a signal measures the motion."""
+_MOST = 20
+"""Candidates of a role that are compared, the likeliest by type and name: each costs a fit."""
 _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
@@ -125,7 +127,9 @@ def examine(
     sideways = any(find_sideways_share(data.topics, one) for one in _list_candidates(sources))
     if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
         # A body that moves sideways has no course.
-        return Recording(sources, configuration)
+        text = "the vehicle moves sideways: signs, units and the frame of its poses are not compared"
+        aside = (Finding("sideways_unexamined", "info", text, where="pose"),) if sources.pose else ()
+        return Recording(sources, configuration, aside)
     try:
         examination = Examination(data, sources, configuration, vehicle, is_known=is_known, where=where)
     except SlipError:
@@ -243,7 +247,7 @@ class Examination:
         wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
         drives, taken = [], set()
         for is_measured, sources in ((False, commands), (True, wheels)):
-            for rank, source in enumerate(one for one in sources if isinstance(one, DriveSource)):
+            for rank, source in enumerate([one for one in sources if isinstance(one, DriveSource)][:_MOST]):
                 key = (source.form, source.signals)
                 reading = None if key in taken else self._read(source, is_measured=is_measured)
                 if reading is None and key not in taken and is_measured and source == self.sources.wheels:
@@ -337,16 +341,22 @@ class Examination:
     def _turn(self, motion: Motion, readings: Sequence[Reading]) -> Motion:
         """The motion in the frame in which the readings explain it, and the readings fitted to it."""
         source, section = self.sources.pose, self.configuration.pose
-        if source is None or source.content is not PoseContent.POSE or section.heading_deg is not None:
+        if source is None or source.content is not PoseContent.POSE:
             return motion
         turned, margin = find_frame(motion, readings)
         if not margin:
             return motion
+        if section.heading_deg is not None:
+            text = (
+                f"by the motion the heading of {source} is {turned.offset_deg:.0f} degrees off (or as much "
+                "less half a turn), but [pose] in run.toml gives heading_deg, which is taken as it is given"
+            )
+            self.findings.append(Finding("pose_contradicted", "warning", text, where="pose", value=margin))
+            return motion
         if turned.flip:
             text = (
                 f"the headings of {source} turn against its own path: its frame is of the other hand; "
-                "correct what "
-                "publishes it"
+                "correct what publishes it"
             )
             self.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
         for one in readings:
@@ -710,6 +720,10 @@ class Examination:
         names = {"pose": "pose_turned", "wheels": "wheels_corrected", "command": "command_corrected"}
         if "up" in change and not given and self.configuration.pose.axes != default.axes:
             given = ["axes"]
+        if given and section == "pose":
+            text = f"{what}, but [pose] in run.toml gives {', '.join(given)}, which is taken as it is given"
+            self.findings.append(Finding("pose_contradicted", "warning", text, where=section, value=margin))
+            return
         if given:
             text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
             self.findings.append(Finding("signs_contradict", "error", text, where=section))
@@ -801,7 +815,7 @@ def describe(reading: Reading, roles: Mapping[int, str]) -> Evidence:
         why = "it is the same throughout" if is_constant else "too little of it is recorded beside the motion"
         return Evidence(reading.name, role, why)
     gains = (float(made.ahead.gains[0]), float(made.turned.gains[0]))
-    reason = "" if role else "another is likelier" if made.is_sure else "the motion does not follow it"
+    reason = "" if role else "another is as likely" if made.is_sure else "the motion does not follow it"
     if not role and made.is_sure and max(abs(gain - 1.0) for gain in gains) < _EQUAL:
         reason = "it measures the motion"
     return Evidence(

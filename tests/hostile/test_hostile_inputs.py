@@ -251,7 +251,7 @@ FLEETS = [
     ('[[match]]\n[match.run]\nterrain = "x"\n', "glob"),
     ("match = 3\n", "match"),
     ('[[match]]\nglob = "other"\n[match.runs]\n', "runs"),
-    ('[[match]]\nglob = "*"\n[match.command]\nunit = "mph"', r"line 4: .*'mph'.*cm/s, .*km/h, m/s, mm/s, .*rad"),
+    ('[[match]]\nglob = "*"\n[match.command]\nunit = "mph"', r"line 4: .*'mph'.*km/h, m/s, mm/s, .*rad"),
 ]
 """Files named fleet.toml above a log."""
 

@@ -27,11 +27,11 @@ QUICK = {
     ("husky_tile", "right wheels reversed"),
     ("husky_tile", "clock back by 10 s"),
     ("ackermann_gravel", "both encoders backward"),
-    ("turtlebot4", "poses in JSON"),
-    ("turtlebot4", "wheels in rpm"),
-    ("turtlebot4", "a measured twist beside"),
+    ("husky_tile", "poses in JSON"),
+    ("husky_tile", "wheels in rpm"),
+    ("husky_tile", "a measured twist beside"),
+    ("husky_tile", "sides exchanged"),
     ("turtlebot4", "yaw rate in degrees"),
-    ("turtlebot4", "sides exchanged"),
 }
 
 

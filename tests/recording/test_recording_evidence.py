@@ -225,7 +225,7 @@ def test_a_poor_fit_shows_no_unit() -> None:
 @pytest.mark.parametrize(
     ("gain", "name", "unit"),
     [(0.033, "/joint_states", "rad/s"), (0.3, "/joint_states", "rad/s"), (0.0105, "/wheel/left/rpm", "rpm"),
-     (0.0017, "/wheels", "deg/s")],
+     (0.0017, "/wheels", "deg/s"), (0.1, "/wheel/left/rpm", "rad/s")],
 )  # fmt: skip
 def test_unit_of_wheel_speeds(gain: float, name: str, unit: str) -> None:
     assert find_wheel_unit(gain, 0.95, name) == unit
