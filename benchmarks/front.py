@@ -15,6 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from mcap.exceptions import McapError
 from measuring import RECORDINGS
 from rewritten_logs import Change, Roles, list_changes, read, write
 
@@ -123,8 +124,8 @@ def run(chosen: argparse.Namespace) -> None:
         for log in list_logs(kept, chosen.logs):
             try:
                 verdicts = try_log(log, folder, changes)
-            except SlipError as error:
-                print(f"    {log.stem}: not read as it is: {error.what}")
+            except (SlipError, McapError) as error:
+                print(f"    {log.stem}: not written anew: {str(error)[:100]}")
                 continue
             for name, verdict in verdicts:
                 counts.setdefault(name, {}).setdefault(verdict, 0)
