@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from typing import Literal
 
 from pipeline.sources.message_types import NumberField, PoseFields, find_type, list_pairs
 
@@ -177,6 +178,11 @@ class Sources:
     others: Mapping[str, tuple[DriveSource | PoseSource | TopicSource, ...]] = field(default_factory=dict)
     power: PowerSource | None = None
 
+    def rank_drives(self, role: Literal["command", "wheels"]) -> list[DriveSource]:
+        """The choice for a role and its alternatives, the best first."""
+        chosen = self.command if role == "command" else self.wheels
+        return [one for one in (chosen, *self.others.get(role, ())) if isinstance(one, DriveSource)]
+
     @property
     def body_beside(self) -> DriveSource | None:
         """The body command that is recorded beside commanded wheels; None where there is none."""
@@ -184,8 +190,8 @@ class Sources:
             return None
         drives = (self.command, self.wheels, None if self.pose is None else self.pose.wheels)
         taken = {signal.topic for one in drives if one is not None for signal in one.signals}
-        for one in self.others.get("command", ()):
-            if isinstance(one, DriveSource) and one.form is DriveForm.BODY:
+        for one in self.rank_drives("command")[1:]:
+            if one.form is DriveForm.BODY:
                 topics = {signal.topic for signal in one.signals}
                 if len(topics) == 1 and not topics & taken and not MEASURED.search(min(topics).lower()):
                     return one
@@ -194,9 +200,7 @@ class Sources:
     def separated(self, copy: str = "") -> Sources:
         """The same, but with measured wheels from another topic than the pose, or than a copy of it."""
         poses = {copy, *(() if self.pose is None else (self.pose.topic,))}
-        ranked = [
-            one for one in (self.wheels, *self.others.get("wheels", ())) if isinstance(one, DriveSource)
-        ]
+        ranked = self.rank_drives("wheels")
         free = [one for one in ranked if not {signal.topic for signal in one.signals} <= poses]
         chosen = free[0] if free else None
         if chosen == self.wheels or (self.wheels is not None and self.wheels.reason == CONFIGURED):

@@ -66,7 +66,7 @@ class PoseRating:
         reason: as text.
         refusal: why it is unusable; empty if it is usable.
         made: tables extracted for the rating, without intervals; of the best candidate only.
-        places: its positions, rounded to a micrometre.
+        position: its positions [m], shape (n, 2), until copies are found.
         same_as: wheel odometry with the same positions; empty if there is none.
     """
 
@@ -81,7 +81,7 @@ class PoseRating:
     reason: str = ""
     refusal: str = ""
     made: Extracted | None = None
-    places: frozenset[tuple[float, float]] = frozenset()
+    position: Floats | None = None
     same_as: str = ""
 
     def format_line(self) -> str:
@@ -113,7 +113,7 @@ def rate_poses(
         ratings.append(_rate(data, candidate, sources, configuration, vehicle, where))
         ratings.sort(key=lambda rating: (bool(rating.refusal), -rating.score, -rating.rate_hz))
         ratings[1:] = [replace(worse, made=None) for worse in ratings[1:]]
-    return tuple(replace(_find_copy(one, ratings), places=frozenset()) for one in ratings)
+    return tuple(replace(_find_copy(one, ratings), position=None) for one in ratings)
 
 
 _COPIED: Final = 0.9
@@ -122,14 +122,20 @@ _COPIED: Final = 0.9
 
 def _find_copy(rating: PoseRating, ratings: Sequence[PoseRating]) -> PoseRating:
     """The rating of a pose that an odometry of the wheels, by its name, publishes as well."""
-    if not rating.places or not _ODOMETRY_FRAME.search(rating.parent.lower()):
+    reckoned = [one for one in ratings if one is not rating and DEAD_RECKONED.search(str(one.source).lower())]
+    if not reckoned or not _ODOMETRY_FRAME.search(rating.parent.lower()):
         return rating
-    for other in ratings:
-        is_dead_reckoned = DEAD_RECKONED.search(str(other.source).lower()) and other is not rating
-        if is_dead_reckoned and len(rating.places & other.places) > _COPIED * len(rating.places):
+    own = _round_positions(rating)
+    for other in reckoned:
+        if len(own & _round_positions(other)) > _COPIED * len(own):
             reason = f"the same positions as {other.source}, by its name an odometry of the wheels"
             return replace(rating, from_wheels=True, same_as=str(other.source), reason=reason)
     return rating
+
+
+def _round_positions(rating: PoseRating) -> set[tuple[float, ...]]:
+    """Positions of a candidate to a micrometre; none of one that is refused."""
+    return set() if rating.position is None else {*map(tuple, np.round(rating.position, 6).tolist())}
 
 
 def _rate(
@@ -197,7 +203,7 @@ def _rate(
         score=score,
         reason=", ".join(reasons),
         made=made,
-        places=frozenset(map(tuple, np.round(position, 6).tolist())),
+        position=position,
     )
 
 
