@@ -293,12 +293,7 @@ def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configu
     """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
     from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
 
-    drives = [
-        one
-        for role in ("command", "wheels")
-        for one in chosen.sources.others.get(role, ())
-        if isinstance(one, DriveSource)
-    ]
+    drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
     recording = examine_drive(
         data,
@@ -413,8 +408,7 @@ def _leave_out_silent(
     chosen = sources.command
     if chosen is None or chosen.reason == CONFIGURED or not _is_text(index, chosen):
         return channels, sources, []
-    others = [one for one in sources.others.get("command", ()) if isinstance(one, DriveSource)]
-    texts = [one for one in (chosen, *others) if _is_text(index, one)]
+    texts = [one for one in sources.rank_drives("command") if _is_text(index, one)]
     readable = {
         columns.topic for columns in _read_commands(index, texts) if with_texts(columns).log_time.size
     }
@@ -481,12 +475,7 @@ def _compare(
     from pipeline.recording import examine  # noqa: PLC0415 - heavy
     from pipeline.stages.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
-    drives = [
-        one
-        for role in ("command", "wheels")
-        for one in chosen.sources.others.get(role, ())
-        if isinstance(one, DriveSource)
-    ]
+    drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, [*rivals, *drives]))
     sources, ratings, findings = chosen.sources, chosen.ratings, list(chosen.findings)
     if rivals or _may_be_odometry(sources.pose):
@@ -495,8 +484,7 @@ def _compare(
             text = (
                 f"the pose of {ratings[0].source} is wheel odometry, not a localization: it is that of "
                 f"{ratings[0].same_as}, computed from the wheels, and says nothing about the ground; "
-                "record a "
-                "localization (lidar, camera, satellites, motion capture)"
+                "record a localization (lidar, camera, satellites, motion capture)"
             )
             findings.append(Finding("pose_from_wheels", "error", text, where="pose"))
         elif ratings and ratings[0].from_wheels:

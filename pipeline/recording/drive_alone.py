@@ -11,12 +11,10 @@ import numpy as np
 
 from pipeline.core import enumerate_texts
 from pipeline.logs import LogData
-from pipeline.recording.evidence import find_wheel_unit
 from pipeline.recording.examination import Candidate, Examination, Recording, describe, is_crossed
-from pipeline.recording.geometry import Geometry, Length
-from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
+from pipeline.recording.geometry import Geometry, Length, roll_wheels
+from pipeline.recording.motion import Motion
+from pipeline.recording.score import CLEAR
 from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.sources import (
     Configuration,
@@ -55,9 +53,8 @@ def examine_drive(
     Returns:
         The recording; None if no candidate for wheels turns, or there is no command.
     """
-    commands = [one for one in (sources.command, *sources.others.get("command", ())) if one is not None]
     if vehicle.kinematics.has_inputs("sideways") or any(
-        isinstance(one, DriveSource) and find_sideways_share(data.topics, one) for one in commands
+        find_sideways_share(data.topics, one) for one in sources.rank_drives("command")
     ):
         # Of its motion to the side only the wheels of a known vehicle show anything.
         return _take_by_name(sources, configuration) if is_known else None
@@ -73,8 +70,7 @@ def _take_by_name(sources: Sources, configuration: Configuration) -> Recording |
 
 def _replace_pose(sources: Sources, wheels: DriveSource) -> Sources:
     """Sources with these wheels in the rank of a pose, and without a gyro, which measures the ground."""
-    ranked = (sources.wheels, *sources.others.get("wheels", ()))
-    others = tuple(one for one in ranked if isinstance(one, DriveSource) and one != wheels)
+    others = tuple(one for one in sources.rank_drives("wheels") if one != wheels)
     pose = PoseSource(wheels.signals[0].topic, _REASON, content=PoseContent.WHEELS, wheels=wheels)
     return replace(sources, wheels=None, pose=pose, imu=None, others={**sources.others, "wheels": others})
 
@@ -122,8 +118,7 @@ class _DriveExamination(Examination):
 
     def _find_wheels(self) -> tuple[Candidate | None, Motion | None]:
         """The first candidate for wheels that turn, and their motion in its own units."""
-        ranked = (self.sources.wheels, *self.sources.others.get("wheels", ()))
-        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+        for number, source in enumerate(self.sources.rank_drives("wheels")):
             for kind in ("ackermann", "differential"):
                 if kind == "ackermann" and source.form is not DriveForm.JOINTS:
                     continue
@@ -132,7 +127,7 @@ class _DriveExamination(Examination):
                     continue
                 if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
                     continue
-                motion = _roll(reading)
+                motion = roll_wheels(reading)
                 if motion is not None:
                     return Candidate(source, reading, number, is_measured=True), motion
         return None, None
@@ -140,9 +135,8 @@ class _DriveExamination(Examination):
     def _read_commands(self, motion: Motion, wheels: Candidate) -> list[Candidate]:
         """Candidates for the command, fitted to the motion of the wheels."""
         taken = {signal.topic for signal in wheels.source.signals}
-        ranked = (self.sources.command, *self.sources.others.get("command", ()))
         drives = []
-        for number, source in enumerate(one for one in ranked if isinstance(one, DriveSource)):
+        for number, source in enumerate(self.sources.rank_drives("command")):
             if taken & {signal.topic for signal in source.signals}:
                 continue
             reading = self._read(source, is_measured=False)
@@ -154,14 +148,13 @@ class _DriveExamination(Examination):
     # Faults.
 
     def _report_dead_side(self, wheels: Candidate) -> None:
-        sides = {"left": wheels.reading.first, "right": wheels.reading.second}
-        dead = [name for name, side in sides.items() if side is None or not side.moves]
-        if len(dead) == 1:
+        dead = wheels.reading.dead_side
+        if dead:
             text = (
-                f"the {dead[0]} wheels' encoder reads the same throughout while the other wheels turn: it is "
+                f"the {dead} wheels' encoder reads the same throughout while the other wheels turn: it is "
                 "dead, and the log holds no pose in its rank"
             )
-            self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead[0]}"))
+            self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
 
     def _report_opposite(self, command: Candidate, wheels: Candidate) -> None:
         """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
@@ -199,20 +192,9 @@ class _DriveExamination(Examination):
     def _find_unit(self, wheels: Candidate, command: Candidate) -> None:
         """Unit of the wheel speeds by the radius that each would mean."""
         explained = command.reading.explained
-        if (
-            self.is_known
-            or self.configuration.wheels.unit is not None
-            or explained is None
-            or not command.sign("ahead")
-            or command.reading.form == "sides"
-            or wheels.source.signals[0].unit
-        ):
+        if self.is_known or explained is None or not command.sign("ahead") or command.reading.form == "sides":
             return
-        gain = 1.0 / abs(float(explained.ahead.gains[0]))
-        unit = find_wheel_unit(gain, explained.shares[0], str(wheels.source))
-        if unit != "rad/s":
-            what = f"the wheel speeds of {wheels.source} are in {unit}"
-            self._correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
+        self._correct_wheel_unit(wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
 
     def _measure_lengths(self, command: Candidate, wheels: Candidate) -> Geometry:
         """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
@@ -236,19 +218,3 @@ class _DriveExamination(Examination):
         if form == "steering":
             return Geometry(rolled=radius, wheelbase=width)
         return Geometry(radius=radius, track=width)
-
-
-def _roll(wheels: Reading) -> Motion | None:
-    """Increments of wheels that roll without slip, in their own units; None if they hardly turn."""
-    start = max(float(one.times[0]) for one in wheels.inputs)
-    end = min(float(one.times[-1]) for one in wheels.inputs)
-    if end - start < FEWEST_STEPS * STEP_S:
-        return None
-    edges = np.arange(start, end, STEP_S)
-    steps = Steps(edges[:-1], edges[1:])
-    steps = steps.take(np.logical_and.reduce([one.is_there(steps) for one in wheels.inputs]))
-    if steps.start.size < FEWEST_STEPS:
-        return None
-    ahead, turned = wheels.columns(steps, 0.0, 0.0, crossed=False)
-    moved = np.asarray(ahead, dtype=np.complex128)
-    return Motion(steps, moved, np.zeros(turned.size), turned, "z")

@@ -20,6 +20,7 @@ from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Reading
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
 from pipeline.sources.candidates import COMMANDED, MEASURED
+from pipeline.sources.configuration import convert_unit
 
 # Frame of the pose.
 
@@ -76,7 +77,6 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
 # Signs: the fewest faults that explain which signals go the other way.
 
 Axis = Literal["ahead", "turned"]
-AXES: tuple[Axis, Axis] = ("ahead", "turned")
 _FAULTS: Mapping[str, tuple[frozenset[tuple[str, Axis]], float]] = {
     "pose_backward": (frozenset({("pose", "ahead")}), 2.0),
     "pose_mirrored": (frozenset({("pose", "turned")}), 2.0),
@@ -137,9 +137,15 @@ def _sign_of(key: tuple[str, Axis], parts: Iterable[frozenset[tuple[str, Axis]]]
 
 # Units.
 
-SPEEDS = {"m/s": 1.0, "km/h": 1 / 3.6, "mm/s": 1e-3, "cm/s": 1e-2}
-RATES = {"rad/s": 1.0, "deg/s": np.pi / 180.0, "mrad/s": 1e-3}
-WHEELS = {"rad/s": 1.0, "rpm": np.pi / 30.0, "deg/s": np.pi / 180.0}
+
+def _list_factors(*units: str) -> dict[str, float]:
+    """Factors to SI units, the unit of the message type first."""
+    return {unit: convert_unit(unit, {}, where="")[0] for unit in units}
+
+
+SPEEDS = _list_factors("m/s", "km/h", "mm/s", "cm/s")
+RATES = _list_factors("rad/s", "deg/s", "mrad/s")
+WHEELS = _list_factors("rad/s", "rpm", "deg/s")
 _STRANGE = {"rpm": 4.0, "deg/s": 4.0, "km/h": 4.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0}
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
 _NAMED = 4.0
@@ -213,6 +219,11 @@ _USUAL = 3.0
 """Nats of a name that says what a topic is."""
 
 
+def is_named_measured(name: str) -> bool:
+    """Whether a name says that a signal is measured, and not that it is commanded."""
+    return bool(MEASURED.search(name.lower())) and not COMMANDED.search(name.lower())
+
+
 def rate_command(one: Reading, rank: int, earliest: float) -> float:
     """How likely a reading is the command, in nats.
 
@@ -225,9 +236,7 @@ def rate_command(one: Reading, rank: int, earliest: float) -> float:
     """
     explained = one.explained
     assert explained is not None  # noqa: S101 - given so
-    name = one.name.lower()
-    is_commanded = bool(COMMANDED.search(name))
-    named = _USUAL * is_commanded - _USUAL * (bool(MEASURED.search(name)) and not is_commanded)
+    named = _USUAL * bool(COMMANDED.search(one.name.lower())) - _USUAL * is_named_measured(one.name)
     lead = explained.lag + explained.delay - earliest
     held = float(np.mean([one.held_share for one in one.inputs]))
     return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * rank

@@ -13,12 +13,14 @@ from pipeline.core import SlipError, enumerate_texts
 from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
 from pipeline.recording.evidence import (
+    WHEELS,
     Axis,
     Reversal,
     find_body_units,
     find_frame,
     find_reversed,
     find_wheel_unit,
+    is_named_measured,
     rate_command,
 )
 from pipeline.recording.geometry import (
@@ -29,7 +31,7 @@ from pipeline.recording.geometry import (
     measure_geometry,
 )
 from pipeline.recording.motion import Motion, measure_motion
-from pipeline.recording.readings import Bent, Held, Reading
+from pipeline.recording.readings import SIDES, Bent, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.sources import (
     CONFIGURED,
@@ -41,7 +43,6 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.sources.candidates import COMMANDED, MEASURED
 from pipeline.stages import Finding
 from pipeline.stages.extract import Extraction
 from pipeline.stages.reading import find_sideways_share
@@ -124,7 +125,8 @@ def examine(
         is_known: whether its geometry is known.
         where: the log, for error messages.
     """
-    sideways = any(find_sideways_share(data.topics, one) for one in _list_candidates(sources))
+    drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
+    sideways = any(find_sideways_share(data.topics, one) for one in drives)
     if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
         # A body that moves sideways has no course.
         text = "the vehicle moves sideways: signs, units and the frame of its poses are not compared"
@@ -136,16 +138,6 @@ def examine(
         # The stage `extract` raises it again.
         return Recording(sources, configuration)
     return examination.run()
-
-
-def _list_candidates(sources: Sources) -> list[DriveSource]:
-    every = [
-        sources.command,
-        *sources.others.get("command", ()),
-        sources.wheels,
-        *sources.others.get("wheels", ()),
-    ]
-    return list(dict.fromkeys(one for one in every if isinstance(one, DriveSource)))
 
 
 @dataclass
@@ -236,18 +228,18 @@ class Examination:
             self._complete(),
             tuple(self.findings),
             kind,
-            self._measure(command, wheels),
+            # Lengths that are known are not measured again.
+            Geometry() if self.is_known else self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
         )
 
     # Signals.
 
     def _read_drives(self, motion: Motion) -> list[Candidate]:
-        commands = [self.sources.command, *self.sources.others.get("command", ())]
-        wheels = [self.sources.wheels, *self.sources.others.get("wheels", ())]
+        commands, wheels = (self.sources.rank_drives(role) for role in ("command", "wheels"))
         drives, taken = [], set()
         for is_measured, sources in ((False, commands), (True, wheels)):
-            for rank, source in enumerate([one for one in sources if isinstance(one, DriveSource)][:_MOST]):
+            for rank, source in enumerate(sources[:_MOST]):
                 key = (source.form, source.signals)
                 reading = None if key in taken else self._read(source, is_measured=is_measured)
                 if reading is None and key not in taken and is_measured and source == self.sources.wheels:
@@ -386,20 +378,21 @@ class Examination:
             best = max(rivals, key=lambda one: rates[id(one)])
             if command is None or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
                 if command is not None:
-                    self._report_role("command", best, command)
+                    self._report_command(best, command)
                 command = best
         wheels = self._find(drives, self.sources.wheels)
         if wheels is None and self.sources.wheels is None:
             # A pair of sides that is no command measures the wheels.
+            is_free = command is None
             spare = [one for one in rivals if one is not command and one.reading.form == "sides"]
             spare = [
                 one
                 for one in spare
-                if command is None or _is_measured(one) or one.source.form is DriveForm.SIDES
+                if is_free or one.source.form is DriveForm.SIDES or is_named_measured(one.reading.name)
             ]
             wheels = max(spare, key=lambda one: -one.rank, default=None)
             if wheels is not None and command is not None and command.reading.form == "sides":
-                wheels = wheels if _is_measured(wheels) else None
+                wheels = wheels if is_named_measured(wheels.reading.name) else None
         return command, wheels
 
     def _is_still(self, drives: Sequence[Candidate]) -> bool:
@@ -431,13 +424,12 @@ class Examination:
             made = replace(made, command=source) if role == "command" else replace(made, wheels=source)
         return made
 
-    def _report_role(self, role: str, chosen: Candidate, other: Candidate) -> None:
+    def _report_command(self, chosen: Candidate, other: Candidate) -> None:
         text = (
-            f"{chosen.source} is taken for the {role}, and not {other.source}: the motion follows the "
-            "first later, and "
-            f"the second measures it or is not followed; [{role}] in run.toml names another"
+            f"{chosen.source} is taken for the command, and not {other.source}: the motion follows the first "
+            "later, and the second measures it or is not followed; [command] in run.toml names another"
         )
-        self.findings.append(Finding("role_by_motion", "info", text, where=role))
+        self.findings.append(Finding("role_by_motion", "info", text, where="command"))
 
     def _read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
         """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
@@ -497,8 +489,7 @@ class Examination:
             )
             text = (
                 f"the {side} side of the drive runs backward against its command, {also}: the polarity of "
-                "its motor "
-                "is wrong; exchange its wires, or turn its sign in the driver"
+                "its motor is wrong; exchange its wires, or turn its sign in the driver"
             )
             self.findings.append(
                 Finding("motor_reversed", "error", text, where="command", value=explained.sign_margin)
@@ -507,15 +498,13 @@ class Examination:
         return False
 
     def _report_dead(self, wheels: Candidate) -> bool:
-        sides = dict(zip(("left", "right"), (wheels.reading.first, wheels.reading.second), strict=True))
-        moves = {name: side is not None and side.moves for name, side in sides.items()}
-        if any(moves.values()) == all(moves.values()):
+        dead = wheels.reading.dead_side
+        if not dead:
             return False
-        dead, other = sorted(moves, key=lambda name: moves[name])
+        other = next(side for side in SIDES if side != dead)
         text = (
             f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: it is "
-            "dead (take "
-            f"--input command, or correct [wheels] {dead})"
+            f"dead (take --input command, or correct [wheels] {dead})"
         )
         self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
         return True
@@ -568,8 +557,7 @@ class Examination:
             if abs(offset) == _HALF_TURN:
                 what = (
                     f"the poses of {source} look to the rear where {drivers} drive ahead (a sensor that is "
-                    "mounted "
-                    "backward, or base_link points to the rear)"
+                    "mounted backward, or base_link points to the rear)"
                 )
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
@@ -652,6 +640,12 @@ class Examination:
             gain, share = float(explained.ahead.gains[0]), explained.shares[0]
         else:
             return
+        self._correct_wheel_unit(wheels, gain, share, radius)
+
+    def _correct_wheel_unit(
+        self, wheels: Candidate, gain: float, share: float, radius: float | None = None
+    ) -> None:
+        """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
         if wheels.source.signals[0].unit or self.configuration.wheels.unit is not None:
             return
         unit = find_wheel_unit(gain, share, str(wheels.source), radius)
@@ -703,8 +697,7 @@ class Examination:
 
     def _wheel_factor(self) -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""
-        unit = self.changes.get("wheels", {}).get("unit")
-        return {"rpm": 30.0 / np.pi, "deg/s": 180.0 / np.pi}.get(str(unit), 1.0)
+        return 1.0 / WHEELS[str(self.changes.get("wheels", {}).get("unit", "rad/s"))]
 
     # What the user reads, and what the stages read.
 
@@ -730,8 +723,8 @@ class Examination:
             self.findings.append(Finding("signs_contradict", "error", text, where=section))
             return
         self.changes.setdefault(section, {}).update(change)
-        lines = [line for key, line in _AS_RECORDED[section].items() if key in change]
-        otherwise = "".join(f"; {line} takes them as recorded" for line in lines)
+        settled = [text for key, text in _AS_RECORDED[section].items() if key in change]
+        otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
         text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
         self.findings.append(Finding(names[section], "warning", text, where=section, value=margin))
 
@@ -796,11 +789,6 @@ def is_crossed(drive: Candidate) -> bool:
         return False
     sizes = [abs(float(explained.ahead.t[0])), abs(float(explained.turned.t[0]))]
     return sizes[0] > CLEAR and (drive.reading.form == "sides" or sizes[1] > CLEAR)
-
-
-def _is_measured(drive: Candidate) -> bool:
-    name = drive.reading.name.lower()
-    return bool(MEASURED.search(name)) and not COMMANDED.search(name)
 
 
 def _scale(length: Length | None, factor: float) -> Length | None:

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.core import format_share
 from pipeline.core.arrays import join_parts
 from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import Explained, Reading
+from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
 from pipeline.sources import find_alike
 from pipeline.sources.configuration import RANGES
@@ -63,8 +63,23 @@ class Geometry:
         }
 
 
+def roll_wheels(wheels: Reading) -> Motion | None:
+    """Increments of wheels that roll without slip, in their own units; None if they hardly turn."""
+    start = max(float(one.times[0]) for one in wheels.inputs)
+    end = min(float(one.times[-1]) for one in wheels.inputs)
+    if end - start < FEWEST_STEPS * STEP_S:
+        return None
+    edges = np.arange(start, end, STEP_S)
+    steps = Steps(edges[:-1], edges[1:])
+    steps = steps.take(np.logical_and.reduce([one.is_there(steps) for one in wheels.inputs]))
+    if steps.start.size < FEWEST_STEPS:
+        return None
+    ahead, turned = wheels.columns(steps, 0.0, 0.0, crossed=False)
+    return Motion(steps, join_parts(ahead, 0.0), np.zeros(turned.size), turned, "z")
+
+
 def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
-    """What wheels do of a command: their mean and the difference of their sides in place of a pose's motion.
+    """What wheels do of a command: their motion takes the place of a pose's.
 
     Args:
         command: of the body or of both sides.
@@ -73,25 +88,11 @@ def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
     Returns:
         The fit; None if the wheels do not follow the command, or one of its sides counts backward.
     """
-    left, right = wheels.first, wheels.second
-    if (
-        left is None
-        or right is None
-        or not (left.moves and right.moves)
-        or command.form not in {"body", "sides"}
-    ):
+    if len(wheels.inputs) < len(SIDES) or command.form not in {"body", "sides"}:
         return None
-    start, end = max(left.times[0], right.times[0]), min(left.times[-1], right.times[-1])
-    if end - start < FEWEST_STEPS * STEP_S:
+    motion = roll_wheels(wheels)
+    if motion is None:
         return None
-    edges = np.arange(start, end, STEP_S)
-    steps = Steps(edges[:-1], edges[1:])
-    steps = steps.take(left.is_there(steps) & right.is_there(steps))
-    if steps.start.size < FEWEST_STEPS:
-        return None
-    rolled = [side.integrate(steps, 0.0, 0.0) for side in (left, right)]
-    turned = rolled[1] - rolled[0]
-    motion = Motion(steps, join_parts(0.5 * (rolled[0] + rolled[1]), 0.0), np.zeros(turned.size), turned, "z")
     made = Reading(command.form, command.name, command.first, command.second).explain(motion)
     return None if made is None or not made.is_sure or made.crossed else made
 

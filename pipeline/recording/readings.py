@@ -23,7 +23,7 @@ _FEW_CELLS = 2.0
 """Cells of the grid without a signal that are no gap."""
 _LONGEST_S = 6.0 * 3600.0
 """Distance [s] from the middle message beyond which a stamp is wrong, or more of a drive adds nothing."""
-_PAIR = 2
+SIDES = ("left", "right")
 _DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
 _MOST_ROWS = 2000
@@ -219,6 +219,13 @@ class Reading:
         """Inputs that move."""
         return [one for one in (self.first, self.second) if one is not None and one.moves]
 
+    @property
+    def dead_side(self) -> str:
+        """The one of two sides that does not turn while the other one does; empty if there is none."""
+        sides = zip(SIDES, (self.first, self.second), strict=True)
+        dead = [name for name, one in sides if one not in self.inputs]
+        return dead[0] if len(dead) == 1 else ""
+
     def columns(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> tuple[Floats, Floats]:
         """Increments ahead and of the heading, in the reading's own units."""
         one, two = (
@@ -231,26 +238,20 @@ class Reading:
             return (0.5 * (one - two), -one - two) if crossed else (0.5 * (one + two), two - one)
         return (two, one) if crossed and self.form == "body" else (one, two)
 
-    def explain(self, whole: Motion, live: Flags | None = None) -> Explained | None:
-        """Fit the motion; also kept as ``explained``.
-
-        Args:
-            whole: the motion.
-            live: steps that count, shape (n,).
-        """
+    def explain(self, whole: Motion) -> Explained | None:
+        """Fit the motion; also kept as ``explained``."""
         self.explained = None
         if not self.inputs:
             return None
         keep = np.logical_and.reduce([one.is_there(whole.steps) for one in self.inputs])
-        if live is not None:
-            keep &= live
         busy = self._find_busy(whole)
         if (keep & busy).sum() >= FEWEST_STEPS:
             keep &= busy
         if keep.sum() < FEWEST_STEPS:
             return None
         motion = whole.take(keep)
-        patterns = (False, True) if self.form in {"body", "sides"} and len(self.inputs) == _PAIR else (False,)
+        may_cross = self.form in {"body", "sides"} and len(self.inputs) == len(SIDES)
+        patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
         if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:
