@@ -339,7 +339,7 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
     from pipeline.estimation.across_runs import tie_to_prior  # noqa: PLC0415 - heavy
 
     forecast = forecast_runs(problem.runs, model.vehicle, problem.source.value, out)
-    return tie_to_prior(problem, model, forecast.prior)
+    return tie_to_prior(problem, forecast.prior)
 
 
 def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:

@@ -146,7 +146,6 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         names = ", ".join(str(run.get("run")) for run in runs)
         lines.append(f"fitted {INPUT_WORDS.get(source, source)}: {names}")
     lines += [f"undecided: {' or '.join(group)}" for group in file.undecided]
-    lines += [f"{label} = {value:.4g} with {other} in the model" for label, other, value in file.unless]
     print_lines(lines)
     return CLEAN
 

@@ -8,26 +8,19 @@ what is not observable, and what no effect of the catalogue explains.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.compute import Budget, usual_budget
 from pipeline.estimation import conclude
-from pipeline.estimation.acceptance import NEARLY, NotSignificant
-from pipeline.estimation.ambiguity import (
-    Clocks,
-    Detectable,
-    Undecided,
-    Unobservable,
-    find_undecided,
-    find_unobservable,
-    read_clocks,
-)
+from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
+from pipeline.estimation.conclude import Explored
+from pipeline.estimation.context import Context, DiagnosisError, prepare
+from pipeline.estimation.decision import Search
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
 from pipeline.estimation.encoder_scale import find_encoder_scale
 from pipeline.estimation.fit import Fitted, fit_model
@@ -42,20 +35,11 @@ from pipeline.estimation.problem import (
     predict_at_from,
     predict_from,
 )
-from pipeline.estimation.search import SearchResult, search_body, search_wheels
-from pipeline.estimation.selection import Context, DiagnosisError, prepare
 from pipeline.estimation.state import Free, State
-from pipeline.estimation.unexplained import (
-    LEAST_OF_DRIVE,
-    Explainable,
-    boost_residuals,
-    collect_terms,
-    list_window_signals,
-    measure_asked,
-    search_formula,
-)
+from pipeline.estimation.unexplained import search_formula
 from pipeline.estimation.verdict import FATAL
 from pipeline.models import Effect, Model
+from pipeline.models.effect import Place
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
 
@@ -114,27 +98,6 @@ def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
     return load_run(recording.tables, vehicle, name=recording.name, sha256=recording.sha256)
 
 
-@dataclass(frozen=True)
-class Explored:
-    """Results of the search on one path.
-
-    Attributes:
-        search: the search, its final model with formula terms where they fit better.
-        undecided: alternatives to the identified effects.
-        not_significant: effects whose evidence is below the threshold.
-        unobservable: effects that are not observable on this path.
-        detectable: detection limits of the other effects that were not identified.
-        explainable: predictable part of the residual; None where it was not computed.
-    """
-
-    search: SearchResult
-    undecided: tuple[Undecided, ...]
-    not_significant: tuple[NotSignificant, ...]
-    unobservable: tuple[Unobservable, ...]
-    detectable: tuple[Detectable, ...]
-    explainable: Explainable | None
-
-
 def diagnose_runs(
     recordings: Sequence[Recording],
     vehicle: Vehicle,
@@ -175,8 +138,8 @@ def diagnose_runs(
         budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
-            ways, clocks = _explore(context, chosen.source, known, budget)
-            return _conclude(recordings, context, chosen, ways, clocks)
+            paths, clocks = _explore(context, chosen.source, known, budget)
+            return _conclude(recordings, context, chosen, paths, clocks)
 
     judged = judge(runs)
     misread = find_encoder_scale(judged.runs[0])
@@ -194,69 +157,42 @@ def _explore(
     context: Context, source: Input, known: Sequence[Effect], budget: Budget
 ) -> tuple[list[Explored], Clocks]:
     """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
-    if source is Input.MEASURED or context.has_encoders:
-        body = _explore_body(context, Input.MEASURED, known, budget)
-        ways = [body]
-        if source is Input.COMMAND:
-            ways.append(_explore_wheels(context, known, body.search, budget))
-    else:
-        body = _explore_body(context, Input.COMMAND, known, budget)
-        ways = [body]
-    return ways, read_clocks(context, body.search)
+    problem, path = context.problem, source
+    if not context.is_drive_alone and source is Input.COMMAND and context.has_encoders:
+        problem, path = context.problem.behind_wheels, Input.MEASURED
+    usable = [e for e in known if path is Input.COMMAND or e.place > Place.DRIVE]
+    candidates = context.list_candidates(path)
+    search = Search(problem.parts[0], candidates, context.conditions, frozenset(e.id for e in usable), budget)
+    body = _explore_part(context, search, path.value, problem.start_state(usable))
+    paths, state = [body], body.found.final.state
+    if path is not source:
+        driven = [e for e in known if e.place <= Place.DRIVE]
+        candidates, given = context.list_drivetrain(), frozenset(e.id for e in driven)
+        search = Search(context.problem.parts[1], candidates, context.conditions, given, budget)
+        paths.append(_explore_part(context, search, "wheels", State((), state.timing).add(*driven)))
+    return paths, read_clocks(context, state, path)
 
 
-def _explore_body(context: Context, source: Input, known: Sequence[Effect], budget: Budget) -> Explored:
-    search = search_body(context, source, known, budget)
-    if context.is_drive_alone:
-        return _gather_drive(search)
-    final = search_formula(search.selection, search.final)
-    # Where a formula explains the residual, boosting is skipped.
-    features = None
-    if not collect_terms(final):
-        features = list_window_signals(search.selection.part.comparisons)[0]
-    explainable = None if features is None else boost_residuals(search.selection, final, features)
-    search = replace(search, final=final)
-    return _gather(search, explainable)
-
-
-def _explore_wheels(
-    context: Context, known: Sequence[Effect], body: SearchResult, budget: Budget
-) -> Explored:
-    return _gather_drive(search_wheels(context, known, body, budget))
-
-
-def _gather_drive(search: SearchResult) -> Explored:
-    """Results for the drivetrain, which no formula of place or heading can explain."""
-    selection, final = search.selection, search.final
-    remaining = np.sqrt((final.held**2).mean(axis=0)) / measure_asked(selection)
-    if not (remaining > LEAST_OF_DRIVE).any():
-        return _gather(search, None)
-    features = list_window_signals(selection.part.comparisons)[0]
-    return _gather(search, boost_residuals(selection, final, features))
-
-
-def _gather(search: SearchResult, explainable: Explainable | None) -> Explored:
-    undecided = find_undecided(search.selection, search.final)
-    unobservable, detectable = find_unobservable(search.selection, search.final)
-    return Explored(
-        search,
-        tuple(undecided),
-        tuple(_list_not_significant(search)),
-        tuple(unobservable),
-        tuple(detectable),
-        explainable,
-    )
+def _explore_part(context: Context, search: Search, path: str, start: State) -> Explored:
+    found = search.run(start)
+    formula = None
+    if path != "wheels" and not context.is_drive_alone:
+        sideways = context.vehicle.kinematics.has_inputs("sideways")
+        formula = search_formula(search, found, sideways=sideways)
+    unobservable, detectable = find_unobservable(search, found)
+    undecided = tuple(find_undecided(search, found))
+    return Explored(path, search, found, formula, undecided, tuple(unobservable), tuple(detectable))
 
 
 def _conclude(
     recordings: Sequence[Recording],
     context: Context,
     chosen: InputChoice,
-    ways: Sequence[Explored],
+    paths: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
     common: RunDiagnosis = conclude.summarize(
-        context, chosen.source, ways, clocks, recordings[0].length_scale_m
+        context, chosen.source, paths, clocks, recordings[0].length_scale_m
     )
     common = replace(common, input_reason=chosen.reason)
     return Diagnosis(
@@ -264,17 +200,3 @@ def _conclude(
             conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)
         )
     )
-
-
-def _list_not_significant(search: SearchResult) -> Iterator[NotSignificant]:
-    """Effects last tried as extensions of the final model of the search, see `NotSignificant`."""
-    final, selection = search.final, search.selection
-    for extended in search.not_significant:
-        added = [effect for effect in extended.state.effects if effect.id not in final.ids]
-        if len(added) != 1 or len(extended.ids) != len(final.ids) + 1 or added[0].id in selection.part.clocks:
-            continue
-        if not selection.may_stay(added[0], extended.state):
-            continue
-        improvement = selection.judge(final, extended)
-        if NEARLY <= improvement.reached < 1.0:
-            yield NotSignificant(added[0], improvement.gain, improvement.reached)

@@ -1,16 +1,8 @@
 """Across runs and grounds: joint fits, fits with a prior from other runs, and bands of predictions.
 
-A joint fit of one model to many runs weights each by its own residual scale:
-
-    minimize  sum over runs r and channels of  w_r n_r (log(s_r) + mean(cost(residual / s_r)) / 2),
-
-the likelihood of runs with unknown noise of their own: a gentle run counts as much as a fast one, whose
-residuals are larger by a factor of ten, so that fast runs do not dominate the fit. The scale s_r of a run is
-the one that minimizes this (Huber's concomitant scale), so that steps of weighted least squares decrease the
-objective. w_r is 1, and less for runs on other grounds than the requested one. Residuals are those of models
-whose states are reset to measured ones at the start of each prediction over 2 s (`Part.restarted`).
-
-Source: Huber, Robust Statistics, 1981, chapter 7.
+A joint fit of one model to many runs has noise of the same kind in all of them, and of each run's own size
+(`noise.Noise`): a gentle run counts as much as a fast one, whose residuals are larger by a factor of ten.
+Runs on other grounds than the requested one count less.
 
 A ground parameter has one value per ground, shared by the runs on it; all other parameters belong to the
 vehicle and have one value.
@@ -26,43 +18,36 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import CONFIDENCE, format_share
-from pipeline.core.arrays import Floats, Ints, guarded_spread
+from pipeline.core.arrays import Floats, Ints
 from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
+from pipeline.estimation.decision import list_costs
+from pipeline.estimation.fit import Fitted, PartFit, fit_model, invert
 from pipeline.estimation.folds import HeldOut, number_predictions
-from pipeline.estimation.intervals import (
-    SHORTEST_TIME_S,
-    count_repeats,
-)
-from pipeline.estimation.parts import CLIP, BodyPart, Part, measure_spread
+from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
-from pipeline.estimation.state import Prior, State, Weights, make_columns, pick_windows, weigh_columns
+from pipeline.estimation.state import Prior, State
 from pipeline.models.learned_term import LEAST_WAY_M, Bands
 from pipeline.models.model import Model
 
 if TYPE_CHECKING:
+    from pipeline.estimation.noise import Noise
     from pipeline.estimation.parts import Part
-    from pipeline.estimation.state import Free, State
+    from pipeline.estimation.state import Free
 
 
 _ITERATIONS = 20
 """Maximum number of steps of a joint fit: a safeguard, `_ENOUGH` ends it."""
-_SCALE_ROUNDS = 20
-"""Maximum number of rounds of a scale: a safeguard, each round reduces its error tenfold."""
-_SAME_SCALE = 1e-6
-"""Relative change below which a scale counts as unchanged."""
-_DAMPINGS = (1e-3, 1e-1, 1e1)
-"""Damping relative to the diagonal, tried in turn until a step lowers the loss: nearly Gauss-Newton first,
+_DAMPINGS = (1e-6, 1e-2, 1e1)
+"""Damping relative to the diagonal, tried in turn until a step lowers the cost: nearly Gauss-Newton first,
 nearly steepest descent last."""
-_ENOUGH = 1e-5
-"""Decrease of the mean logarithm of the spread below which a fit ends."""
+_ENOUGH = 0.01
+"""Fall of chi-square below which a fit ends."""
 
 
 @dataclass(frozen=True)
@@ -83,37 +68,43 @@ class RunNormal:
 def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None) -> PartFit:
     """Fit the shared parameters of runs on one part of the path, from their current values, and run delays.
 
-    The fit uses predictions over 2 s whose states begin at measured ones: the parameters serve such
-    predictions, and model errors do not accumulate over a long drive.
-
     Args:
         part: part of the path, of several runs.
         state: effects with the values to start from.
         run_weights: weight of each run, shape (runs,); equal by default.
-
-    Returns:
-        The fit, with the weights of residuals within their own run.
     """
-    part = part.restarted
     shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
     by_ground = list_ground_labels(state)
     free = tuple(number for number in part.list_free(state, by_ground) if number.is_smooth)
     ties = _tie_grounds(part, free, by_ground)
-    best = _look(part, state, free, shares)
+    residual = part.find_residuals(state)
+    best = PartFit(
+        part, state, free, residual, part.differentiate(state, residual, free), part.learn(residual)
+    )
     for _ in range(_ITERATIONS if free else 0):
-        jacobian = part.differentiate(best.state, best.residual, free)
+        white, share = best.white, shares[part.run[best.white.rows]]
+        columns = white.columns @ ties
+        normal, pull = (columns * share[:, None]).T @ columns, columns.T @ (share * white.residual)
+        cost = _sum_costs(part, best.noise, residual, shares)
         for damping in _DAMPINGS:
-            step, _ = solve_step(jacobian @ ties, best.residual, _share(part, best.weights, shares), damping)
-            tried = _look(part, best.state.move(free, (ties @ step).tolist()), free, shares)
-            if tried.loss < best.loss:
+            step = invert(normal + damping * np.diag(np.diag(normal))) @ pull
+            moved = best.state.move(free, (ties @ step).tolist())
+            tried = part.find_residuals(moved)
+            if (reached := _sum_costs(part, best.noise, tried, shares)) < cost:
                 break
         else:
             break
-        fall, best = best.loss - tried.loss, tried
-        if fall < _ENOUGH:
+        residual = tried
+        columns_of_moved = part.differentiate(moved, residual, free)
+        best = PartFit(part, moved, free, residual, columns_of_moved, part.learn(residual, best.noise))
+        if cost - reached < _ENOUGH:
             break
-    jacobian = part.differentiate(best.state, best.residual, free)
-    return replace(best, state=best.state.centred, jacobian=jacobian)
+    return replace(best, state=best.state.centred)
+
+
+def _sum_costs(part: Part, noise: Noise, residual: Floats, shares: Floats) -> float:
+    """Cost of the innovations, each run by its share."""
+    return float((list_costs(part, noise, residual) * shares[part.run]).sum())
 
 
 def list_ground_labels(state: State) -> list[str]:
@@ -137,42 +128,13 @@ def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> 
     return ties
 
 
-def _look(part: Part, state: State, free: tuple[Free, ...], shares: Floats) -> PartFit:
-    """A state with its loss and with weights by each run's own scale."""
-    residual = part.find_residuals(state)
-    scale = measure_spread(residual, part, _measure_scale)
-    weights = Weights(scale, np.full(scale.shape, CLIP))
-    channels = list(part.channels)
-    costs = np.log(scale[:, channels]).mean(axis=1) + 0.5 * weights.cost(residual) / len(channels)
-    loss = float(np.average(costs[part.live], weights=shares[part.run[part.live]]))
-    return PartFit(state, free, residual, make_columns(residual.shape[0], len(free)), weights, loss)
-
-
-def _measure_scale(size: Floats, clip: float, least: float) -> float:
-    """Huber's concomitant scale of residuals of these sizes, shape (k,)."""
-    scale = guarded_spread(size, clip, least)
-    for _ in range(_SCALE_ROUNDS):
-        weight = clip * scale / np.maximum(size, clip * scale)
-        before, scale = scale, max(float(np.sqrt(np.mean(weight * size**2))), least)
-        if abs(scale - before) < _SAME_SCALE * scale:
-            break
-    return scale
-
-
-def _share(part: Part, weights: Weights, shares: Floats) -> Weights:
-    """The weights times those of the runs."""
-    root = np.sqrt(shares[part.run])[:, None]
-    return Weights(weights.scale / root, weights.clip * root)
-
-
 def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
     """Normal equations of each run of a fit, with parameters of single runs and delays eliminated.
 
     For a ground parameter, a run contributes to the value of its own ground.
     """
     by_ground = list_ground_labels(fit.state)
-    excess = measure_excess(part, fit)
-    factor = fit.weights.factors(fit.residual)
+    excess, white = fit.overdispersion, fit.white
     values = np.array([fit.state.get(number) for number in fit.free])
     normals = []
     for run in range(len(part.comparisons)):
@@ -181,10 +143,10 @@ def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
             for index, number in enumerate(fit.free)
             if number.effect and (number.run is None or (number.run == run and number.label in by_ground))
         ]
-        rows = part.run == run
-        columns = weigh_columns(pick_windows(fit.jacobian, rows), factor[rows])
+        rows = part.run[white.rows] == run
+        columns = white.columns[rows]
         normal = columns.T @ columns / excess
-        pull = columns.T @ (fit.residual[rows] * factor[rows]).reshape(-1) / excess + normal @ values
+        pull = columns.T @ white.residual[rows] / excess + normal @ values
         own = [n for n in range(len(fit.free)) if n not in common and fit.free[n].run in {None, run}]
         shared = normal[np.ix_(common, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
         normals.append(
@@ -197,55 +159,22 @@ def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
     return normals
 
 
-def tie_to_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Problem:
-    """The problem with a prior on the model's parameters.
-
-    The overdispersion of the residuals is taken from the fit without the prior: a prior that contradicts
-    the runs increases the residuals, and would thereby increase its own weight.
+def tie_to_prior(problem: Problem, numbers: Mapping[str, tuple[float, float]]) -> Problem:
+    """The problem with a prior on the parameters of a model.
 
     Args:
         problem: the runs.
-        model: its effects start at their values.
         numbers: mean and standard deviation by label ``effect.name``.
 
     Returns:
         The prepared runs, shared with `problem`, with the prior in every part.
     """
-    alone = fit_model(problem, model)
-    excess = [measure_excess(part, fit) for part, fit in zip(problem.parts, alone.fits, strict=True)]
-    return _tie(problem, [Prior(numbers, one) for one in excess])
+    return problem.with_parts(tuple(tie_prior(part, Prior(numbers)) for part in problem.parts))
 
 
 def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
     """Fit a model with a prior on its parameters; see `tie_to_prior`."""
-    return fit_model(tie_to_prior(problem, model, numbers), model, exact=True)
-
-
-def measure_excess(part: Part, fit: PartFit) -> float:
-    """Factor by which the summed cost of residuals overstates their information.
-
-    It is the product of two factors. The first is the autocorrelation time of the residuals over their
-    distance; that time is at least that of the shortest blocks of `intervals.join_blocks`, as a few seconds
-    are too short to estimate it. The second is the mean square of the residuals in units of the spreads of
-    their weights, if above one: the model then leaves more than noise.
-    """
-    live = fit.residual[part.live] if part.live.any() else fit.residual
-    scale = fit.weights.scale[part.live] if part.live.any() else fit.weights.scale
-    squares = np.mean((live / scale)[:, list(part.channels)] ** 2)
-    distance = float(np.median(np.diff(part.times.mean(axis=1))))
-    repeats = max(count_repeats(part, fit), SHORTEST_TIME_S / max(distance, 1e-3))
-    count = live.shape[0] * len(part.channels) / repeats
-    freedom = max(count - len(fit.free), 1.0)
-    return float(repeats * max(float(squares) * count / freedom, 1.0))
-
-
-def _tie(problem: Problem, priors: list[Prior]) -> Problem:
-    parts = tuple(copy(part) for part in problem.parts)
-    for part, prior in zip(parts, priors, strict=True):
-        part.prior = prior
-    body = parts[0]
-    whole = body if problem.whole is problem.parts[0] and isinstance(body, BodyPart) else problem.whole
-    return problem.with_parts(whole, parts)
+    return fit_model(tie_to_prior(problem, numbers), model, exact=True)
 
 
 # Estimates of effects that a model lacks, to first order.

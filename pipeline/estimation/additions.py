@@ -13,10 +13,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import format_share
-from pipeline.estimation.acceptance import LEAST_GAIN, LEAST_T, Improvement, compare
-from pipeline.estimation.evidence import Evidence, learn_noise, tile_windows
+from pipeline.estimation.candidates import Screen
+from pipeline.estimation.context import Context
+from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.fit import Fitted
-from pipeline.estimation.folds import Errors, HeldOut, number_predictions
+from pipeline.estimation.folds import Errors, number_predictions
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import (
     CHANCE,
@@ -28,8 +29,6 @@ from pipeline.estimation.ladder import (
     raises_errors,
 )
 from pipeline.estimation.learned_step import explain_no_help
-from pipeline.estimation.parts import make_weights
-from pipeline.estimation.selection import PRICE, Context
 from pipeline.models import Model
 from pipeline.models.catalogue import explain_idle
 from pipeline.models.learned_term import LEARNED
@@ -39,8 +38,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
     from pipeline.core.arrays import Floats
+    from pipeline.estimation.candidates import Candidate
     from pipeline.estimation.problem import Problem
-    from pipeline.estimation.proposals import Candidate
     from pipeline.models.effect import Effect, Parameter
     from pipeline.models.parameter import Conditions
 
@@ -110,9 +109,8 @@ def list_promising(problem: Problem, fitted: Fitted) -> list[Candidate]:
     for part, fit in zip(problem.parts, fitted.fits, strict=True):
         effects = [candidate for candidate in candidates if candidate().acts_in(fitted.model.ids)]
         mine = [candidate for candidate in effects if part.owns(candidate())]
-        ranked = Evidence(part, fit, mine, problem.largest).rank_singles(PRICE)
-        paying = [one for one in ranked if one.chi_square > PRICE * one.numbers]
-        promising += [by_id[one.starts[0].effect.id] for one in paying[:MOST_FITTED]]
+        paying = [one for one in Screen(fit, mine, problem.largest).list_singles() if one.net > 0.0]
+        promising += [by_id[one.names[0]] for one in paying[:MOST_FITTED]]
     return promising
 
 
@@ -149,7 +147,7 @@ class Tries:
             self._problem,
             self._base,
             after,
-            lambda: estimate_intervals(self._problem, after.fitted).shared_intervals,
+            lambda: estimate_intervals(after.fitted).shared_intervals,
         )
         remaining, held = _measure_remaining(self.before, after.errors), self._base.held_out.residuals
         self._moves[name] = _unit(after.held_out.residuals - held, held)
@@ -198,33 +196,30 @@ def explain_refusals(
     conditions = Context(problem).conditions
     if alone := {one.id: why for one in added if (why := explain_refusal(one, {}, conditions))}:
         return alone
-    numbers = max(len(after.fitted.free) - len(before.fitted.free), 1)
-    gain = measure_gain(problem, before.held_out, after.held_out, numbers)
-    if together := explain_errors(before.errors, after.errors, gain):
+    t = min(measure_t(fit, one) for one in added for fit in after.fitted.fits if fit.part.owns(one))
+    if together := explain_errors(before.errors, after.errors, t):
         return dict.fromkeys((one.id for one in added), together)
     fitted = intervals()
     return {one.id: why for one in added if (why := explain_refusal(one, fitted))}
 
 
 def explain_errors(
-    before: Errors | Mapping[str, object], after: Errors | Mapping[str, object], gain: Improvement
+    before: Errors | Mapping[str, object], after: Errors | Mapping[str, object], t: float
 ) -> str | None:
     """Reason why the held-out errors contradict the addition; None where they support it.
 
     Args:
         before: errors without it.
         after: errors with it.
-        gain: its improvement on held-out data.
+        t: standard errors by which its numbers are away from none.
     """
     if rises := format_rises(before, after, CHANCE):
         return rises
     if not list_rises(after, before, CHANCE):
         return f"no error over 2 s falls by more than {format_share(CHANCE)}"
-    if gain.is_significant:
+    if t >= LEAST_T:
         return None
-    if gain.gain < LEAST_GAIN:
-        return f"the held-out error falls by less than {format_share(LEAST_GAIN)}"
-    return f"the reduction is not significant (t = {gain.share * LEAST_T:.1f}, required {LEAST_T:g})"
+    return f"the reduction is not significant (t = {t:.1f}, required {LEAST_T:g})"
 
 
 def explain_refusal(
@@ -286,22 +281,6 @@ def format_refusals(refusals: Mapping[str, str]) -> str:
     said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
     verb = "is" if len(refusals) == 1 else "are"
     return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
-
-
-def measure_gain(problem: Problem, before: HeldOut, after: HeldOut, numbers: int = 1) -> Improvement:
-    """Improvement of a larger model on held-out data, by the significance test of the diagnosis.
-
-    Args:
-        problem: the runs.
-        before: the smaller model.
-        after: the larger one.
-        numbers: number of additional parameters of the larger one.
-    """
-    part = problem.whole
-    tiles = tile_windows(part)
-    noise = learn_noise(tiles, part.channels, after.residuals[tiles.rows])
-    weights = make_weights(before.residuals, part)
-    return compare(noise, weights, before.residuals, after.residuals, numbers=numbers)
 
 
 def _count_numbers(effect: Effect) -> int:

@@ -25,7 +25,7 @@ from pipeline.core.arrays import (
     student_quantile,
 )
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.parts import locate_windows
+from pipeline.estimation.window_residuals import locate_windows
 from pipeline.models.model import Timing
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle

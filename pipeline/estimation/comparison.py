@@ -4,6 +4,7 @@ import enum
 from collections.abc import Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -22,6 +23,7 @@ from pipeline.run.windows import (
     find_lead,
     gather_nodes,
     join_horizons,
+    join_steps,
     join_windows,
 )
 from pipeline.sources import Vehicle
@@ -124,6 +126,7 @@ class Comparison:
             compared = replace(run, excluded=np.union1d(run.excluded, self._silences))
         self.windows = join_windows(compared, self.grid, self.nodes, lead)
         self.horizons = join_horizons(compared, self.grid, self.nodes, lead)
+        self._steps = join_steps(compared, self.grid, self.nodes, lead)
         # First node of each prediction, common to all of its rows.
         self._begins = self.horizons.origin[np.flatnonzero(np.diff(self.horizons.number, prepend=-1))]
         self._pose_times = run.track.times[self.nodes.poses]
@@ -134,6 +137,13 @@ class Comparison:
         base = self._make_context(vehicle)
         self.forward = Forward(series, self.grid, base, encoders=run.wheels, has_gyro=self.has_gyro)
         self._reaching = replace_context(self.forward, self._look_from_horizons(base))
+
+    @cached_property
+    def stepped(self) -> "Comparison":
+        """The same run, compared by increments that do not overlap in place of windows of half a second."""
+        compared = copy(self)
+        compared.windows, compared._measured = self._steps, {}  # noqa: SLF001 - its own
+        return compared
 
     @property
     def where_read(self) -> "Comparison":
@@ -336,6 +346,10 @@ class Comparison:
             spot = self._find_spot(delay)
             self._measured[delay] = Measured(spot, frame, moved, heading[end] - heading[start])
         return self._measured[delay]
+
+    def measure_steps(self) -> Measured:
+        """Measured motion of every window, with the stamps of the poses as they are."""
+        return self._measure(0.0)
 
     def _at_nodes(self, edges: Signal, spot: Spot) -> Signal:
         index, beyond = spot

@@ -18,10 +18,9 @@ import numpy as np
 
 from pipeline.core import enumerate_texts, suffix_unit
 from pipeline.core.arrays import Flags, Floats
-from pipeline.estimation.acceptance import LEAST_T
+from pipeline.estimation.decision import LEAST_T, list_costs
 from pipeline.estimation.error_regions import format_errors
 from pipeline.estimation.folds import find_in_test, refit, refit_fold, score
-from pipeline.estimation.intervals import sum_blocks
 from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.estimation.verdict import CHANGE, name_effect
 
@@ -84,17 +83,18 @@ class _Change:
         for start, side in zip(starts, self.sides, strict=True):
             fit = start
             for _ in range(rounds):
-                state = refit(self.part, fit, side)
+                state = refit(fit, side)
                 if state is fit.state:
                     break
-                residual, jacobian = self.part.linearize(state, fit.free)
-                fit = replace(fit, state=state, residual=residual, jacobian=jacobian)
+                residual = self.part.find_residuals(state)
+                columns = self.part.differentiate(state, residual, fit.free)
+                fit = replace(fit, state=state, residual=residual, columns=columns)
             fits.append(fit)
         return fits
 
     def locate(self, fits: Sequence[PartFit]) -> _Change:
         """The change at the time at which both fits together are best: blocks are several seconds long."""
-        before, after = (self.fit.weights.cost(fit.residual) for fit in fits)
+        before, after = (list_costs(self.part, self.fit.noise, fit.residual) for fit in fits)
         first = int(np.argmin(np.cumsum(before - after)))
         return replace(self, time=float(self.part.times[first, 1]))
 
@@ -130,7 +130,7 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
         for number, (fold, training) in enumerate(zip(problem.folds, problem.training, strict=True)):
             state, rows = refit_fold(problem, fitted, number), training[change.index]
             sides = zip(fits, change.sides, strict=True)
-            models = [state.take_over(refit(change.part, fit, rows & side), fit.free) for fit, side in sides]
+            models = [state.take_over(refit(fit, rows & side), fit.free) for fit, side in sides]
             folds.append((models, find_in_test(comparison, problem.whole.times, fold.test)))
         errors = _predict(comparison, change, folds)
         if _is_lower(errors, judgement.whole.held_out):
@@ -204,15 +204,18 @@ def _predict(
 
 def _list_changes(index: int, part: Part, fit: PartFit) -> Iterator[_Change]:
     """The most significant change of every number of the effects, where it is significant."""
-    blocks = sum_blocks(part, fit)
-    numbers, label = blocks.numbers, blocks.label
-    size = np.sqrt(np.einsum("bii->i", numbers.normals)) + 1e-100
-    normals, pulls = numbers.normals / np.outer(size, size), numbers.gradients / size
-    pulls = pulls - pulls.mean(axis=0)
+    white, label, count = fit.white, part.unit, int(part.unit.max()) + 1
+    of_row = label[white.rows]
+    size = np.linalg.norm(white.columns, axis=0) + 1e-100
+    columns = white.columns / size
+    normals = np.array([columns[of_row == block].T @ columns[of_row == block] for block in range(count)])
+    pulls = np.zeros((count, size.size))
+    np.add.at(pulls, of_row, columns * white.residual[:, None])
+    pulls -= pulls.mean(axis=0)
     for column, number in enumerate(fit.free):
         if not number.effect or not number.is_smooth:
             continue
-        statistics = _compare_sides(normals, pulls, column)[_MARGIN - 1 : blocks.count - _MARGIN]
+        statistics = _compare_sides(normals, pulls, column)[_MARGIN - 1 : count - _MARGIN]
         best = int(np.abs(statistics).argmax()) if statistics.size else 0
         if statistics.size and abs(statistics[best]) > LEAST_T:
             time = float(part.times[label <= best + _MARGIN - 1, 1].max())

@@ -17,13 +17,12 @@ from pipeline.core import (
     split_interval,
     suffix_unit,
 )
-from pipeline.estimation.acceptance import LEAST_TURN_RAD, LEAST_WAY_SHARE, Moves
 from pipeline.estimation.error_regions import Growth, Region, format_enough
+from pipeline.estimation.plausibility import Moves
 from pipeline.estimation.verdict import format_verdict
 from pipeline.models import format_model
 from pipeline.models.catalogue import find_effect
 from pipeline.models.parameter import AT_BOUND, UNDETERMINED, Level, Reading
-from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
     import polars as pl
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.ambiguity import Detectable, Undecided, Unobservable
     from pipeline.estimation.apportion import Moments, SlipBudget
     from pipeline.estimation.commanded import CommandedTurn
-    from pipeline.estimation.estimates import Unless
     from pipeline.models import ModelFile
 
 Json = None | bool | int | float | str | Sequence["Json"] | Mapping[str, "Json"]
@@ -148,14 +146,10 @@ class Named:
         path: on which it was identified: `command`, `measured` or `wheels`.
         selected: share of resampled recordings in which its gain reaches the threshold.
         motion: the vehicle's motion due to it as text, with its values.
-        tentative: it lowers no error on its own path, or it is a stand-in.
         moves: its change of predictions over 2 s; None where the model does not contain it.
         growth: its evidence and intervals by driving time; None where the model does not contain it.
         by_run: its values in each of the runs that were judged together, where each has its own; those of
             this run are `parameters`.
-        unless: effects that may act beside it and would change its values.
-        as_if: clause stating which values are outside the observed range, so that it is a stand-in; empty
-            where none is.
         clause: the vehicle's motion due to it as a clause of a sentence, with its values.
     """
 
@@ -168,12 +162,9 @@ class Named:
     path: str
     selected: float
     motion: str
-    tentative: bool = False
     moves: Moves | None = None
     growth: Growth | None = None
     by_run: tuple[Mapping[str, Value], ...] = ()
-    unless: tuple[Unless, ...] = ()
-    as_if: str = ""
     clause: str = ""
 
     @property
@@ -203,27 +194,18 @@ class Named:
     @property
     def sentence(self) -> str:
         """The effect with its values, and its possible causes where one run cannot separate them."""
-        if self.as_if:
-            return f"{self.motion}; {self.as_if}, so that the cause is another effect"
         texts = {reading.name: reading.text for reading in reversed(self.readings)}
         if len(texts) <= 1:
             return self.motion
         between = ", or " if any(" or " in text for text in texts.values()) else " or "
         return f"{self.motion}{CAUSE}{between.join(texts.values())}; a run on another surface separates them."
 
-    @property
-    def doubt(self) -> str:
-        """Qualification after its clause where it is a stand-in or tentative; else empty."""
-        if self.as_if:
-            return " (a stand-in for another cause)"
-        return " (tentative)" if self.tentative else ""
-
     def to_json(self) -> dict[str, Json]:
         """The documented keys, and more."""
         return {
             "id": self.id,
             "sentence": self.sentence,
-            "clause": self.clause + self.doubt,
+            "clause": self.clause,
             "parameters": {
                 name: value.to_json()
                 | {"another_run": dict(zip(("low", "high"), map(_clean, value.another_run), strict=True))}
@@ -235,23 +217,12 @@ class Named:
             "corrected": self.corrected,
             "found_on": self.path,
             "selection_frequency": _clean(self.selected),
-            "tentative": self.tentative,
             "level": None,
             "could_be": [
                 {"level": one.level.value, "name": one.name, "text": one.text} for one in self.readings
             ],
             "moves": None if self.moves is None else _numbers(self.moves, *vars(self.moves)),
             "growth": None if self.growth is None else self.growth.to_json(),
-            "unless": [
-                {
-                    "effect": one.id,
-                    "parameters": _values(one.parameters),
-                    **_numbers(one, "gain", "evidence"),
-                    "instead": _values(one.instead),
-                    "text": one.sentence,
-                }
-                for one in self.unless
-            ],
         }
 
 
@@ -331,7 +302,6 @@ class RunDiagnosis:
         input_reason: reason for this input; empty where nothing was fitted.
         joint: names of all runs that were judged together.
         effects: missing effects.
-        immaterial: missing effects below the detection threshold.
         undecided: alternatives that fit equally well.
         unobservable: effects not observable in this log.
         detectable: detection limits of the other effects that were not identified.
@@ -358,7 +328,6 @@ class RunDiagnosis:
     input_reason: str = ""
     joint: tuple[str, ...] = ()
     effects: tuple[Named, ...] = ()
-    immaterial: tuple[Named, ...] = ()
     undecided: tuple[Undecided, ...] = ()
     unobservable: tuple[Unobservable, ...] = ()
     detectable: tuple[Detectable, ...] = ()
@@ -395,12 +364,6 @@ class RunDiagnosis:
             "input_reason": self.input_reason or None,
             "joint_with": [name for name in self.joint if name != self.run],
             "effects": [effect.to_json() for effect in self.effects],
-            "immaterial": [effect.to_json() for effect in self.immaterial],
-            "materiality": {
-                "way_share": LEAST_WAY_SHARE,
-                "heading_rad": LEAST_TURN_RAD,
-                "horizon_s": HORIZON_S,
-            },
             "undecided": [
                 {
                     "candidates": list(item.candidates),

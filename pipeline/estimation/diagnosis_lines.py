@@ -11,7 +11,6 @@ from typing import cast
 
 from pipeline.core import INPUT_WORDS, format_angle, format_length, format_part, format_share, mark_finding
 from pipeline.core.untrusted import mapping_in, number_in
-from pipeline.estimation.acceptance import format_threshold
 from pipeline.estimation.ambiguity import DETECTED_SHARE, Undecided
 from pipeline.estimation.diagnosis import (
     CAUSE,
@@ -168,7 +167,6 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     lines += _label("when", [one.sentence for one in run.when])
     lines += _label("budget", [_format_budget(run)])
     lines += _label("data", [format_enough(run.effects, run.findings)])
-    lines += _label("minor", _format_immaterial(run))
     lines += _label("unseen", _format_unobservable(run))
     return [*lines, *_label("limits", [_format_detectable(run)])]
 
@@ -210,7 +208,6 @@ def _format_effect(
     yield effect.motion
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["corrected before the fit"] if effect.corrected else []
-    notes += ["tentative"] if effect.tentative else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
     yield from _describe_numbers(effect.id, effect.shown, parts, _format_values(effect), width)
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
@@ -330,13 +327,11 @@ def format_learned_share(learned: Mapping[str, object]) -> str:
 
 
 def _format_causes(effect: Named) -> Iterator[str]:
-    """Possible causes of an effect, and effects that would change its values."""
+    """Possible causes of an effect."""
     if effect.sentence != effect.motion:
         # The motion stands above, under `effects`.
         cause = effect.sentence.removeprefix(effect.motion).removeprefix(CAUSE).removeprefix("; ")
         yield f"{effect.id}: {cause}"
-    for one in effect.unless:
-        yield one.sentence
 
 
 def _format_range(effect: Named) -> Iterator[str]:
@@ -369,20 +364,6 @@ def _format_budget(run: RunDiagnosis) -> str:
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
             return f"error budget by cause ({total}): {', '.join(parts)}{signs}"
     return ""
-
-
-def _format_immaterial(run: RunDiagnosis) -> list[str]:
-    """Effects below the detection threshold, and the threshold."""
-    if not run.immaterial:
-        return []
-    width = max(len(_format_values(effect)) for effect in run.immaterial) + 2
-    rows = [
-        f"{_pad_id(effect.id)}{_format_values(effect):<{width}}changes predictions by "
-        f"{effect.moves.position_m * 1e3:.2g} mm and {effect.moves.heading_rad * 1e3:.2g} mrad"
-        for effect in run.immaterial
-        if effect.moves is not None
-    ]
-    return [*rows, f"below the detection threshold over {HORIZON_S:g} s: {format_threshold()}"]
 
 
 def _format_values(effect: Named) -> str:

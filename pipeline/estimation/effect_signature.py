@@ -8,9 +8,9 @@ import numpy as np
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
 from pipeline.estimation.comparison import Comparison
-from pipeline.estimation.parts import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import State
+from pipeline.estimation.window_residuals import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.models.effect import Place
 from pipeline.models.model import Timing
 from pipeline.run.windows import WINDOW_S

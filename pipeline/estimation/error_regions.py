@@ -14,7 +14,7 @@ from pipeline.core import finite_or_none, format_angle, format_digits, format_le
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.estimation.fit import Fitted
 from pipeline.estimation.intervals import narrow_part
-from pipeline.estimation.parts import Part
+from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.models.catalogue import find_effect
 from pipeline.run.windows import NODE_S
 
@@ -44,6 +44,8 @@ _BEYOND = 1.5
 was at most 1.47 on nine simulated runs of 150 s, with a patch of other ground 1.6 to 2.8."""
 _RIDGE = 1e-3
 """Ridge penalty as a share of each command's largest square, for poorly determined coefficients."""
+_SLOPES_RAD = (math.radians(3.0), math.radians(6.0), math.radians(10.0))
+"""Angles above which a region is on a slope: floors are level within a degree."""
 _SHAPE_LAGS = (0, 2, 4)
 """Lags, in quarters of a second, at which products of two commands are formed."""
 
@@ -54,7 +56,7 @@ class Region:
 
     Attributes:
         channel: x, y or w.
-        kind: `command`, `phase`, `time` or `place`.
+        kind: `command`, `phase`, `slope`, `time` or `place`.
         text: description of the region.
         share: of the channel's squared error.
         time_share: of the windows.
@@ -85,7 +87,7 @@ class Region:
         return f"{self.text}: {share} of the {error} in {time} of the time"
 
 
-def map_errors(part: Part, residual: Floats, places: Floats) -> list[Region]:
+def map_errors(part: WindowResiduals, residual: Floats, places: Floats) -> list[Region]:
     """Every region of every kind with its share of each channel's error.
 
     Args:
@@ -122,7 +124,7 @@ def _list_responses(lags: Floats, channel: int) -> Floats:
     """Regressors of a channel's error: commands of the last 2 s, and physically motivated products.
 
     Args:
-        lags: see `Part.find_ideal`.
+        lags: see `WindowResiduals.find_ideal`.
         channel: 0, 1, 2 for x, y, w: products as in the physics of speed, skid and yaw rate.
 
     Returns:
@@ -150,9 +152,9 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
     Args:
         regions: all regions.
         residual: of the model, shape (n, 3).
-        noise: residual spread of a saturated fit; a channel at this level has no excess, shape (n, 3).
+        noise: spread that no model can explain, by channel, shape (3,); at this level nothing is in excess.
     """
-    excess = np.sqrt((residual**2).mean(axis=0)) > 1.2 * np.median(noise, axis=0)
+    excess = np.sqrt((residual**2).mean(axis=0)) > 1.2 * noise
     picked = []
     for channel, name in enumerate(CHANNELS):
         if not excess[channel]:
@@ -172,7 +174,7 @@ def pick_regions(regions: list[Region], residual: Floats, noise: Floats) -> list
     return picked[: 2 * _SHOWN]
 
 
-def find_main_region(part: Part, residual: Floats, places: Floats) -> Region | None:
+def find_main_region(part: WindowResiduals, residual: Floats, places: Floats) -> Region | None:
     """The region with half of a channel's squared error in much less of the time; None without one.
 
     Args:
@@ -187,7 +189,7 @@ def find_main_region(part: Part, residual: Floats, places: Floats) -> Region | N
     )
 
 
-def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
+def _list_regions(part: WindowResiduals, places: Floats) -> list[tuple[str, str, Flags]]:
     lags = part.find_ideal()
     speed, turn = lags[:, 0, 0], lags[:, 0, 1]
     regions = _cut_commands(speed, turn)
@@ -201,10 +203,27 @@ def _list_regions(part: Part, places: Floats) -> list[tuple[str, str, Flags]]:
     edges = np.linspace(float(middle.min()), float(middle.max()) + 1e-6, 6)
     for low, high in pairwise(edges.tolist()):
         regions.append(("time", f"from {low:.0f} to {high:.0f} s", (middle >= low) & (middle < high)))
+    regions += _cut_slopes(part)
     for axis, name in ((0, "x"), (1, "y")):
         cut = float(np.median(places[:, axis]))
         regions.append(("place", f"where {name} > {cut:.1f} m in the map", places[:, axis] > cut))
         regions.append(("place", f"where {name} <= {cut:.1f} m in the map", places[:, axis] <= cut))
+    return regions
+
+
+def _cut_slopes(part: WindowResiduals) -> list[tuple[str, str, Flags]]:
+    """Regions by the slope that the vehicle stands on."""
+    roll, pitch = part.find_attitude().T
+    slopes = (
+        ("uphill", -pitch), ("downhill", pitch), ("across a slope to the left", -roll),
+        ("across a slope to the right", roll),
+    )  # fmt: skip
+    regions: list[tuple[str, str, Flags]] = []
+    for name, angle in slopes:
+        regions += [
+            ("slope", f"{name} above {math.degrees(least):.0f} degrees", angle > least)
+            for least in _SLOPES_RAD
+        ]
     return regions
 
 
@@ -440,10 +459,10 @@ def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
     See `narrow_part`; parameters of single runs are excluded.
     """
     curves: dict[str, Curve] = {}
-    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
+    for fit in fitted.fits:
         if not fit.free:
             continue
-        seconds, halves = narrow_part(part, fit)
+        seconds, halves = narrow_part(fit)
         curves |= {
             number.label: Curve(seconds, halves[:, index])
             for index, number in enumerate(fit.free)

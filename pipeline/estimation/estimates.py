@@ -3,26 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
-from pipeline.core.arrays import Ints
-from pipeline.estimation.acceptance import HALVES, find_beyond, find_exceeded, find_implausible
 from pipeline.estimation.additions import explain_interval
-from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value, format_numbers
+from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import BREVITY
-from pipeline.estimation.fit import Fitted, PartFit, fit_model, solve_step
+from pipeline.estimation.fit import Fitted, PartFit, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
-from pipeline.estimation.intervals import Estimate, Estimates, estimate_intervals, estimate_part, join_blocks
+from pipeline.estimation.intervals import Estimate, Estimates, estimate_part
 from pipeline.estimation.ladder import Judgement
-from pipeline.estimation.parts import Part, count_seconds
-from pipeline.estimation.selection import Context
 from pipeline.estimation.state import State
 from pipeline.estimation.verdict import SEARCH_CUT
+from pipeline.estimation.window_residuals import count_seconds
 from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
@@ -39,7 +36,7 @@ from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.core.compute import Budget
-    from pipeline.estimation.acceptance import NotSignificant
+    from pipeline.estimation.context import Context
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
@@ -108,91 +105,6 @@ def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
     return {parameter.name: Value(value, low, high, parameter.unit, another_run=another)}
 
 
-@dataclass(frozen=True)
-class Unless:
-    """An effect that is not significant, and may change the values of an identified one.
-
-    Attributes:
-        id: its id.
-        parameters: its values.
-        gain, evidence: see `NotSignificant`.
-        instead: values of the identified effect beside it; their intervals do not overlap those without it.
-            Empty where it changes none.
-    """
-
-    id: str
-    parameters: Mapping[str, Value]
-    gain: float
-    evidence: float
-    instead: Mapping[str, Value]
-
-    @property
-    def sentence(self) -> str:
-        """The values of the identified effect beside it, and why it is not reported itself."""
-        beside = (
-            f"with {self.id} ({format_numbers(self.parameters)}) in the model: {format_numbers(self.instead)}"
-        )
-        return f"{beside}; {self.doubt}"
-
-    @property
-    def doubt(self) -> str:
-        """Why it is not reported itself."""
-        evidence = math.floor(100.0 * self.evidence)
-        return f"{self.id} is not significant: it reaches {evidence} % of the significance threshold"
-
-    @property
-    def note(self) -> Mapping[str, Json]:
-        """The finding that it may act."""
-        return _note_insignificant(self.id, f"{self.doubt} ({format_numbers(self.parameters)})")
-
-
-def find_unless(
-    judgement: Judgement,
-    named: Sequence[Named],
-    not_significant: Iterable[NotSignificant],
-    taken: Container[str],
-) -> Iterator[tuple[str | None, Unless]]:
-    """Insignificant effects, by each identified effect whose values change beside them; by None if none do.
-
-    Args:
-        judgement: of the model with the identified effects.
-        named: with their values; effects with values by run are left out.
-        not_significant: effects whose evidence is below the threshold.
-        taken: ids of effects that are reported elsewhere.
-    """
-    for one in not_significant:
-        name = one.effect.id
-        if name in taken:
-            continue
-        beside, moved = _find_moved(judgement, named, one.effect, exact=False)
-        if moved:
-            # What it changes is said with its digits: a model with both effects has them.
-            beside, moved = _find_moved(judgement, named, one.effect, exact=True)
-        if explain_values(name, beside[name]):
-            continue
-        for other, instead in moved.items() or [(None, {})]:
-            yield other, Unless(name, beside[name], one.gain, one.evidence, instead)
-
-
-def _find_moved(
-    judgement: Judgement, named: Sequence[Named], effect: Effect, *, exact: bool
-) -> tuple[Mapping[str, Mapping[str, Value]], Mapping[str, Mapping[str, Value]]]:
-    """Values beside an effect, and those of identified effects that it moves out of their intervals."""
-    start = judgement.fitted
-    fitted = fit_model(judgement.problem, start.model + effect, start=start, exact=exact)
-    beside = list_first_run(fitted.state, estimate_intervals(judgement.problem, fitted))
-    changed = {
-        one.id: {
-            key: other
-            for key, value in one.parameters.items()
-            if (other := beside[one.id][key]).high < value.low or other.low > value.high
-        }
-        for one in named
-        if one.id in beside and not one.by_run
-    }
-    return beside, {other: values for other, values in changed.items() if values}
-
-
 def list_estimates(
     context: Context, judgement: Judgement, named: Sequence[Named]
 ) -> Iterator[EstimatedNumber]:
@@ -237,37 +149,6 @@ def list_estimates(
 def _overlaps(effect: Effect, model: Model) -> bool:
     """Whether an effect is a special case of one of the model, or the other way round."""
     return any(effect.id in one.contains or one.id in effect.contains for one in model)
-
-
-def find_doubt(effect: Named, exceeded: Mapping[str, float]) -> Mapping[str, Json] | None:
-    """The finding why an effect is not reported with its values; None where it is, or is a stand-in.
-
-    Args:
-        effect: with its values.
-        exceeded: what measured wheels exceed, see `Conditions`.
-    """
-    for values in effect.tellings:
-        restored = restore(effect.id, values)
-        highs = {name: value.high for name, value in values.items()}
-        implausible = None if format_stand_in(effect) else find_implausible(restored)
-        doubt = implausible or find_exceeded(restored, highs, exceeded)
-        if doubt is not None:
-            return {"id": "implausible_effect", "text": doubt, "where": effect.id, "severity": "warning"}
-    empty = [explain_values(effect.id, values) for values in effect.tellings]
-    if not all(empty):
-        return None
-    return _note_insignificant(effect.id, f"{effect.id} is not significant: {empty[0]}")
-
-
-def _note_insignificant(name: str, text: str) -> Mapping[str, Json]:
-    """The finding why an effect is not named, though the data may hold it."""
-    return {"id": "insignificant_effect", "text": text, "where": name, "severity": "info"}
-
-
-def format_stand_in(effect: Named) -> str:
-    """Clause listing values outside the observed range of an effect that halves the loss; else empty."""
-    beyond = (find_beyond(restore(effect.id, values)) for values in effect.tellings)
-    return next(filter(None, beyond), "") if HALVES * (1.0 + effect.gain) >= 1.0 else ""
 
 
 def restore(name: str, values: Mapping[str, Value]) -> Effect:
@@ -329,14 +210,8 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
     return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
 
 
-def note_idle(name: str) -> Mapping[str, Json]:
-    """A finding about an effect that does not improve the prediction."""
-    text = f"{name} reduces the error over half a second, but not the error over two seconds"
-    return {"id": "idle_effect", "text": text, "where": name, "severity": "info"}
-
-
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
-    """Estimates of effects that a fitted model lacks, each added to it alone.
+    """Estimates of effects that a fitted model lacks, each added to it alone, by one joint step.
 
     Excluded are effects that the model has, that do not act on its input, or whose parameters derivatives
     cannot optimize, and parameters that are not observable or undetermined within their bounds.
@@ -346,36 +221,33 @@ def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Esti
         candidates: effects at neutral values.
     """
     estimates: list[Estimate] = []
-    labels = [join_blocks(part, fit) for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True)]
     for effect in candidates:
         if effect.id in fitted.model or not all(math.isfinite(p.neutral) for p in effect.parameters):
             continue
-        for part, fit, label in zip(fitted.problem.parts, fitted.fits, labels, strict=True):
-            if part.owns(effect):
-                estimates += _estimate_added(part, fit, label, effect)
-                break
+        fit = next((fit for fit in fitted.fits if fit.part.owns(effect)), None)
+        estimates += [] if fit is None else _estimate_added(fit, effect)
     return tuple(estimates)
 
 
-def _estimate_added(part: Part, fit: PartFit, label: Ints, effect: Effect) -> list[Estimate]:
-    added = fit.state.add(effect)
+def _estimate_added(fit: PartFit, effect: Effect) -> list[Estimate]:
+    part, added = fit.part, fit.state.add(effect)
     new = tuple(n for n in part.list_free(added) if n.effect == effect.id)
     if not all(number.is_smooth for number in new):
         return []
     columns = part.differentiate(added, fit.residual, new)
-    grown = PartFit(
-        added,
-        (*fit.free, *new),
-        fit.residual,
-        np.concatenate((fit.jacobian, columns), axis=2),
-        fit.weights,
-        fit.loss,
+    grown = replace(
+        fit, state=added, free=(*fit.free, *new), columns=np.concatenate((fit.columns, columns), axis=2)
     )
-    step, _ = solve_step(grown.jacobian, grown.residual, grown.weights)
-    made = {item.free: item for item in estimate_part(part, grown, step, label).items}
+    step = invert(grown.normal) @ (grown.white.columns.T @ grown.white.residual)
+    moved = {number: float(change) for number, change in zip(grown.free, step, strict=True)}
+    made = {item.free: item for item in estimate_part(grown).items}
     if not all(made[number].observable for number in new):
         return []
-    return [replace(made[number], at_bound=False) for number in new if math.isfinite(made[number].low)]
+    return [
+        replace(made[number], value=made[number].value + moved[number], at_bound=False)
+        for number in new
+        if math.isfinite(made[number].low)
+    ]
 
 
 def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str, object]]:

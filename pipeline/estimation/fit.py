@@ -1,61 +1,65 @@
-"""Robust least squares over all free parameters of a part at once (Levenberg-Marquardt), part by part."""
+"""Maximum likelihood fits of a model to one part of the path: Gauss-Newton on innovations.
+
+The noise is that of the model's own residuals, learned together with its numbers. A cost is in units of
+chi-square: a step that promises less than a hundredth of one is not worth taking.
+"""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.estimation.parts import make_weights
-from pipeline.estimation.proposals import propose
-from pipeline.estimation.state import (
-    Free,
-    State,
-    Weights,
-    combine_columns,
-    make_columns,
-    pick_columns,
-    weigh_columns,
-)
+from pipeline.estimation.noise import CLIP, huber_cost
+from pipeline.estimation.state import combine_columns, flatten, pick_columns
 from pipeline.models.model import Model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from pipeline.core.arrays import Flags, Floats, Ints
+    from pipeline.estimation.noise import Noise
     from pipeline.estimation.parts import Part
     from pipeline.estimation.problem import Problem
-    from pipeline.models.effect import Effect, Parameter
+    from pipeline.estimation.state import Free, State
 
-_ITERATIONS = 20
-"""Maximum number of steps of a fit."""
-_ENOUGH = 1e-4
-"""Relative decrease of the loss at which a fit of the search ends: a hundredth of what naming needs."""
+_ENOUGH = 0.01
+"""Fall of chi-square below which a step is not worth taking."""
+_SETTLED = 1e-7
+"""The same for a model that is written: from the same values it ends at the same values."""
 _NEWS = 0.02
-"""Relative decrease of the loss above which derivatives are recomputed."""
-_FIRST_STEPS = 2
-"""Steps of a fit taken regardless of their predicted decrease: the first ones are rough."""
-_TRIES = 4
-"""Maximum number of steps with derivatives of another fit: after four, half of the rivals on recordings are
-within 1.5 % of the loss of their complete fit."""
+"""Relative fall of the cost above which derivatives are computed anew."""
+_MOST_STEPS = 20
+_ROUNDS = 3
+"""Times that the noise is learned anew from the residuals of a fit."""
+_SAME_NOISE = 0.03
+"""Change of the noise's correlation, share and relative scale below which it counts as the same."""
 _GRID_ROUNDS = 4
-"""Number of rounds of a grid, each a third as wide as the one before."""
+"""Rounds of a grid, each a third as wide as the one before."""
 _STIFFEST = 30.0
 """Damping relative to the diagonal above which no further step is tried."""
-_REWEIGHTED = 3
-"""Maximum number of rounds of recomputing the weights from the residuals and refitting."""
-_SAME_SCALE = 0.01
-"""Relative change below which weights count as unchanged."""
-_SETTLED = 1e-9
-"""Relative decrease of the loss at which the fit of a model that is written ends."""
-_SETTLED_ROUNDS = 60
-"""Maximum number of rounds until parameters, weights and digits no longer change, a safeguard: half a minute
-of gentle driving, which hardly determines a controller, needs 20."""
-_SAME_NUMBER = 2e-4
-"""Relative change below which a parameter counts as unchanged."""
+RIDGE = 1e-9
+"""Regularization of normal equations of columns of unit size."""
+
+
+@dataclass(frozen=True)
+class White:
+    """Innovations of a fit, weighted by Huber's weights, in one column of rows.
+
+    Attributes:
+        residual: shape (m,).
+        columns: of the fit's numbers, shape (m, p).
+        rows: step of each, shape (m,).
+        weights: square roots of Huber's weights, shape (n, 3), by which other columns are multiplied.
+    """
+
+    residual: Floats
+    columns: Floats
+    rows: Ints
+    weights: Floats
 
 
 @dataclass(frozen=True)
@@ -63,34 +67,279 @@ class PartFit:
     """Fit of one part of the path.
 
     Attributes:
-        state: the fitted state.
-        free: its free parameters that act on this part.
-        residual: its residuals, shape (n, 3).
-        jacobian: derivative of the prediction by each free parameter, shape (n, 3, p).
-        weights: weights of the residuals.
-        loss: mean cost under these weights, including that of the prior.
-        is_fresh: whether the derivatives are those at this state; after a small step the last ones are kept.
-        both_sides: whether they are central differences.
+        part: the part.
+        state: the fitted model.
+        free: its numbers that act on this part.
+        residual: measured less predicted increments, shape (n, 3).
+        columns: derivative of the prediction by each number, shape (n, 3, p).
+        noise: of the residuals.
     """
 
+    part: Part = field(repr=False)
     state: State
     free: tuple[Free, ...]
-    residual: Floats
-    jacobian: Floats
-    weights: Weights
-    loss: float
-    is_fresh: bool = True
-    both_sides: bool = False
+    residual: Floats = field(repr=False)
+    columns: Floats = field(repr=False)
+    noise: Noise
 
     @property
     def smooth(self) -> list[int]:
-        """Indices of the free parameters that derivatives can optimize."""
+        """Indices of the numbers that derivatives optimize."""
         return [index for index, number in enumerate(self.free) if number.is_smooth]
 
     @property
-    def without_derivatives(self) -> PartFit:
-        """The fit in the memory of its residuals; a fit that starts from it computes its own derivatives."""
-        return replace(self, jacobian=make_columns(0, len(self.free)), is_fresh=False)
+    def ids(self) -> tuple[str, ...]:
+        """Ids of the effects."""
+        return self.state.ids
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers were fitted."""
+        return len(self.free)
+
+    @cached_property
+    def white(self) -> White:
+        """Its innovations."""
+        return whiten(self.part, self.noise, self.residual, self.columns)
+
+    @cached_property
+    def normal(self) -> Floats:
+        """Information on its numbers, that of the prior included, shape (p, p)."""
+        prior = np.diag(self.part.prior.weigh(self.state, self.free)) if self.free else np.zeros((0, 0))
+        columns: Floats = self.white.columns
+        return columns.T @ columns + prior
+
+    @cached_property
+    def score(self) -> float:
+        """Minus twice the logarithm of the likelihood: smaller is better, also between kinds of noise."""
+        part = self.part
+        return measure_cost(part, self.noise, self.state, self.free, self.residual) + self.noise.log_variance(
+            part.steps
+        )
+
+    @cached_property
+    def overdispersion(self) -> float:
+        """Mean square of its weighted innovations, at least one."""
+        count = max(self.white.residual.size - self.numbers, 1)
+        return max(_sum_squares(self.white.residual) / count, 1.0)
+
+    @cached_property
+    def covariance(self) -> Floats:
+        """Covariance of its numbers, shape (p, p); see `join_covariance`."""
+        return join_covariance(self, self.normal)
+
+
+def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
+    """Weighted innovations of a residual (n, 3) and of columns (n, 3, p)."""
+    joined = np.concatenate((residual[:, :, None], columns), axis=2)
+    white = noise.whiten(joined, part.steps)
+    weights = np.sqrt(CLIP / np.maximum(np.abs(white[:, :, 0]), CLIP))
+    known = np.array(noise.known, dtype=np.int64)
+    rows = np.repeat(np.arange(residual.shape[0]), known.size)
+    flat = flatten(np.ascontiguousarray((white * weights[:, :, None])[:, known, :]))
+    return White(flat[:, 0], flat[:, 1:], rows, weights)
+
+
+def whiten_columns(fit: PartFit, columns: Floats) -> Floats:
+    """Columns (n, 3, q) in the rows of a fit's innovations, shape (m, q)."""
+    white = fit.noise.whiten(columns, fit.part.steps) * fit.white.weights[:, :, None]
+    known = np.array(fit.noise.known, dtype=np.int64)
+    return flatten(np.ascontiguousarray(white[:, known, :]))
+
+
+def _sum_squares(values: Floats) -> float:
+    return float(values @ values)
+
+
+def join_covariance(fit: PartFit, normal: Floats) -> Floats:
+    """Covariance from the information, and from how blocks differ where that is more.
+
+    A number that changes from block to block, or from run to run, is known less well than noise alone
+    allows (cluster-robust covariance: White, Econometrica 48, 1980; Cameron and Miller, 2015).
+    """
+    if not fit.free:
+        return np.zeros((0, 0))
+    inverse = invert(normal)
+    plain = fit.overdispersion * inverse
+    white, part = fit.white, fit.part
+    label = part.run if part.run[-1] + 1 >= _FEWEST_RUNS else part.block
+    count = int(label.max()) + 1
+    if count < _FEWEST_RUNS:
+        return plain
+    pulls = np.zeros((count, len(fit.free)))
+    np.add.at(pulls, label[white.rows], white.columns * white.residual[:, None])
+    moved = (pulls - pulls.mean(axis=0)) @ inverse
+    robust = count / (count - 1.0) * moved.T @ moved
+    factors = np.sqrt(np.maximum(np.diag(robust) / np.maximum(np.diag(plain), 1e-300), 1.0))
+    joined: Floats = plain * np.outer(factors, factors)
+    return joined
+
+
+_FEWEST_RUNS = 8
+"""Fewest blocks, or runs, from whose differences a covariance is estimated."""
+
+
+def invert(normal: Floats) -> Floats:
+    """Inverse of an information matrix, columns scaled to unit size; huge where nothing is known."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+    scaled = normal / np.outer(size, size) + RIDGE * np.eye(size.size)
+    inverse: Floats = np.linalg.inv(scaled) / np.outer(size, size)
+    return inverse
+
+
+def fit_part(
+    part: Part,
+    start: State,
+    *,
+    noise: Noise | None = None,
+    per_run: Sequence[str] = (),
+    exact: bool = False,
+) -> PartFit:
+    """Fit all numbers of a state to one part of the path, with the noise of its residuals.
+
+    Args:
+        part: part of the path.
+        start: state to start from.
+        noise: of nearly the same residuals; None to learn it from those of the start.
+        per_run: labels with one value per run.
+        exact: whether numbers must converge, not only the likelihood.
+    """
+    free = part.list_free(start, per_run)
+    residual = part.find_residuals(start)
+    known = part.learn(residual, noise)
+    enough = _SETTLED if exact else _ENOUGH
+    fit = PartFit(part, start, free, residual, part.differentiate(start, residual, free), known)
+    if not free:
+        return fit
+    for _ in range(_ROUNDS * (1 + exact)):
+        fit = _descend(fit, enough)
+        for number in fit.free:
+            if not number.is_smooth:
+                fit = _walk_grid(fit, number, enough)
+        learned = part.learn(fit.residual, None if exact else fit.noise)
+        is_same = _is_same(learned, fit.noise)
+        if is_same:
+            break
+        fit = replace(fit, noise=learned)
+    return fit
+
+
+def _is_same(one: Noise, other: Noise) -> bool:
+    sizes = one.spread, other.spread
+    apart = [one.correlation - other.correlation, one.share - other.share]
+    apart.append((sizes[0] - sizes[1]) / np.maximum(sizes[1], 1e-300))
+    return bool(np.abs(apart)[:, other.known].max(initial=0.0) < _SAME_NOISE)
+
+
+def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
+    """Huber's cost of innovations, and that of the prior."""
+    innovations = noise.whiten(residual[:, :, None], part.steps)
+    return float(huber_cost(innovations).sum()) + part.prior.cost(state, free)
+
+
+def _descend(fit: PartFit, enough: float) -> PartFit:
+    """Levenberg-Marquardt steps with this noise, numbers held to their bounds."""
+    part, noise, free = fit.part, fit.noise, fit.free
+    cost = measure_cost(part, noise, fit.state, free, fit.residual)
+    damping, is_fresh = 1e-6, True
+    for _ in range(_MOST_STEPS if fit.smooth else 0):
+        white = fit.white
+        pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
+        moving = [
+            index for index in fit.smooth if not _is_pushed_out(fit.state, free[index], float(pulls[index]))
+        ]
+        if not moving:
+            break
+        normal = fit.normal[np.ix_(moving, moving)]
+        size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+        scaled = normal / np.outer(size, size) + (RIDGE + damping) * np.eye(size.size)
+        step = np.linalg.solve(scaled, pulls[moving] / size) / size
+        if float(step @ pulls[moving]) < enough:
+            break
+        state = fit.state.move([free[index] for index in moving], step.tolist())
+        residual = part.find_residuals(state)
+        reached = measure_cost(part, noise, state, free, residual)
+        if not reached < cost:
+            if not is_fresh:
+                fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free))
+                is_fresh = True
+                continue
+            if damping > _STIFFEST:
+                break
+            damping = max(damping * 30.0, 1e-2)
+            continue
+        is_fresh = cost - reached > _NEWS * cost or cost - reached > 1.0 or enough < _ENOUGH
+        columns = part.differentiate(state, residual, free) if is_fresh else fit.columns
+        fall, cost, damping = cost - reached, reached, max(damping / 30.0, 1e-9)
+        fit = replace(fit, state=state, residual=residual, columns=columns)
+        if fall < enough:
+            break
+    if not is_fresh:
+        fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free))
+    return fit
+
+
+def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
+    """Whether a number is at a bound and is pulled beyond it."""
+    value, (low, high) = state.get(number), number.bounds
+    return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
+
+
+def _walk_grid(fit: PartFit, number: Free, enough: float) -> PartFit:
+    """Search a number on a shrinking grid, the others adapted linearly; then all of them are fitted."""
+    part, noise, smooth = fit.part, fit.noise, fit.smooth
+    columns = pick_columns(fit.columns, smooth)
+    value = fit.state.get(number)
+    width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
+    best, least = value, measure_cost(part, noise, fit.state, fit.free, fit.residual)
+    inverse = invert(fit.normal[np.ix_(smooth, smooth)])
+    for _ in range(_GRID_ROUNDS):
+        for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
+            if not number.bounds[0] <= at <= number.bounds[1]:
+                continue
+            residual = part.find_residuals(fit.state.set(number, at))
+            if smooth:
+                white = whiten(part, noise, residual, columns)
+                residual = residual - combine_columns(columns, inverse @ (white.columns.T @ white.residual))
+            cost = measure_cost(part, noise, fit.state, fit.free, residual)
+            if cost < least:
+                best, least = at, cost
+        width /= 3.0
+    if best == value:
+        return fit
+    state = fit.state.set(number, best)
+    residual = part.find_residuals(state)
+    moved = replace(
+        fit, state=state, residual=residual, columns=part.differentiate(state, residual, fit.free)
+    )
+    beyond = _descend(moved, enough)
+    costs = [measure_cost(part, noise, one.state, one.free, one.residual) for one in (beyond, fit)]
+    return beyond if costs[0] < costs[1] else fit
+
+
+def hold_out(fit: PartFit, noise: Noise, folds: Ints) -> Floats:
+    """Residuals of every step under numbers fitted without its fold, by one step from the fit, shape (n, 3).
+
+    Args:
+        fit: the fit.
+        noise: by which the folds are fitted.
+        folds: fold of each step, shape (n,).
+    """
+    held, smooth = np.array(fit.residual), fit.smooth
+    if not smooth:
+        return held
+    columns = pick_columns(fit.columns, smooth)
+    white = whiten(fit.part, noise, fit.residual, columns)
+    normal, pull = white.columns.T @ white.columns, white.columns.T @ white.residual
+    own = 0.01 * np.diag(np.diag(normal))
+    fold_of_row = folds[white.rows]
+    for fold in np.unique(folds).tolist():
+        rows = fold_of_row == fold
+        out, gone = white.columns[rows], white.residual[rows]
+        step = invert(normal - out.T @ out + own) @ (pull - out.T @ gone)
+        mine: Flags = folds == fold
+        held[mine] -= combine_columns(columns[mine], step)
+    return held
 
 
 @dataclass(frozen=True)
@@ -101,13 +350,16 @@ class Fitted:
         problem: the runs.
         state: model, per-run values and delays.
         fits: the fit of each part of the path.
-        residuals: residuals of the whole path, shape (n, 3).
     """
 
     problem: Problem = field(repr=False)
     state: State
     fits: tuple[PartFit, ...] = field(repr=False)
-    residuals: Floats = field(repr=False)
+
+    @cached_property
+    def residuals(self) -> Floats:
+        """Residuals in windows of the whole path, shape (n, 3)."""
+        return self.problem.find_residuals(self.state)
 
     @property
     def model(self) -> Model:
@@ -144,357 +396,58 @@ def fit_model(
         problem: the runs.
         model: effects at neutral values are searched from several starts; others start at their values.
         per_run: labels ``effect.name`` or ids with one value per run.
-        start: a fit of nearly the same model, whose unchanged parts are reused.
+        start: a fit of nearly the same model, from whose values those of common effects start.
         exact: iterate until the parameters converge, so that the same model has the same estimates from
-            every start; otherwise until the loss converges, which is enough to compare models.
+            every start; otherwise until the likelihood converges, which is enough to compare models.
 
     Returns:
         The fit; for a parameter at its bound, the data would fit better beyond it.
     """
-    state = problem.start_state(() if start is None else start.state.hold(_list_common(start, model)))
+    known = () if start is None else start.state.hold([e for e in start.state.effects if e.id in model])
+    state = problem.start_state(known)
     effects = problem.active_effects(model)
+    common = {effect.id: effect for effect in state.effects}
     fits: list[PartFit] = []
-    for index, part in enumerate(problem.parts):
-        mine = state.hold([effect for effect in effects if part.owns(effect)])
-        known = None if start is None else start.fits[index]
-        if known is not None and (known.state.effects, known.state.timing) == (mine.effects, mine.timing):
-            fit = _finish(part, known, per_run, exact=exact)
-        else:
-            begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
-            fit = problem.fits.recall(begin, partial(_begin, problem, part, mine, per_run, exact=exact))
+    for part in problem.parts:
+        mine = state.hold([common.get(effect.id, effect) for effect in effects if part.owns(effect)])
+        begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+        fit = problem.fits.recall(begin, partial(_fit_from, problem, part, mine, per_run, exact=exact))
         fits.append(fit)
         own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
         state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
-    return Fitted(problem, state, tuple(fits), problem.find_residuals(state))
+    acting = {effect.id for effect in effects}
+    return Fitted(problem, state.hold([one for one in state.effects if one.id in acting]), tuple(fits))
 
 
-def _begin(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
-    """The fit from a state; if ``exact``, from values as model files have them, where it ends at them.
+def _fit_from(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    """The fit from a state; effects without values start where they promise most, one after the other."""
+    from pipeline.estimation.candidates import Screen, Unset  # noqa: PLC0415 - it looks at fits
 
-    So the fit of a written model is the model: its values are such that no fit from them changes them.
-    """
-    if not exact:
-        return _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=False)
-    for _ in range(_SETTLED_ROUNDS):
-        state = state.hold([effect.rounded for effect in state.effects])
-        fit = _finish(part, _fit_part(problem, part, state, per_run), per_run, exact=True)
-        if _are_same(state, fit.state, [number for number in fit.free if number.effect]):
-            break
-        state = state.hold(fit.state.effects)
-    state = fit.state.add(*(effect.rounded for effect in state.effects))
-    fit = _enter(part, fit.weights, state, fit.free, Until(enough=_SETTLED))
-    weights = make_weights(fit.residual, part)
-    return replace(fit, weights=weights, loss=measure_loss(part, weights, fit.residual, state, fit.free))
-
-
-def _are_same(one: State, other: State, free: Sequence[Free]) -> bool:
-    values, others = ([state.get(number) for number in free] for state in (one, other))
-    return np.allclose(values, others, rtol=_SAME_NUMBER, atol=1e-6)
-
-
-def _finish(part: Part, fit: PartFit, per_run: Sequence[str], *, exact: bool) -> PartFit:
-    """The fit, converged if ``exact``, with shared values as the means over the runs."""
-    fit = _converge(part, fit, per_run) if exact else fit
-    return replace(fit, state=fit.state.centred)
-
-
-def _list_common(start: Fitted, model: Model) -> list[Effect]:
-    return [effect for effect in start.state.effects if effect.id in model]
-
-
-def _fit_part(problem: Problem, part: Part, state: State, per_run: Sequence[str]) -> PartFit:
-    """Fit of a part of the path; effects without values are added one after the other."""
     fresh = [
         effect
         for effect in state.effects
-        if effect.fixed != _names(effect)
+        if effect.fixed != {parameter.name for parameter in effect.parameters}
         # A value shared by all runs is no start for the clock of each run.
         and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
     ]
-    state = state.drop([effect.id for effect in fresh])
-    weights, state = _estimate_delays(part, state)
-    fit = fit_part(part, weights, state, per_run=per_run)
+    fit = fit_part(part, state.drop([effect.id for effect in fresh]), per_run=per_run)
     for effect in fresh:
-        proposal = propose(part, fit, Unset(effect), problem.largest)
-        extended = fit.state if proposal is None else proposal.state
-        started = extended.find(effect.id)
-        # Values that the proposal does not change may be fitted here.
-        extended = extended.add(effect if started is None else effect.change(**started.values))
-        fit = fit_part(part, fit.weights, extended, per_run=per_run)
-    for _ in range(_REWEIGHTED):
-        weights = make_weights(fit.residual, part)
-        if np.allclose(weights.scale, fit.weights.scale, rtol=_SAME_SCALE):
-            break
-        fit = fit_part(part, weights, fit, per_run=per_run)
-    return fit
+        extended = fit.state.add(effect)
+        starts = Screen(fit, [Unset(effect)], problem.largest).list_starts()
+        if starts:
+            extended = starts[0].add_to(fit.state)
+            started = extended.find(effect.id)
+            # Values that the start does not change may be fitted here.
+            extended = extended if started is None else extended.add(effect.change(**started.values))
+        fit = fit_part(part, extended, noise=fit.noise, per_run=per_run)
+    if exact:
+        fit = fit_part(part, fit.state, per_run=per_run, exact=True)
+        fit = _write_down(fit)
+    return replace(fit, state=fit.state.centred)
 
 
-def _estimate_delays(part: Part, state: State) -> tuple[Weights, State]:
-    """Weights, and the state with delays fitted before its effects: fitted all at once, these may diverge.
-
-    Both settle before the effects move: a fit that starts from the values of a fitted model ends there.
-    """
-    weights = make_weights(part.find_residuals(state), part)
-    delays = tuple(number for number in part.list_free(state) if not number.effect)
-    if not state.effects or not delays or any(state.get(number) for number in delays):
-        return weights, state
-    fit = _converge(part, _enter(part, weights, state, delays, Until(enough=_SETTLED)), ())
-    return make_weights(fit.residual, part), fit.state
-
-
-def _converge(part: Part, fit: PartFit, per_run: Sequence[str]) -> PartFit:
-    """The fit iterated until neither parameters nor weights change."""
-    for _ in range(_SETTLED_ROUNDS):
-        before, weights = fit.state, make_weights(fit.residual, part)
-        fit = fit_part(part, weights, fit, per_run=per_run, enough=_SETTLED)
-        if _are_same(before, fit.state, fit.free):
-            break
-    return fit
-
-
-def _names(effect: Effect) -> frozenset[str]:
-    return frozenset(parameter.name for parameter in effect.parameters)
-
-
-@dataclass(frozen=True)
-class Unset:
-    """An effect whose values are still to be fitted, as a candidate; fixed parameters keep their values."""
-
-    effect: Effect
-
-    @property
-    def id(self) -> str:
-        """Id of the effect."""
-        return self.effect.id
-
-    @property
-    def parameters(self) -> tuple[Parameter, ...]:
-        """Its parameters that are not fixed."""
-        return tuple(p for p in self.effect.parameters if p.name not in self.effect.fixed)
-
-    def __call__(self, **values: float) -> Effect:
-        """The effect with these values."""
-        return self.effect.change(**values)
-
-
-@dataclass(frozen=True)
-class Until:
-    """Stopping criteria of a fit; see `fit_part`."""
-
-    iterations: int = _ITERATIONS
-    enough: float = _ENOUGH
-    useful: float = math.inf
-
-    def is_enough(self, steps: int, loss: float, promised: float) -> bool:
-        """Whether to stop after this number of steps, from the predicted loss of the next one."""
-        if steps >= _FIRST_STEPS and promised > self.useful:
-            return True
-        return (loss - promised) / max(loss, 1e-12) < 0.5 * self.enough
-
-
-def fit_part(
-    part: Part,
-    weights: Weights,
-    start: State | PartFit,
-    iterations: int = _ITERATIONS,
-    *,
-    per_run: Sequence[str] = (),
-    enough: float = _ENOUGH,
-    useful: float = math.inf,
-) -> PartFit:
-    """Fit all free parameters of a state to one part of the path, including those that need a grid.
-
-    Args:
-        part: part of the path.
-        weights: weights of the residuals.
-        start: state to start from, or a fit, whose residuals and derivatives are reused.
-        iterations: maximum number of steps.
-        per_run: as in `fit_model`.
-        enough: relative decrease of the loss at which the fit ends.
-        useful: required loss; the fit ends early if the predicted loss of its next step is above it.
-    """
-    until = Until(iterations, enough, useful)
-    if isinstance(start, State):
-        start = _enter(part, weights, start, part.list_free(start, per_run), until)
-    fit = _descend(part, replace(start, weights=weights), until)
-    for number in fit.free:
-        moved = None if number.is_smooth else _walk_grid(part, fit, number)
-        if moved is None:
-            continue
-        # The grid treats the others as linear: where they are not, its loss may not be reached.
-        beyond = _descend(part, _enter(part, weights, moved, fit.free, until), until)
-        if beyond.loss < fit.loss:
-            fit = beyond
-    return fit
-
-
-def _enter(part: Part, weights: Weights, state: State, free: tuple[Free, ...], until: Until) -> PartFit:
-    """An unchanged state with its residuals and derivatives."""
-    both = until.enough < _ENOUGH
-    residual, jacobian = part.linearize(state, free, both_sides=both)
-    return PartFit(state, free, residual, jacobian, weights, math.nan, both_sides=both)
-
-
-def try_part(part: Part, weights: Weights, state: State, base: PartFit) -> PartFit:
-    """Some steps of a fit with the derivatives of another one: of its new parameters alone they are computed.
-
-    Args:
-        part: part of the path.
-        weights: weights of the residuals.
-        state: state to start from.
-        base: fit of a state with most of its parameters.
-    """
-    free = part.list_free(state)
-    known = {number.key: index for index, number in enumerate(base.free)}
-    new = [index for index, number in enumerate(free) if number.key not in known]
-    residual, columns = part.linearize(state, [free[index] for index in new])
-    jacobian = make_columns(residual.shape[0], len(free))
-    jacobian[:, :, new] = columns
-    old = [index for index in range(len(free)) if index not in new]
-    jacobian[:, :, old] = base.jacobian[:, :, [known[free[index].key] for index in old]]
-    start = PartFit(state, free, residual, jacobian, weights, math.nan)
-    return replace(_descend(part, start, Until(_TRIES), new), is_fresh=False)
-
-
-def _renew(
-    part: Part,
-    free: Sequence[Free],
-    which: Sequence[int] | None,
-    state: State,
-    residual: Floats,
-    jacobian: Floats,
-    *,
-    both_sides: bool,
-) -> Floats:
-    """The derivatives at a state: all of them, or the known ones with those of some parameters recomputed."""
-    if which is None:
-        return part.differentiate(state, residual, free, both_sides=both_sides)
-    renewed = jacobian.copy(order="K")
-    renewed[:, :, list(which)] = part.differentiate(state, residual, [free[index] for index in which])
-    return renewed
-
-
-def measure_loss(part: Part, weights: Weights, residual: Floats, state: State, free: Sequence[Free]) -> float:
-    """Mean cost per window, including that of the prior."""
-    prior: float = part.prior.cost(state, free) / residual.shape[0]
-    return weights.loss(residual) + prior
-
-
-def solve_step(
-    jacobian: Floats,
-    residual: Floats,
-    weights: Weights,
-    damping: float = 0.0,
-    hold: Floats | float = 0.0,
-    pull: Floats | float = 0.0,
-) -> tuple[Floats, Floats]:
-    """One weighted least squares step.
-
-    Args:
-        jacobian: derivative of the prediction by each parameter, shape (n, 3, p).
-        residual: shape (n, 3).
-        weights: weights of the residuals.
-        damping: Levenberg-Marquardt damping relative to the diagonal.
-        hold: information for the current value of each parameter, shape (p,).
-        pull: gradient of the prior: information for a change, times that change, shape (p,).
-
-    Returns:
-        The step, shape (p,), and the normal matrix, shape (p, p).
-    """
-    factor = weights.factors(residual)
-    rows = weigh_columns(jacobian, factor)
-    target = (residual * factor).reshape(-1)
-    normal = np.asarray(rows.T @ rows, dtype=np.float64)
-    size = np.diag(normal) + 1e-12
-    stiff = normal + np.diag(size * (damping + 1e-9) + hold)
-    step = np.asarray(np.linalg.solve(stiff, rows.T @ target + pull), dtype=np.float64)
-    return step, normal
-
-
-def _descend(part: Part, start: PartFit, until: Until, which: Sequence[int] | None = None) -> PartFit:
-    """Descend from a fit; of its derivatives only some are recomputed, if ``which`` gives their indices."""
-    both = until.enough < _ENOUGH
-    state, free, weights, residual, jacobian = (
-        start.state, start.free, start.weights, start.residual, start.jacobian
-    )  # fmt: skip
-    renew = partial(_renew, part, free, which, both_sides=both)
-    loss = measure_loss(part, weights, residual, state, free)
-    smooth, damping, is_fresh = start.smooth, 1e-4, True
-    if not start.is_fresh or both != start.both_sides:
-        jacobian = renew(state, residual, jacobian)
-    for iteration in range(until.iterations if smooth else 0):
-        pull = part.prior.pull(state, free)
-        moving = [
-            index
-            for index in smooth
-            if not _pushes_out(state, free[index], jacobian[:, :, index], residual, float(pull[index]))
-        ]
-        if not moving:
-            break
-        movable, columns = [free[index] for index in moving], pick_columns(jacobian, moving)
-        step, _ = solve_step(
-            columns,
-            residual,
-            weights,
-            damping,
-            part.prior.weigh(state, free)[moving],
-            pull[moving],
-        )
-        trial = state.move(movable, step.tolist())
-        # Loss of the step if the model were linear: without a decrease, the fit ends.
-        linear = residual - combine_columns(columns, step)
-        if until.is_enough(iteration, loss, measure_loss(part, weights, linear, trial, free)):
-            break
-        after = part.find_residuals(trial)
-        reached = measure_loss(part, weights, after, trial, free)
-        if reached > loss:
-            if not is_fresh:
-                jacobian = renew(state, residual, jacobian)
-                is_fresh = True
-                continue
-            if damping > _STIFFEST:
-                break
-            damping = max(damping * 20.0, 1e-2)
-            continue
-        fall = (loss - reached) / max(loss, 1e-12)
-        state, residual, loss = trial, after, reached
-        damping = max(damping / 8.0, 1e-8)
-        # After a small step the derivatives are reused: new ones cost a prediction per parameter.
-        is_fresh = fall > _NEWS
-        if is_fresh:
-            jacobian = renew(state, residual, jacobian)
-        if fall < until.enough:
-            break
-    return PartFit(state, free, residual, jacobian, weights, loss, is_fresh, both)
-
-
-def _pushes_out(state: State, number: Free, column: Floats, residual: Floats, prior: float) -> bool:
-    """Whether a parameter is at its bound and the gradient points beyond."""
-    value, (low, high) = state.get(number), number.bounds
-    if low < value < high:
-        return False
-    pull = float(np.sum(column * residual)) + prior
-    return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
-
-
-def _walk_grid(part: Part, fit: PartFit, number: Free) -> State | None:
-    """Search on a shrinking grid, the other parameters adapted linearly; None if nothing is better."""
-    columns, weights = pick_columns(fit.jacobian, fit.smooth), fit.weights
-    value = fit.state.get(number)
-    # A moment in time has no magnitude to scale the width with.
-    width = 8.0 * number.step if math.isnan(fit.state.neutral_of(number)) else 0.5 * abs(value)
-    best, best_loss = value, fit.loss
-    for _ in range(_GRID_ROUNDS):
-        for at in (best - width, best - 0.5 * width, best + 0.5 * width, best + width):
-            if not number.bounds[0] <= at <= number.bounds[1]:
-                continue
-            moved = fit.state.set(number, at)
-            residual = part.find_residuals(moved)
-            if fit.smooth:
-                step, _ = solve_step(columns, residual, weights)
-                residual = residual - combine_columns(columns, step)
-            loss = measure_loss(part, weights, residual, moved, fit.free)
-            if loss < best_loss:
-                best, best_loss = at, loss
-        width /= 3.0
-    return None if best == value else fit.state.set(number, best)
+def _write_down(fit: PartFit) -> PartFit:
+    """The fit at values as model files have them."""
+    part, state = fit.part, fit.state.hold([effect.rounded for effect in fit.state.effects])
+    residual = part.find_residuals(state)
+    return replace(fit, state=state, residual=residual)

@@ -3,24 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
 from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, pick_finite
 from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
-from pipeline.estimation.fit import PartFit, measure_loss, solve_step
-from pipeline.estimation.parts import Part
-from pipeline.estimation.state import (
-    State,
-    Weights,
-    combine_columns,
-    flatten,
-    pick_columns,
-    pick_windows,
-    weigh_columns,
-)
+from pipeline.estimation.fit import PartFit, invert
 from pipeline.models.learned_term import LEARNED
 
 if TYPE_CHECKING:
@@ -29,6 +18,8 @@ if TYPE_CHECKING:
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import Fitted
     from pipeline.estimation.problem import Problem
+    from pipeline.estimation.state import State
+    from pipeline.estimation.window_residuals import WindowResiduals
     from pipeline.models.effect import Effect
 
     Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
@@ -40,10 +31,6 @@ if TYPE_CHECKING:
 
 GAP_S = 1.5
 """Gap between training and test windows [s]: residuals are correlated for about a second."""
-_CHORD_STEPS = 3
-"""Maximum number of steps of a fit to one fold, from the fit to all windows and with its derivatives."""
-_NOTHING = 1e-6
-"""Relative decrease of the loss below which a fold needs no further step."""
 _LEAST_SHARE = 0.01
 """Regularization of each parameter in a fold, as a share of the information of the whole run."""
 
@@ -56,104 +43,57 @@ class Fold:
     test: Flags
 
 
-def make_folds(part: Part) -> tuple[Fold, ...]:
+class _Rows(Protocol):
+    """Rows with a run and times: windows, or the steps of a part."""
+
+    run: Ints
+    times: Floats
+
+
+def make_folds(windows: WindowResiduals) -> tuple[Fold, ...]:
     """Five folds of ten-second stretches, with gaps of 1.5 s between training and test windows."""
-    tests = [part.unit % FOLDS == number for number in range(FOLDS)]
-    return tuple(Fold(~find_near(part, part, test), test) for test in tests)
+    tests = [windows.unit % FOLDS == number for number in range(FOLDS)]
+    return tuple(Fold(~find_near(windows, windows, test), test) for test in tests)
 
 
-def find_near(part: Part, test_part: Part, test: Flags) -> Flags:
-    """Mask of windows of a part within the gap of test windows of the same runs, shape (n,).
+def find_near(rows: _Rows, tested: _Rows, test: Flags) -> Flags:
+    """Mask of rows within the gap of test rows of the same runs, shape (n,).
 
     Args:
-        part: part with the windows.
-        test_part: the part with the test windows; may be the same.
-        test: mask of its test windows, shape (m,).
+        rows: the rows.
+        tested: those with the test rows; may be the same.
+        test: mask of these, shape (m,).
     """
-    near = np.zeros(part.run.size, dtype=bool)
-    for run in np.unique(part.run).tolist():
-        rows, judged = part.run == run, (test_part.run == run) & test
-        starts, ends = np.sort(test_part.times[judged, 0]), np.sort(test_part.times[judged, 1])
-        # A window is near if more test windows begin before its end than end before its start.
-        later = np.searchsorted(starts, part.times[rows, 1] + GAP_S)
-        earlier = np.searchsorted(ends, part.times[rows, 0] - GAP_S)
-        near[rows] = later > earlier
+    near = np.zeros(rows.run.size, dtype=bool)
+    for run in np.unique(rows.run).tolist():
+        mine, judged = rows.run == run, (tested.run == run) & test
+        starts, ends = np.sort(tested.times[judged, 0]), np.sort(tested.times[judged, 1])
+        # A row is near if more test rows begin before its end than end before its start.
+        later = np.searchsorted(starts, rows.times[mine, 1] + GAP_S)
+        earlier = np.searchsorted(ends, rows.times[mine, 0] - GAP_S)
+        near[mine] = later > earlier
     return near
 
 
-def hold_out_part(fit: PartFit, folds: tuple[Fold, ...]) -> Floats:
-    """Residuals of every window with parameters fitted without it and its surroundings, shape (n, 3).
-
-    First-order approximation from the derivatives, as a search needs it many times.
-    """
-    smooth = fit.smooth
-    held = np.array(fit.residual)
-    if not smooth:
-        return held
-    jacobian, factor = pick_columns(fit.jacobian, smooth), fit.weights.factors(fit.residual)
-    rows, target = jacobian * factor[:, :, None], fit.residual * factor
-    whole = _sum_normals(rows, target)
-    hold = _LEAST_SHARE * np.diag(whole[0])
-    for fold in folds:
-        if not fold.test.any() or not fold.train.any():
-            continue
-        # Nearly all windows are fitted: subtract the others from the sum over all.
-        out = _sum_normals(pick_windows(rows, ~fold.train), target[~fold.train])
-        normal, gradient = whole[0] - out[0], whole[1] - out[1]
-        stiff = normal + np.diag((np.diag(normal) + 1e-12) * 1e-9 + hold)
-        step = np.asarray(np.linalg.solve(stiff, gradient), dtype=np.float64)
-        held[fold.test] -= combine_columns(pick_windows(jacobian, fold.test), step)
-    return held
-
-
-def _sum_normals(rows: Floats, target: Floats) -> tuple[Floats, Floats]:
-    """Normal matrix (p, p) and gradient (p,) of weighted columns (n, 3, p) and residuals (n, 3)."""
-    flat = flatten(rows)
-    return flat.T @ flat, flat.T @ target.reshape(-1)
-
-
-def refit(part: Part, fit: PartFit, train: Flags) -> State:
-    """State of the fit repeated on some windows, from its own solution and with its own derivatives.
+def refit(fit: PartFit, train: Flags) -> State:
+    """State of the fit on some steps only, by one step from its solution with its own derivatives.
 
     Args:
-        part: the fitted part.
-        fit: fit to all windows.
-        train: mask of the windows to fit, shape (n,).
+        fit: fit to all steps.
+        train: mask of the steps to fit, shape (n,).
     """
-    smooth, state, residual = fit.smooth, fit.state, fit.residual
+    smooth, state = fit.smooth, fit.state
     if not smooth or not train.any():
         return state
-    weights, hold = _take(fit.weights, train), _hold(fit)
-    jacobian = pick_windows(pick_columns(fit.jacobian, smooth), train)
+    white = fit.white
+    columns = white.columns[:, smooth]
+    own = _LEAST_SHARE * np.diag(np.einsum("ij,ij->j", columns, columns))
     free = [fit.free[index] for index in smooth]
-    loss = measure_loss(part, weights, residual[train], state, fit.free)
-    for _ in range(_CHORD_STEPS):
-        pull = part.prior.pull(state, fit.free)[smooth]
-        held = hold + part.prior.weigh(state, fit.free)[smooth]
-        step, _ = solve_step(jacobian, residual[train], weights, hold=held, pull=pull)
-        moved = state.move(free, step.tolist())
-        promised = measure_loss(
-            part, weights, residual[train] - combine_columns(jacobian, step), moved, fit.free
-        )
-        if loss - promised < _NOTHING * loss:
-            break
-        trial = part.find_residuals(moved)
-        new = measure_loss(part, weights, trial[train], moved, fit.free)
-        if new >= loss:
-            break
-        state, residual, loss = moved, trial, new
-    return state
-
-
-def _hold(fit: PartFit) -> Floats:
-    """Regularizing information, shape (p,): an effect that acts briefly may act in one fold only."""
-    rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
-    hold: Floats = _LEAST_SHARE * np.einsum("ij,ij->j", rows, rows)
-    return hold
-
-
-def _take(weights: Weights, rows: Flags) -> Weights:
-    return Weights(weights.scale[rows], weights.clip[rows])
+    prior = fit.part.prior
+    rows = train[white.rows]
+    normal = columns[rows].T @ columns[rows] + own + np.diag(prior.weigh(state, fit.free)[smooth])
+    pull = columns[rows].T @ white.residual[rows] + prior.pull(state, fit.free)[smooth]
+    return state.move(free, (invert(normal) @ pull).tolist())
 
 
 @dataclass(frozen=True)
@@ -259,9 +199,8 @@ def _score_fold(
 def refit_fold(problem: Problem, fitted: Fitted, number: int) -> State:
     """State of a fit repeated without the tested stretches of a fold."""
     state = fitted.state
-    for part, fit, train in zip(problem.parts, fitted.fits, problem.training[number], strict=True):
-        begin = (part, fit.state.effects, fit.state.timing, repr(fit.state.own), train.tobytes())
-        state = state.take_over(problem.refits.recall(begin, partial(refit, part, fit, train)), fit.free)
+    for fit, train in zip(fitted.fits, problem.training[number], strict=True):
+        state = state.take_over(refit(fit, train), fit.free)
     return state
 
 

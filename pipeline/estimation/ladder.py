@@ -16,8 +16,8 @@ from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.parts import average_windows, locate_windows
 from pipeline.estimation.problem import Problem
+from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
 
@@ -302,7 +302,7 @@ def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) 
         per_run: labels with one value per run.
     """
     whole = judge_whole(problem, model, per_run)
-    return Judgement(problem, whole, estimate_intervals(problem, whole.fitted), tuple(per_run))
+    return Judgement(problem, whole, estimate_intervals(whole.fitted), tuple(per_run))
 
 
 def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
@@ -363,12 +363,7 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     if names in ([], list(problem.names)):
         ids = set(model.ids)
         undecided = [group for group in file.undecided if ids.intersection(group)]
-        unless = [
-            {"parameter": label, "effect": other, "value": value}
-            for label, other, value in file.unless
-            if label.split(".")[0] in ids and other not in ids
-        ]
-        fit |= {key: rows for key, rows in (("undecided", undecided), ("unless", unless)) if rows}
+        fit |= {key: rows for key, rows in (("undecided", undecided),) if rows}
     return replace(file, model=model, per_run=per_run, intervals=intervals, fit=fit)
 
 

@@ -39,9 +39,9 @@ from pipeline.estimation.ladder import (
     list_rises,
     read_error,
 )
-from pipeline.estimation.parts import CLIP
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.state import State
+from pipeline.estimation.window_residuals import CLIP
 from pipeline.models.effect import Effect, Late
 from pipeline.models.learned_term import (
     INPUTS,
@@ -338,7 +338,7 @@ def judge_learned_term(judgement: Judgement) -> Judgement:
 def add_term(fitted: Fitted, term: ResidualTerm) -> Fitted:
     """A fit with a learned term added, all parameters unchanged."""
     state = fitted.state.add(term)
-    return replace(fitted, state=state, residuals=fitted.problem.find_residuals(state))
+    return replace(fitted, state=state)
 
 
 def _name_own(problem: Problem) -> str:
@@ -447,20 +447,18 @@ def fit_own(problem: Problem, model: Model, per_run: Sequence[str] = ()) -> Fitt
     return fit_as_it_is(problem, model, (*clocks, *per_run))
 
 
-def learn_beyond(judgement: Judgement) -> dict[str, Json]:
-    """Result of a learned term on top of a judged model: `learned` of a diagnosis, empty if it has one.
+def learn_beyond(judgement: Judgement) -> LearnedStep | None:
+    """A learned term on top of a judged model; None if it has one already.
 
     Nothing is learned from an error at the noise floor.
     """
     below, floor = judgement.whole, judgement.floor
     if find_learned(below.fitted.model) is not None:
-        return {}
+        return None
     if all(read_error(below.errors, one) < ABOVE_FLOOR * read_error(floor, one) for one in ERRORS_OVER_2S):
         at_floor = "the remaining error is at the noise floor"
-        step = LearnedStep(ResidualTerm(), below.held_out, below.held_out, at_floor)
-    else:
-        step = make_learned_step(judgement.problem, below.fitted, below.held_out)
-    return learned_as_json(step, judgement.ideal.errors, floor)
+        return LearnedStep(ResidualTerm(), below.held_out, below.held_out, at_floor)
+    return make_learned_step(judgement.problem, below.fitted, below.held_out)
 
 
 def learned_as_json(step: LearnedStep, ideal: Errors, floor: Errors) -> dict[str, Json]:

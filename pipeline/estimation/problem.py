@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core import FOLDS
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
 from pipeline.core.compute import Newest
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
@@ -18,6 +17,7 @@ from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
+from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.models.effect import Effect
 from pipeline.models.learned_term import drop_learned
 from pipeline.models.model import Model, Timing
@@ -159,13 +159,12 @@ class Problem:
 
     Attributes:
         comparisons: the runs with the input.
-        whole: the whole path from the input to the body, on which errors are measured.
         parts: parts on which parameters are fitted: the whole path, or if wheels are measured as well as
             commanded, the path from the wheels to the body and that from the command to the wheels.
         largest: the largest commands.
         exceeded: speeds that measured wheels exceed, see `measure_exceeded`.
-        fits, refits: cached fits of a part, and of it in a fold, by their starts: models with commands and
-            with measured wheels as input share the part after the wheels.
+        fits: cached fits of a part by their starts: models with commands and with measured wheels as input
+            share the part after the wheels.
 
     Raises:
         MotionError: a run lacks the input, or has too little comparable data.
@@ -185,30 +184,27 @@ class Problem:
         self.heading = heading
         self.comparisons = self._compare(source)
         counts = [comparison.windows.start.size for comparison in self.comparisons]
-        for run, count in zip(self.runs, counts, strict=True):
-            if count < FEWEST_WINDOWS:
-                raise _refuse_few(run, count)
+        if sum(counts) < FEWEST_WINDOWS or 0 in counts:
+            fewest = counts.index(min(counts))
+            raise _refuse_few(self.runs[fewest], counts[fewest])
         self.largest = measure_largest(self.runs, self.vehicle)
         self.exceeded = measure_exceeded(self.runs, self.vehicle)
-        self.fits, self.refits = Newest[PartFit](_MOST_FITS), Newest[State](_MOST_FITS * FOLDS)
+        self.fits = Newest[PartFit](_MOST_FITS)
         # A gyro determines the delay of the poses, one in any run for all; the remaining delay between poses
         # and wheels is that of the encoders.
         gyro = any(comparison.has_gyro for comparison in self.comparisons)
         delays: tuple[DelayName, ...] = ("wheel_delay_s",) if gyro else ()
+        self.parts: tuple[Part, ...]
         if source is Input.MEASURED:
-            self.whole = BodyPart(self.comparisons, delays, whole=False)
-            self.parts: tuple[Part, ...] = (self.whole,)
+            self.parts = (BodyPart(self.comparisons, delays, whole=False),)
         elif any(run.wheels is None for run in self.runs):
-            self.whole = BodyPart(self.comparisons)
-            self.parts = (self.whole,)
+            self.parts = (BodyPart(self.comparisons),)
         else:
-            measured = self._compare(Input.MEASURED)
-            self.whole = BodyPart(self.comparisons)
+            self._measured = self._compare(Input.MEASURED)
+            sideways = self.largest.sideways > 0.0
             self.parts = (
-                BodyPart(measured, delays, whole=False),
-                WheelPart(
-                    [one.where_read for one in self.comparisons], measured, self.largest, self.exceeded
-                ),
+                BodyPart(self._measured, delays, whole=False),
+                WheelPart(self.comparisons, self._measured, sideways=sideways, exceeded=self.exceeded),
             )
 
     def _compare(self, source: Input) -> tuple[Comparison, ...]:
@@ -222,25 +218,29 @@ class Problem:
         """The same runs with their measured wheels as input; prepared data are shared."""
         if self.source is Input.MEASURED:
             return self
-        body = self.parts[0]
-        if not isinstance(body, BodyPart) or body is self.whole:
+        if len(self.parts) == 1:
             raise MotionError(
                 "no_measured",
                 "the run has no measured wheels to feed a model with",
                 where=", ".join(self.names),
                 hint="Choose the other input.",
             )
-        problem = self.with_parts(body, (body,))
-        problem.source, problem.comparisons = Input.MEASURED, body.comparisons
+        problem = self.with_parts(self.parts[:1])
+        problem.source, problem.comparisons = Input.MEASURED, self._measured
         return problem
 
-    def with_parts(self, whole: BodyPart, parts: tuple[Part, ...]) -> Problem:
+    def with_parts(self, parts: tuple[Part, ...]) -> Problem:
         """The same runs with other parts, without cached results of the former ones."""
         problem = copy(self)
-        for name in ("behind_wheels", "folds", "training"):
+        for name in ("behind_wheels", "whole", "folds", "training"):
             problem.__dict__.pop(name, None)
-        problem.whole, problem.parts = whole, parts
+        problem.parts = parts
         return problem
+
+    @cached_property
+    def whole(self) -> WindowResiduals:
+        """Residuals of the whole path, from the input to the body, in windows: errors are measured there."""
+        return WindowResiduals(self.comparisons)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -259,13 +259,9 @@ class Problem:
 
     @cached_property
     def training(self) -> tuple[tuple[Flags, ...], ...]:
-        """Masks of the training windows, by fold and part."""
+        """Masks of the training steps, by fold and part."""
         return tuple(
-            tuple(
-                fold.train if part is self.whole else ~find_near(part, self.whole, fold.test)
-                for part in self.parts
-            )
-            for fold in self.folds
+            tuple(~find_near(part, self.whole, fold.test) for part in self.parts) for fold in self.folds
         )
 
     def start_state(self, known: State | Sequence[Effect] = ()) -> State:

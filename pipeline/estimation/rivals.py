@@ -27,8 +27,8 @@ from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
 from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
-from pipeline.estimation.parts import CLIP, locate_windows
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
+from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.model import Model, Timing
 from pipeline.run import MotionError

@@ -10,7 +10,6 @@ from typing import Literal
 import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.core.machine_code import compiled
 from pipeline.models.effect import Effect, Search
 from pipeline.models.model import Timing
 
@@ -46,62 +45,9 @@ def flatten(columns: Floats) -> Floats:
     return columns.reshape(columns.shape[0] * columns.shape[1], columns.shape[2])
 
 
-def weigh_columns(columns: Floats, factor: Floats) -> Floats:
-    """Columns times factors of shape (n, 3), as those of a matrix, shape (3 n, p)."""
-    return flatten(columns * factor[:, :, None])
-
-
 def combine_columns(columns: Floats, step: Floats) -> Floats:
     """Sum of the columns, each times its part of a step of shape (p,), shape (n, 3)."""
     return (flatten(columns) @ step).reshape(columns.shape[:2])
-
-
-@dataclass(frozen=True)
-class Weights:
-    """Weights of residuals.
-
-    Attributes:
-        scale: spread of each residual, shape (n, 3); infinite in channels that say nothing.
-        clip: where a residual stops to count quadratically, in units of `scale`, shape (n, 3).
-    """
-
-    scale: Floats
-    clip: Floats
-
-    def weigh(self, residual: Floats) -> Floats:
-        """Residuals in units of their spread, square-rooted Huber weights included, shape (n, 3)."""
-        scaled = residual / self.scale
-        size = np.abs(scaled)
-        return scaled * np.sqrt(self.clip / np.maximum(size, self.clip))
-
-    def factors(self, residual: Floats) -> Floats:
-        """Factors that turn rows of a Jacobian into those of `weigh`, shape (n, 3)."""
-        factors = residual / self.scale
-        np.maximum(np.abs(factors, out=factors), self.clip, out=factors)
-        np.sqrt(np.divide(self.clip, factors, out=factors), out=factors)
-        factors /= self.scale
-        return factors
-
-    def cost(self, residual: Floats) -> Floats:
-        """Huber cost of every window, shape (n,)."""
-        costs = np.zeros(residual.shape[0])
-        residual, scale, clip = map(np.ascontiguousarray, (residual, self.scale, self.clip))
-        _sum_costs(residual, scale, clip, costs)
-        return costs
-
-    def loss(self, residual: Floats) -> float:
-        """Mean cost of a window."""
-        return float(self.cost(residual).mean())
-
-
-@compiled("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1])")
-def _sum_costs(residual: Floats, scale: Floats, clip: Floats, costs: Floats) -> None:
-    """See `Weights.cost`."""
-    for row in range(residual.shape[0]):
-        for channel in range(residual.shape[1]):
-            size = abs(residual[row, channel] / scale[row, channel])
-            held = min(size, clip[row, channel])
-            costs[row] += held * (2.0 * size - held)
 
 
 DelayName = Literal["wheel_delay_s"]
@@ -340,9 +286,7 @@ class State:
 # p numbers, each z standard deviations from its mean, add (f + p) log(1 + sum z^2 / f) to the cost of a fit,
 # as one more observation (maximum a posteriori): that of a multivariate t distribution with few degrees of
 # freedom f (Lange, Little and Taylor, JASA 84, 1989). Where the run contradicts what was known of one number,
-# all of them are held less: a run with an effect that no other run had is unlike them in several. Residuals
-# repeat each other in time and are larger than noise, so that they say less than their summed cost. The prior
-# is weighed up by that `excess`.
+# all of them are held less: a run with an effect that no other run had is unlike them in several.
 
 # Degrees of freedom: what was known is forgotten where a run lies several deviations off.
 _FREEDOM = 4.0
@@ -354,20 +298,17 @@ class Prior:
 
     Attributes:
         numbers: mean and standard deviation by label ``effect.name``, deviations positive.
-        excess: cost of residuals that says as much as a cost of one would if they were independent and no
-            larger than noise.
     """
 
     numbers: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    excess: float = 1.0
 
     def cost(self, state: State, free: Sequence[Free]) -> float:
-        """Cost of a state's free numbers, on the scale of the summed cost of residuals."""
+        """Cost of a state's free numbers, in units of chi-square."""
         if not self.numbers:
             return 0.0
         away, known = self._compare(state, free)
         count = np.count_nonzero(known)
-        return self.excess * (_FREEDOM + count) * float(np.log1p(known @ away**2 / _FREEDOM))
+        return (_FREEDOM + int(count)) * float(np.log1p(known @ away**2 / _FREEDOM))
 
     def weigh(self, state: State, free: Sequence[Free]) -> Floats:
         """Information on each of all free numbers, zero where nothing is known, shape (p,)."""
@@ -375,7 +316,8 @@ class Prior:
             return np.zeros(len(free))
         away, known = self._compare(state, free)
         held = (_FREEDOM + np.count_nonzero(known)) / (_FREEDOM + known @ away**2)
-        return self.excess * held * known
+        weighed: Floats = held * known
+        return weighed
 
     def pull(self, state: State, free: Sequence[Free]) -> Floats:
         """Half the fall of the cost with each of all free numbers, shape (p,)."""

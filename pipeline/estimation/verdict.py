@@ -114,7 +114,7 @@ def _list_open_ends(diagnosis: Content) -> tuple[str, str, str]:
     elif SEARCH_CUT in noted:
         why = "the budget ended the search for effects early"
     elif CHANGE not in noted and measure_excess(diagnosis) >= ABOVE_FLOOR:
-        why = f"{_name_small(diagnosis)}no known effect explains the rest"
+        why = "no known effect explains the rest"
     return _describe_choice(diagnosis), noted.get(CHANGE, ""), why
 
 
@@ -198,19 +198,7 @@ def _format_nothing(diagnosis: Content) -> list[str]:
     ]
     if open_groups:
         return [*sentences, f"The cause is {open_groups[0]}, which this log does not separate"]
-    return [*sentences, f"{_name_small(diagnosis)}no known effect explains the error"]
-
-
-def _name_small(diagnosis: Content) -> str:
-    """What explains some of the rest and is left out of the model, as the beginning of a clause."""
-    small = []
-    for one in objects_in(diagnosis, "immaterial"):
-        numbers = mapping_in(one, "parameters")
-        if not any(mapping_in(numbers, key).get("undetermined") for key in numbers):
-            small.append(str(one["id"]))
-    return (
-        f"apart from {enumerate_texts(_list_names(small))} below the detection threshold, " if small else ""
-    )
+    return [*sentences, "No known effect explains the error"]
 
 
 def _list_clauses(diagnosis: Content) -> dict[str, str]:

@@ -459,8 +459,6 @@ class Facts:
         if rivals := self.file.list_rivals(effect.id):
             names = " or ".join(map(quote_name, rivals))
             text += f", undecided: {names} would explain the data as well"
-        for number, other, at in self.file.unless:
-            text += f", {at:.5g}{unit} with {quote_name(other)} in the model" if number == label else ""
         doubt = self.file.find_doubt(effect, parameter)
         return f"{text}, {doubt}" if doubt else text
 

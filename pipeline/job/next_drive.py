@@ -18,6 +18,7 @@ from pipeline.core import SlipError
 from pipeline.estimation import Recording, RunDiagnosis
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.decision import find_cost
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
 from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
@@ -47,8 +48,6 @@ OTHER_GROUND = 0.1
 """Weight of a run on another terrain, so that runs on the requested terrain dominate and the others determine
 the remaining parameters. The median heading error of seven runs, divided by that of their own models, is 1.29
 with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows."""
-LEAST_FALL = 0.01
-"""Decrease of the mean logarithm of the runs' residual scale to add an effect: one percent of the error."""
 
 
 def forecast_deployment(
@@ -128,7 +127,7 @@ def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) 
         if taken or not part.owns(effect):
             continue
         extended = fit_part_jointly(part, fit.state.add(effect), shares)
-        if fit.loss - extended.loss >= LEAST_FALL:
+        if find_cost(extended) < find_cost(fit):
             fit = extended
     return fit
 
@@ -373,8 +372,6 @@ def ask(
         questions += ask_undecided(knowledge, groups)
         questions += ask_apart(knowledge, {name for group in groups for name in group})
         numbers |= knowledge.base.names.difference(*groups)
-        effects = () if diagnosis is None else diagnosis.effects
-        names += [one.id for effect in effects for one in effect.unless]
     questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
     if ALL in wanted:
         names += [u.id for u in diagnosis.unobservable] if diagnosis is not None else list_names(knowledge)

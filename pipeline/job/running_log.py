@@ -26,7 +26,7 @@ import msgspec
 
 from pipeline.core import python_command
 from pipeline.core.untrusted import objects_in
-from pipeline.estimation.acceptance import LEAST_T
+from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.error_regions import ABOVE_FLOOR, INTERVAL_SHARE, find_goal, format_errors
 from pipeline.estimation.verdict import find_refusal, measure_excess
 from pipeline.job import JobError
@@ -406,7 +406,7 @@ def _is_enough(diagnosis: Content, stated: Sequence[Stated], waiting: Sequence[s
 
 def _passes(effect: Content) -> bool:
     """Whether a named effect has the evidence required in a running log; corrected clocks are excluded."""
-    return not (effect["tentative"] or effect["corrected"]) and measure_t(effect) >= RUNNING_T
+    return not effect["corrected"] and measure_t(effect) >= RUNNING_T
 
 
 def measure_t(effect: Content) -> float:

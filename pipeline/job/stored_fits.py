@@ -370,10 +370,10 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
     names = [label.name for label in labels]
     count = len(names) + len(LOGARITHMS)
     values, covariance = np.full(count, np.nan), np.full((count, count), np.nan)
-    for part, fit in zip(problem.parts, fitted.fits, strict=True):
+    for fit in fitted.fits:
         if not fit.free:
             continue
-        estimates = estimate_part(part, fit)
+        estimates = estimate_part(fit)
         common = [
             (index, item)
             for index, item in enumerate(estimates.items)

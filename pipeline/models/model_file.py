@@ -92,15 +92,6 @@ class ModelFile:
         """Ids of effects that explained the fitted runs as well as an effect of the model."""
         return [name for group in self.undecided if effect in group for name in group if name != effect]
 
-    @property
-    def unless(self) -> list[tuple[str, str, float]]:
-        """Values that change if an effect that is not significant acts: label, its id, the other value."""
-        return [
-            (str(row.get("parameter")), str(row.get("effect")), float(row["value"]))  # type: ignore[arg-type]
-            for row in self.list_fitted("unless")
-            if _is_number(row.get("value"))
-        ]
-
     def find_doubt(self, effect: Effect, parameter: Parameter) -> str:
         """Reason why a value is not reliable, in words; empty where there is none.
 

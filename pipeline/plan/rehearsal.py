@@ -12,11 +12,11 @@ import numpy as np
 from pipeline.core.arrays import Complex, Flags, Floats
 from pipeline.estimation import Comparison, Input, Problem, State, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
+from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import Fitted, PartFit
-from pipeline.estimation.intervals import count_repeats
-from pipeline.estimation.parts import Part, average_windows, locate_windows
 from pipeline.estimation.problem import average_sustained, measure_largest
-from pipeline.estimation.state import Free, pick_columns, weigh_columns
+from pipeline.estimation.state import Free
+from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models import Effect, Model, Place, Timing
 from pipeline.models.parameter import Excitation, Largest
 from pipeline.plan import Commands, PlanError, Reached, is_steered
@@ -242,9 +242,8 @@ def _read_wheels(times: Floats, driven: Velocity, vehicle: Vehicle) -> DriveSeri
 # by the variance of its weighted residuals times the number of neighbours that repeat each residual. The
 # prior of the fleet, or the usual size of a parameter, adds to it.
 
-# Without a log: spread of a window's residual [m/s, m/s, rad/s], and number of overlapping windows.
-_USUAL_NOISE = (0.02, 0.02, 0.02)
-_OVERLAP = 2.0
+_USUAL_NOISE = (0.007, 0.007, 0.007)
+"""Without a log: spread of the residual of a step [m, m, rad]."""
 # Standard deviation of the clock offset of a future log [s].
 CLOCK_S = 0.05
 
@@ -301,7 +300,7 @@ class Knowledge:
         vehicle: geometry.
         senses: sensors of the next log.
         base: model that explains the logs so far; the ideal one without logs.
-        noise: standard deviation of a window's residual by part and channel, corrected for overlap; infinite
+        noise: standard deviation of a step's residual by part and channel, as if independent; infinite
             in channels without information, shape (parts, 3).
         fitted: fit of the base to the logs so far; None without logs on this ground.
         problem: residual problem of the logs so far; None without logs.
@@ -336,9 +335,9 @@ class Knowledge:
         problem, power = self.fitted.problem, 0.0
         other = fit_model(problem, Model(problem.vehicle, tuple(effects)))
         for part, own, fit in zip(problem.parts, self.fitted.fits, other.fits, strict=True):
-            # The weights are the same for both models.
-            excess = own.weights.loss(fit.residual) - own.weights.loss(own.residual)
-            power += excess * fit.residual.shape[0] / _inflate(part, own)
+            # The noise is the same for both models.
+            costs = [list_costs(part, own.noise, one.residual) for one in (fit, own)]
+            power += float((costs[0] - costs[1]).sum()) / own.overdispersion
         return _inform(other), 0.5 * math.sqrt(max(power, 0.0))
 
 
@@ -372,9 +371,9 @@ def learn(
     problem = Problem(used, vehicle, Input.COMMAND)
     model = Model(problem.vehicle, tuple(effects))
     if prior:
-        problem = tie_to_prior(problem, model, prior)
+        problem = tie_to_prior(problem, prior)
     fitted = fit_model(problem, model)
-    noise = [_measure_noise(part, fit) for part, fit in zip(problem.parts, fitted.fits, strict=True)]
+    noise = [_measure_noise(fit) for fit in fitted.fits]
     return Knowledge(problem.vehicle, read_senses(used), _inform(fitted), np.array(noise), problem, fitted)
 
 
@@ -388,7 +387,7 @@ def assume(
         effects: expected effects at their expected values; none for the ideal model.
         prior: prior of their parameters: mean and standard deviation by label.
     """
-    noise = np.sqrt(_OVERLAP) * np.array([_USUAL_NOISE])
+    noise = np.array([_USUAL_NOISE])
     senses = Senses(track_multiplier=vehicle.controller_track_multiplier)
     return Knowledge(vehicle, senses, _assume(tuple(effects), prior or {}), noise)
 
@@ -404,9 +403,9 @@ def _inform(fitted: Fitted) -> Hypothesis:
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
     index_of = {number.label: index for index, number in enumerate(free)}
     total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
-    for part, fit in zip(fitted.problem.parts, fitted.fits, strict=True):
-        rows = weigh_columns(pick_columns(fit.jacobian, fit.smooth), fit.weights.factors(fit.residual))
-        normal = rows.T @ rows / _inflate(part, fit)
+    for fit in fitted.fits:
+        columns = fit.white.columns[:, fit.smooth]
+        normal = columns.T @ columns / fit.overdispersion
         numbers = [fit.free[index] for index in fit.smooth]
         mine = [index for index, number in enumerate(numbers) if number.effect and number.run is None]
         clocks = [index for index in range(len(numbers)) if index not in mine]
@@ -437,13 +436,12 @@ def _expect(
     return np.array(spread, dtype=np.float64) ** -2.0
 
 
-def _inflate(part: Part, fit: PartFit) -> float:
-    """Variance of weighted residuals times the number of neighbours that repeat each of them."""
-    rest = fit.weights.weigh(fit.residual)[part.live][:, list(part.channels)]
-    return max(float(np.mean(rest**2)), 1e-12) * count_repeats(part, fit)
+def _measure_noise(fit: PartFit) -> Floats:
+    """Standard deviation of a step by channel, as if steps were independent, shape (3,).
 
-
-def _measure_noise(part: Part, fit: PartFit) -> Floats:
-    """Standard deviation of a window's residual by channel for independent windows, shape (3,)."""
-    middle = np.median(fit.weights.scale, axis=0)
-    return np.asarray(middle * math.sqrt(_inflate(part, fit)), dtype=np.float64)
+    A slow disturbance adds up over many steps, and counts by its sum; the noise of poses cancels.
+    """
+    noise = fit.noise
+    lasting = noise.share * (1.0 + noise.correlation) / (1.0 - noise.correlation)
+    spread = noise.spread * np.sqrt((lasting + 1.0 - noise.share) * fit.overdispersion)
+    return np.where(spread > 0.0, spread, np.inf)

@@ -237,7 +237,6 @@ def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, ob
         "does": begin_large(does),
         "may_be": may_be,
         "alike": _list_alike(entry),
-        "unless": [begin_large(str(one.get("text", ""))) for one in objects_in(entry, "unless")],
         "picture": signature,
     }
 
@@ -262,7 +261,6 @@ def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
     """One row per parameter: value, interval, and in the first row the gain of the effect."""
     name, same = str(entry.get("id", "")), entry.get("equivalent_to")
     notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
-    notes += ["tentative"] if entry.get("tentative") else []
     gain = _format_gain(number_in(entry, "gain"))
     without = Cell(gain, small=_PATHS.get(str(entry.get("found_on")), "")) if gain else ""
     parameters = mapping_in(entry, "parameters")
@@ -315,9 +313,6 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "unexplained", f"{format_unexplained(rest)}{example}", formula
     if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
         yield "beyond the effects", beyond, ""
-    small = [str(entry.get("id", "")) for entry in objects_in(diagnosis, "immaterial")]
-    if small:
-        yield "below the detection threshold", f"{', '.join(small)} (values in the JSON)", ""
     unseen = diagnosis.get("unobservable")
     if isinstance(unseen, list) and unseen:
         yield "not observable in this log", ", ".join(map(str, unseen)), ""

@@ -23,6 +23,11 @@ HORIZON_S = 2.0
 """Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25
 """Step between means of poses [s]: windows overlap by half."""
+STEP_S = 0.2
+"""Step of the increments that models are fitted to [s]: of half a second they say little of delays, and of a
+tenth nothing else."""
+_LONGEST_STEP_S = 0.75
+"""Longest increment [s]: three of the nodes of dense poses."""
 _GATHER_S = 0.066
 """Half-width of the mean over poses [s]: of three poses at 20 Hz, which reduces noise, but no motion of half
 a second."""
@@ -176,6 +181,22 @@ def join_windows(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Win
     blocks = number_blocks(run, grid)
     block = np.searchsorted(blocks, times.mean(axis=1), side="right") - 1
     return Windows(start, end, times[:, 1] - times[:, 0], block, times)
+
+
+def join_steps(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Windows:
+    """Increments from node to node that do not overlap, each from where the one before ends."""
+    period = float(np.median(np.diff(nodes.times))) if nodes.times.size > 1 else STEP_S
+    least, chain = STEP_S - 0.3 * period, [0]
+    for index in range(1, nodes.times.size):
+        is_cut = nodes.piece[index] != nodes.piece[chain[-1]]
+        if is_cut or nodes.times[index] - nodes.times[chain[-1]] >= least:
+            chain.append(index)
+    start, end = np.array(chain[:-1], dtype=np.int64), np.array(chain[1:], dtype=np.int64)
+    mask = nodes.times[end] - nodes.times[start] < _LONGEST_STEP_S
+    mask &= _is_clean(run, grid, nodes, (start, end), lead_s)
+    start, end = start[mask], end[mask]
+    times = np.column_stack((nodes.times[start], nodes.times[end]))
+    return Windows(start, end, times[:, 1] - times[:, 0], np.zeros(start.size, dtype=np.int64), times)
 
 
 def join_horizons(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Horizons:

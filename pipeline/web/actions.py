@@ -26,14 +26,13 @@ from pipeline.estimation import (
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals, format_refusals
 from pipeline.estimation.apportion import SlipBudget, apportion
+from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.problem import predict_at_from
-from pipeline.estimation.selection import Context
-from pipeline.estimation.unexplained import find_places
 from pipeline.job.run_results import load_vehicle
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.models.model_file import ModelFile
@@ -129,7 +128,7 @@ class PreparedRun:
         with self.lock:
             if key not in self._fits:
                 fitted, held_out = fit_and_hold_out(self.problem, model)
-                estimates = estimate_intervals(self.problem, fitted) if model.effects else NOTHING
+                estimates = estimate_intervals(fitted) if model.effects else NOTHING
                 self.remember(model, Judged(fitted, held_out, estimates))
             self._fits.move_to_end(key)
             return self._fits[key]
@@ -198,7 +197,7 @@ class PreparedRun:
             state = self.state(model, timing)
             whole, comparison = self.problem.whole, self.problem.comparisons[0]
             residual = whole.find_residuals(state)
-            regions = map_errors(whole, residual, find_places([comparison]))
+            regions = map_errors(whole, residual, whole.find_places())
             return Shown(
                 view=self.stage.view(state, ladder, floor),
                 where=[region.sentence for region in pick_regions(regions, residual, whole.noise)],

@@ -116,7 +116,6 @@ const buildNext = (pane) => {
   const running = trial && !trial.done;
   const next = findNext(rows, running);
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
-  const unless = (diagnosis?.effects ?? []).flatMap((effect) => (effect.unless ?? []).map((entry) => h("p", { class: "quiet" }, `${effect.id} ${entry.text}`)));
   const rest = diagnosis?.unexplained && !diagnosis.unexplained.formula ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row) => buildRow(pane, row, row === next);
   return h("div", { class: "next" },
@@ -127,7 +126,7 @@ const buildNext = (pane) => {
     trial?.done && !next && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
-    unless, undecided, rest, buildPlan(pane),
+    undecided, rest, buildPlan(pane),
     buildCatalogue(pane, catalogue.filter((entry) => !there.has(entry.id))));
 };
 

@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, format_angle, format_length
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
-from pipeline.estimation.acceptance import LEAST_T
+from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal
 from pipeline.estimation.ladder import format_rises
 from pipeline.estimation.verdict import CAUSE_NAMES

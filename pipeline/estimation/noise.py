@@ -1,0 +1,262 @@
+"""Noise of increments: a disturbance that lasts, and white noise of the poses between which they lie.
+
+    d_k = a_k + n_k - n_(k-1),  a an AR(1) of variance A s^2 and correlation phi^(dt/h),  var n = (1 - A) s^2
+
+d_k is the residual of a step, measured less predicted displacement or turn; a is motion that no model
+explains and n the error of the localization. Differences of poses make n anticorrelated: whoever takes
+residuals as independent throws away what is slow. The innovations of a Kalman filter with these three numbers
+are independent and of variance one. Its gains do not depend on the data, so that residuals and columns of a
+Jacobian pass through the same filter.
+
+Source: Ljung, System Identification, 2nd ed., section 3.2; Harvey, Forecasting, Structural Time Series Models
+and the Kalman Filter, 1989, chapter 3.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.optimize import minimize
+
+from pipeline.core.machine_code import compiled
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.core.arrays import Flags, Floats, Ints
+
+CLIP = 3.0
+"""Innovation [standard deviations] above which its cost grows linearly (Huber)."""
+_LONGEST_S = 2.0
+"""Longest correlation time of a disturbance [s]: what lasts longer is an effect, or the ground, not noise."""
+_LEAST = 1e-9
+"""Spread [m, rad] below which residuals are rounding."""
+_SCALE_ROUNDS = 30
+_SAME_SCALE = 1e-4
+"""Relative change of a scale at which it has converged."""
+_GAUSSIAN = 1.4826
+"""Ratio of the standard deviation of a normal distribution to its median absolute value."""
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Increments of runs, one after the other.
+
+    Attributes:
+        spans: length of each [s], shape (n,).
+        fresh: whether it does not continue the one before, shape (n,).
+        run: number of its run, shape (n,).
+    """
+
+    spans: Floats
+    fresh: Flags
+    run: Ints
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise of the three channels of increments.
+
+    Attributes:
+        step_s: time to which `correlation` refers [s].
+        correlation: of the disturbance from one step to the next, shape (3,).
+        share: of the disturbance in the variance of a step, shape (3,).
+        scale: standard deviation [m, m, rad] in each run, which a fast one has larger, shape (runs, 3);
+            infinite where a channel says nothing.
+    """
+
+    step_s: float
+    correlation: Floats
+    share: Floats
+    scale: Floats
+
+    @property
+    def known(self) -> list[int]:
+        """Channels that say anything in one of the runs."""
+        return [int(channel) for channel in np.flatnonzero(np.isfinite(self.scale).any(axis=0))]
+
+    @property
+    def spread(self) -> Floats:
+        """Root mean square of the scale over the runs, zero in channels that say nothing, shape (3,)."""
+        scale = np.where(np.isfinite(self.scale), self.scale, 0.0)
+        spread: Floats = np.sqrt(np.mean(scale**2, axis=0))
+        return spread
+
+    def whiten(self, columns: Floats, steps: Steps) -> Floats:
+        """Innovations of columns in standard deviations, before any weight of outliers.
+
+        Args:
+            columns: increments, shape (n, 3, q).
+            steps: the steps.
+
+        Returns:
+            Shape (n, 3, q); zeros in channels that say nothing.
+        """
+        white = np.zeros(columns.shape)
+        for channel in self.known:
+            values = np.ascontiguousarray(columns[:, channel, :])
+            made, spreads = self._filter(values, steps, channel)
+            white[:, channel, :] = made / (spreads * self.scale[steps.run, channel])[:, None]
+        return white
+
+    def log_variance(self, steps: Steps) -> float:
+        """Sum of the logarithms of the innovations' variances: what a likelihood has beside its squares."""
+        total, nothing = 0.0, np.zeros((steps.run.size, 1))
+        for channel in self.known:
+            spreads = self._filter(nothing, steps, channel)[1] * self.scale[steps.run, channel]
+            total += 2.0 * float(np.log(spreads[np.isfinite(spreads)]).sum())
+        return total
+
+    def _filter(self, values: Floats, steps: Steps, channel: int) -> tuple[Floats, Floats]:
+        return _filter(values, steps, self.step_s, self.correlation[channel], self.share[channel])
+
+    def spread_after(self, seconds: Floats) -> tuple[Floats, Floats]:
+        """Variances of the sum of increments over times by poses and by disturbance, shape (m, 3) each."""
+        count = np.maximum(seconds / self.step_s, 1.0)[:, None]
+        phi, variance = self.correlation, self.spread**2
+        poses = np.broadcast_to(2.0 * (1.0 - self.share) * variance, (count.size, 3))
+        grown = count * (1.0 + phi) / (1.0 - phi) - 2.0 * phi * (1.0 - phi**count) / (1.0 - phi) ** 2
+        return poses, self.share * variance * grown
+
+
+def learn_noise(residual: Floats, steps: Steps, channels: Sequence[int], start: Noise | None = None) -> Noise:
+    """Noise of residuals by maximum likelihood, outliers weighted down.
+
+    Args:
+        residual: increments, shape (n, 3).
+        steps: the steps.
+        channels: those that say anything.
+        start: noise of nearly the same residuals.
+    """
+    step_s, runs = float(np.median(steps.spans)), int(steps.run[-1]) + 1
+    correlation, share, scale = np.zeros(3), np.zeros(3), np.full((runs, 3), np.inf)
+    rows = [steps.run == run for run in range(runs)]
+    for channel in channels:
+        values = np.ascontiguousarray(residual[:, channel : channel + 1])
+        rough = np.array([_measure_rough(values[mine]) for mine in rows])
+        if not (rough > _LEAST).any():
+            continue
+        known = None if start is None else (start.correlation[channel], start.share[channel])
+        scaled = values / np.where(rough > _LEAST, rough, np.inf)[steps.run][:, None]
+        phi, part = _maximize(scaled, steps, step_s, known)
+        made, deviations = _filter(values, steps, step_s, phi, part)
+        correlation[channel], share[channel] = phi, part
+        for run, mine in enumerate(rows):
+            if rough[run] > _LEAST:
+                scale[run, channel] = max(_measure_scale(made[mine, 0] / deviations[mine]), _LEAST)
+    return Noise(step_s, correlation, share, scale)
+
+
+def _measure_rough(values: Floats) -> float:
+    """Spread of residuals as if they were independent."""
+    if not values.size:
+        return 0.0
+    return max(_GAUSSIAN * float(np.median(np.abs(values))), 0.1 * float(values.std()))
+
+
+def _measure_scale(innovations: Floats) -> float:
+    """Scale of most likelihood of innovations with a density that falls as exp(-`huber_cost` / 2)."""
+    size = np.abs(innovations)
+    scale = max(_GAUSSIAN * float(np.median(size)), 0.1 * float(size.mean()), 1e-12)
+    for _ in range(_SCALE_ROUNDS):
+        grown = math.sqrt(float(np.mean(np.minimum(size * size, CLIP * scale * size)))) / scale
+        scale *= grown
+        if abs(grown - 1.0) < _SAME_SCALE:
+            break
+    return scale
+
+
+def huber_cost(innovations: Floats) -> Floats:
+    """Square of an innovation, growing linearly above `CLIP`; of the shape of the argument."""
+    size = np.abs(innovations)
+    held = np.minimum(size, CLIP)
+    cost: Floats = held * (2.0 * size - held)
+    return cost
+
+
+def _maximize(
+    values: Floats, steps: Steps, step_s: float, known: tuple[float, float] | None
+) -> tuple[float, float]:
+    """Correlation and share of the disturbance."""
+    most = math.exp(-step_s / _LONGEST_S)
+
+    def read(at: Floats) -> tuple[float, float]:
+        phi, part = 1.0 / (1.0 + np.exp(-np.clip(at, -12.0, 12.0)))
+        return float(phi) * most, float(part)
+
+    def cost(at: Floats) -> float:
+        made, deviations = _filter(values, steps, step_s, *read(at))
+        innovations = made[:, 0] / deviations
+        spread = _measure_scale(innovations)
+        squares = float(huber_cost(innovations / spread).sum())
+        return squares + 2.0 * (innovations.size * math.log(spread) + float(np.log(deviations).sum()))
+
+    starts = [(2.0, -2.0), (0.0, 1.0)]
+    if known is not None:
+        inside = np.clip((known[0] / most, known[1]), 1e-4, 1.0 - 1e-4)
+        first, second = np.log(inside / (1.0 - inside)).tolist()
+        starts = [(first, second)]
+    found = [
+        minimize(
+            cost,
+            np.array(start),
+            method="Nelder-Mead",
+            options={
+                "maxiter": 80,
+                "xatol": 0.02,
+                "fatol": 0.3,
+                "initial_simplex": np.add(start, [[0.0, 0.0], [1.2, 0.0], [0.0, 1.2]]),
+            },
+        )
+        for start in starts
+    ]
+    return read(min(found, key=lambda one: float(one.fun)).x)
+
+
+def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: float) -> tuple[Floats, Floats]:
+    """Innovations of columns (n, q), and their standard deviations for a variance of one, shape (n,)."""
+    made, deviations = np.empty(values.shape), np.empty(steps.run.size)
+    state = np.empty((2, values.shape[1]))
+    _walk(values, steps.fresh, steps.spans, step_s, phi, share, state, made, deviations)
+    return made, deviations
+
+
+@compiled(
+    "void(float64[:, ::1], boolean[::1], float64[::1], float64, float64, float64, float64[:, ::1], "
+    "float64[:, ::1], float64[::1])"
+)
+def _walk(
+    values: Floats,
+    fresh: Flags,
+    spans: Floats,
+    step_s: float,
+    phi: float,
+    share: float,
+    state: Floats,
+    made: Floats,
+    deviations: Floats,
+) -> None:
+    """Kalman filter of a disturbance and the error of the last pose; see the module for the equations."""
+    noise = 1.0 - share
+    of_a, of_both, of_n = share, 0.0, noise
+    for row in range(values.shape[0]):
+        if fresh[row]:
+            of_a, of_both, of_n = share, 0.0, noise
+            for column in range(values.shape[1]):
+                state[0, column], state[1, column] = 0.0, 0.0
+        variance = of_a + of_n - 2.0 * of_both + noise
+        gain_a, gain_n = (of_a - of_both) / variance, noise / variance
+        keep = phi ** (spans[row] / step_s)
+        for column in range(values.shape[1]):
+            fresh_part = values[row, column] - state[0, column] + state[1, column]
+            made[row, column] = fresh_part
+            state[0, column] = keep * (state[0, column] + gain_a * fresh_part)
+            state[1, column] = gain_n * fresh_part
+        deviations[row] = math.sqrt(variance)
+        after = of_a - gain_a * gain_a * variance
+        of_both = -keep * gain_a * gain_n * variance
+        of_n = noise - gain_n * gain_n * variance
+        of_a = keep * keep * after + (1.0 - keep * keep) * share
