@@ -178,7 +178,7 @@ def _explore_part(context: Context, search: Search, path: str, start: State) -> 
     formula = None
     if path != "wheels" and not context.is_drive_alone:
         sideways = context.vehicle.kinematics.has_inputs("sideways")
-        formula = search_formula(search, found, sideways=sideways)
+        found, formula = search_formula(search, found, sideways=sideways)
     unobservable, detectable = find_unobservable(search, found)
     undecided = tuple(find_undecided(search, found))
     return Explored(path, search, found, formula, undecided, tuple(unobservable), tuple(detectable))

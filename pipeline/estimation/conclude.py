@@ -250,7 +250,7 @@ def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list
         effect.id: effect
         for path in paths
         for effect in path.found.final.state.effects
-        if effect.late is not Late.POSES
+        if effect.late is not Late.POSES and effect.id in (*path.found.new, *path.found.start.ids)
     }
     effects |= {effect.id: effect for effect in clocks.effects}
     joined = join_classes(list(effects.values()), context.vehicle)

@@ -20,7 +20,7 @@ from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
 from pipeline.estimation.fit import PartFit, fit_part, hold_out
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.parts import HORIZONS_S
-from pipeline.estimation.plausibility import is_nameable
+from pipeline.estimation.plausibility import is_nameable, is_too_small
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
@@ -39,16 +39,28 @@ STABLE_T = 0.5 * LEAST_T
 """The same without the ten seconds that contribute most: one event is not enough."""
 EQUAL = 12.0
 """Difference of two models' scores below which the data do not decide between them."""
+LEAST_WAY_SHARE = 0.005
+"""Share of the distance driven in 2 s that an effect must move: half a 5 cm cell after 5 m."""
+LEAST_TURN_RAD = 0.0025
+"""Heading change over 2 s that it must make otherwise [rad]: a quarter of such a cell beside the path."""
+_FELT_S = 2.0
+_UNUSUAL = 8.0
+"""Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than a
+wrong track, a lag or a limit."""
 SHOWN = 0.05
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
 _RISEN = 2.0
-"""Standard errors by which no held-out error may rise."""
-_NO_CHANGE = 0.01
-"""Relative rise of an error that does not matter."""
+"""Standard errors beyond which a rise of a held-out error is no chance: it may not exceed the largest fall."""
+_ALIKE = 0.3
+"""Correlation of two numbers from which on their effects may stand for one common cause."""
 _MOST_EFFECTS = 8
 """Most effects that a search adds on one path: a longer list explains nothing."""
 _SINGLES, _PAIRS = 4, 3
 """Extensions by one effect and by two that are fitted in each round."""
+_ROUGH = 3
+"""Steps of a rough fit of an effect in the place of its special cases."""
+_NEAR = 0.2
+"""Share of what those explain that it may lack after them to be fitted to the end."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
 _FEWEST_RUNS = 3
@@ -60,6 +72,7 @@ class Judged:
     """An extension of a model, fitted and judged.
 
     Attributes:
+        base: the smaller model.
         fit: the larger model.
         added: ids of its new effects.
         refusal: why it is not accepted; empty where it is.
@@ -70,6 +83,7 @@ class Judged:
             (4, 2), NaN where nothing is predicted so far.
     """
 
+    base: PartFit
     fit: PartFit
     added: tuple[str, ...]
     refusal: str
@@ -85,8 +99,9 @@ class Judged:
 
 
 def find_cost(fit: PartFit) -> float:
-    """Minus twice the log-likelihood of a fit, with the price of its numbers."""
-    return fit.score + PRICE * fit.numbers
+    """Minus twice the log-likelihood of a fit, with the price of its numbers and of unusual effects."""
+    unusual = sum(not any(p.quantities for p in effect.parameters) for effect in fit.state.effects)
+    return fit.score + PRICE * fit.numbers + _UNUSUAL * unusual
 
 
 @dataclass(frozen=True)
@@ -110,7 +125,8 @@ class Found:
 
     Attributes:
         start: the model to start from, fitted.
-        final: the model that no extension improves, fitted.
+        final: the model that no extension improves, fitted; effects too small for a name are in it, too.
+        new: ids of the effects that are named.
         judged: how each of its effects was judged against the model without it, by id.
         rivals: models that the data do not separate from it.
         refused: extensions of it that were not accepted.
@@ -119,15 +135,11 @@ class Found:
 
     start: PartFit
     final: PartFit
+    new: tuple[str, ...]
     judged: dict[str, Judged]
     rivals: tuple[Rival, ...]
     refused: tuple[Judged, ...]
     screen: Screen
-
-    @property
-    def new(self) -> tuple[str, ...]:
-        """Ids of the effects that were added."""
-        return tuple(name for name in self.final.ids if name not in self.start.ids)
 
 
 @dataclass
@@ -154,17 +166,27 @@ class Search:
     def run(self, start: State) -> Found:
         """Search from a model."""
         first = current = self._fit(start)
-        seen, refused = {current.ids}, list[Judged]()
+        refused = list[Judged]()
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
             judged, refused = self._extend(current)
-            chosen = _choose(judged)
-            better = self._exchange(current) if chosen is None else self._prune(chosen.fit)
-            if better is None or better.ids in seen:
+            chosen, small = _choose(judged), _choose([one for one in refused if self._is_unnamed(one)])
+            if (
+                small is not None
+                and small.cost < find_cost(current if chosen is None else chosen.fit) - EQUAL
+            ):
+                # An effect that is too small for a name, as sampling makes: others would only imitate it.
+                current = small.fit
+                self.given |= set(small.added)
+                continue
+            better = None if chosen is None else self._prune(chosen.fit)
+            if better is None or not find_cost(better) < find_cost(current):
+                # What an extension makes superfluous may have been worth more than it.
+                better = self._exchange(current)
+            if better is None or not find_cost(better) < find_cost(current):
                 break
-            seen.add(better.ids)
             current = better
-        return self._conclude(first, current, refused)
+        return self._conclude(first, self._refuse(current), refused)
 
     def _conclude(self, first: PartFit, current: PartFit, refused: Iterable[Judged]) -> Found:
         judged, rivals = dict[str, Judged](), list[Rival]()
@@ -175,7 +197,8 @@ class Search:
                 behind = other.cost - find_cost(current)
                 if behind < EQUAL and not set(other.added) & set(current.ids):
                     rivals.append(Rival(name, other, behind))
-        return Found(first, current, judged, tuple(rivals), tuple(refused), self._screen(current))
+        new = tuple(judged)
+        return Found(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
 
     @property
     def _least_t(self) -> float:
@@ -183,6 +206,11 @@ class Search:
 
     def _judge(self, base: PartFit, fit: PartFit) -> Judged:
         return judge(base, fit, self.conditions, self._least_t)
+
+    def _is_unnamed(self, judged: Judged) -> bool:
+        """Whether a model was refused for the size of its new effects alone."""
+        new = [effect for effect in judged.fit.state.effects if effect.id in judged.added]
+        return bool(new) and all(is_too_small(effect, self.conditions) for effect in new)
 
     def _fit(self, state: State, noise: Noise | None = None) -> PartFit:
         key = (*(effect.key for effect in state.effects), repr(state.own))
@@ -193,7 +221,7 @@ class Search:
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:
         return self._fit(fit.state.drop(names))
 
-    def _screen(self, fit: PartFit, without: Collection[str] = ()) -> Screen:
+    def screen(self, fit: PartFit, without: Collection[str] = ()) -> Screen:
         """What could be added to a model; special cases of its effects are in it already."""
         known = set(without).union(*({*effect.contains} for effect in fit.state.effects))
         acting = [one for one in self.candidates if one.id not in known and one().acts_in(fit.ids)]
@@ -203,7 +231,7 @@ class Search:
         """Accepted and refused extensions of a model."""
         if len(current.ids) - len(self.given) >= _MOST_EFFECTS:
             return [], []
-        judged = self._judge_extensions(current, self._screen(current), _SINGLES, _PAIRS)
+        judged = self._judge_extensions(current, self.screen(current), _SINGLES, _PAIRS)
         return [one for one in judged if not one.refusal], [one for one in judged if one.refusal]
 
     def _judge_extensions(
@@ -243,11 +271,18 @@ class Search:
             free = [effect for effect in fit.state.effects if effect.id not in self.given]
             weak = [one for effect in free if (one := (measure_t(fit, effect), effect.id))[0] < self._least_t]
             if not weak:
-                judged = ((self._judge(self._drop(fit, [e.id]), fit), e.id) for e in free)
-                weak = [(one.gain, name) for one, name in judged if one.refusal]
-            if not weak:
                 return fit
             fit = self._drop(fit, [min(weak)[1]])
+
+    def _refuse(self, fit: PartFit) -> PartFit:
+        """The model without effects that are not accepted beside its others, the least gain first."""
+        while True:
+            free = [name for name in fit.ids if name not in self.given]
+            judged = ((self._judge(self._drop(fit, [name]), fit), name) for name in free)
+            refused = [(float(np.nan_to_num(one.gain)), name) for one, name in judged if one.refusal]
+            if not refused:
+                return fit
+            fit = self._drop(fit, [min(refused)[1]])
 
     def _exchange(self, current: PartFit) -> PartFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
@@ -265,13 +300,19 @@ class Search:
         return None
 
     def _list_groups(self, current: PartFit) -> list[tuple[str, ...]]:
-        """Effects that may stand for others: each, and each two of them."""
+        """Effects that may stand for others: each, and each two whose numbers the data hardly separate."""
         free = [name for name in current.ids if name not in self.given]
-        return [*((name,) for name in free), *combinations(free, 2)]
+        size = np.sqrt(np.maximum(np.diag(current.covariance), 1e-300))
+        alike = np.abs(current.covariance / np.outer(size, size)) > _ALIKE
+        pairs = {
+            tuple(sorted((current.free[one].effect, current.free[other].effect)))
+            for one, other in zip(*np.nonzero(np.triu(alike, 1)), strict=True)
+        }
+        return [*((name,) for name in free), *(two for two in combinations(sorted(free), 2) if two in pairs)]
 
     def _list_rivals(self, current: PartFit, without: PartFit, names: Sequence[str]) -> list[Judged]:
         """Models with other effects in the place of some, judged against the one with neither."""
-        screen = self._screen(without, names)
+        screen = self.screen(without, names)
         own = without.score - current.score
         return self._judge_extensions(without, screen, 2, 1, 0.3 * own - PRICE * len(names))
 
@@ -284,9 +325,12 @@ class Search:
             return None
         base, largest = self._drop(current, cases), self.conditions.largest
         starts = [base.state.add(candidate(**values)) for values in effect.list_starts(largest)]
-        fits = [self._fit(state, base.noise) for state in starts]
-        fit = min(fits, key=find_cost)
-        if find_cost(fit) > find_cost(current) - EQUAL:
+        # Some steps show whether it may come near what its special cases explain.
+        rough = [fit_part(self.part, state, noise=base.noise, most=_ROUGH) for state in starts]
+        own, explained = find_cost(current), find_cost(base) - find_cost(current)
+        fits = [self._fit(one.state, one.noise) for one in rough if find_cost(one) < own + _NEAR * explained]
+        fit = min(fits, key=find_cost, default=base)
+        if find_cost(fit) > own - EQUAL:
             return None
         judged = self._judge(base, fit)
         return None if judged.refusal else self._prune(fit)
@@ -299,11 +343,23 @@ def _choose(judged: Sequence[Judged]) -> Judged | None:
     return min(near, key=lambda one: (one.fit.numbers, one.cost), default=None)
 
 
-def measure_t(fit: PartFit, effect: Effect) -> float:
+def measure_t(fit: PartFit, effect: Effect, base: PartFit | None = None) -> float:
     """Standard errors by which the numbers of an effect are away from none, together.
 
-    A limit acts in proportion to its inverse. Numbers that only say where an effect begins do not count.
+    A limit acts in proportion to its inverse. Numbers that only say where an effect begins do not count. Of
+    one without derivatives, such as a deadband, the fall of chi-square counts.
+
+    Args:
+        fit: a model with the effect.
+        effect: as it is there.
+        base: the model without it; without one, an effect without derivatives counts as evident.
     """
+    own = [number for number in fit.free if number.effect == effect.id]
+    if own and not any(number.is_smooth for number in own):
+        if base is None:
+            return math.inf
+        costs = [list_costs(fit.part, fit.noise, one.residual) for one in (base, fit)]
+        return math.sqrt(max(float((costs[0] - costs[1]).sum()) / fit.overdispersion, 0.0))
     indices, aways = list[int](), list[float]()
     for index, number in enumerate(fit.free):
         if number.effect != effect.id:
@@ -338,10 +394,10 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
     for effect in new:
         acting = fit.state.list_as_it_acts(effect)
         if not any(is_nameable(one, conditions) for one in acting):
-            return Judged(fit, added, f"{effect.id}: its values are not possible")
-        t = measure_t(fit, effect)
+            return Judged(base, fit, added, f"{effect.id}: its values are not possible")
+        t = measure_t(fit, effect, base)
         if t < least_t:
-            return Judged(fit, added, f"{effect.id}: t = {t:.1f}")
+            return Judged(base, fit, added, f"{effect.id}: t = {t:.1f}")
     part, noise = fit.part, fit.noise
     folds = make_folds(part)
     before, after = (hold_out(one, one.noise, folds) for one in (base, fit))
@@ -350,20 +406,33 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
     own = list_costs(part, noise, base.residual) - list_costs(part, noise, fit.residual)
     by_unit = np.asarray(np.bincount(part.unit, own), dtype=np.float64)
     stable = math.sqrt(max(float(by_unit.sum() - by_unit.max()), 0.0))
-    falls, rises = _compare_horizons(part.list_horizon_errors(before), part.list_horizon_errors(after))
+    falls, rise, risen = _compare_horizons(*map(part.list_horizon_errors, (before, after)))
+    most = float(np.nanmax(falls, initial=0.0))
     refusal = ""
     if not gain > 0.0:
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif rises:
-        refusal = f"the error {rises} rises"
-    elif not np.nanmax(falls, initial=0.0) >= SHOWN:
-        refusal = f"no error falls by more than {np.nanmax(falls, initial=0.0):.1%}"
+    elif rise > most:
+        refusal = f"the error {risen} rises"
+    elif most < SHOWN:
+        refusal = f"no error falls by more than {most:.1%}"
+    elif not _is_material(part, base.residual - fit.residual):
+        refusal = "nobody would notice it"
     sums = [np.bincount(part.block, cost) for cost in costs]
     draws = np.random.default_rng(0).integers(0, sums[0].size, (_DRAWS, sums[0].size))
     frequency = float(np.mean(sums[1][draws].sum(axis=1) < sums[0][draws].sum(axis=1)))
-    return Judged(fit, added, refusal, gain, frequency, by_unit, falls)
+    return Judged(base, fit, added, refusal, gain, frequency, by_unit, falls)
+
+
+def _is_material(part: Part, change: Floats) -> bool:
+    """Whether a change of the predicted increments is felt over two seconds, root mean square over the run."""
+    length = max(round(_FELT_S / float(np.median(part.spans))), 1)
+    sums = np.cumsum(np.concatenate((np.zeros((1, 3)), change)), axis=0)
+    length = min(length, change.shape[0])
+    x, y, turn = np.sqrt(np.mean((sums[length:] - sums[:-length]) ** 2, axis=0)).tolist()
+    distance = _FELT_S * part.speed
+    return math.hypot(x, y) >= LEAST_WAY_SHARE * distance or turn >= LEAST_TURN_RAD
 
 
 def make_folds(part: Part) -> Ints:
@@ -380,25 +449,26 @@ def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
     return costs
 
 
-def _compare_horizons(before: Sequence[HorizonError], after: Sequence[HorizonError]) -> tuple[Floats, str]:
-    """Relative falls of the errors, shape (4, 2), and the first that rises beyond chance; empty if none."""
-    falls, risen = np.full((len(HORIZONS_S), 2), math.nan), ""
+def _compare_horizons(
+    before: Sequence[HorizonError], after: Sequence[HorizonError]
+) -> tuple[Floats, float, str]:
+    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where it is."""
+    falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
     for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
         for channel, name in enumerate(("position", "heading")):
             one, other = getattr(old, name), getattr(new, name)
             if not one.size or not one.mean() > 0.0:
                 continue
-            ratio = math.sqrt(float(other.mean() / one.mean()))
-            falls[index, channel] = 1.0 - ratio
-            if ratio > 1.0 + _NO_CHANGE and _measure_block_t(other - one, old.block) > _RISEN and not risen:
+            fall = falls[index, channel] = 1.0 - math.sqrt(float(other.mean() / one.mean()))
+            if -fall > rise and _measure_block_t(other - one, old.block) > _RISEN:
                 length = "a whole stretch" if math.isinf(horizon) else f"{horizon:g} s"
-                risen = f"in {name} over {length}"
-    return falls, risen
+                rise, risen = -fall, f"in {name} over {length}"
+    return falls, rise, risen
 
 
 def _measure_block_t(values: Floats, block: Ints) -> float:
     """Student's t of the sums over blocks."""
     sums = np.bincount(np.unique(block, return_inverse=True)[1], values)
     if sums.size <= 2:  # noqa: PLR2004 - two blocks say nothing of chance
-        return 0.0
+        return math.inf
     return float(sums.sum() / (math.sqrt(sums.size) * sums.std() + 1e-300))

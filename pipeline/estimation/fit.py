@@ -194,6 +194,7 @@ def fit_part(
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
     exact: bool = False,
+    most: int = _MOST_STEPS,
 ) -> PartFit:
     """Fit all numbers of a state to one part of the path, with the noise of its residuals.
 
@@ -203,16 +204,18 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
+        most: steps with one noise.
     """
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
     known = part.learn(residual, noise)
     enough = _SETTLED if exact else _ENOUGH
-    fit = PartFit(part, start, free, residual, part.differentiate(start, residual, free), known)
+    columns = part.differentiate(start, residual, free, both_sides=exact)
+    fit = PartFit(part, start, free, residual, columns, known)
     if not free:
         return fit
     for _ in range(_ROUNDS * (1 + exact)):
-        fit = _descend(fit, enough)
+        fit = _descend(fit, enough, most)
         for number in fit.free:
             if not number.is_smooth:
                 fit = _walk_grid(fit, number, enough)
@@ -237,12 +240,12 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
     return float(huber_cost(innovations).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, enough: float) -> PartFit:
+def _descend(fit: PartFit, enough: float, most: int = _MOST_STEPS) -> PartFit:
     """Levenberg-Marquardt steps with this noise, numbers held to their bounds."""
     part, noise, free = fit.part, fit.noise, fit.free
-    cost = measure_cost(part, noise, fit.state, free, fit.residual)
+    cost, exact = measure_cost(part, noise, fit.state, free, fit.residual), enough < _ENOUGH
     damping, is_fresh = 1e-6, True
-    for _ in range(_MOST_STEPS if fit.smooth else 0):
+    for _ in range(most if fit.smooth else 0):
         white = fit.white
         pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
         moving = [
@@ -261,15 +264,19 @@ def _descend(fit: PartFit, enough: float) -> PartFit:
         reached = measure_cost(part, noise, state, free, residual)
         if not reached < cost:
             if not is_fresh:
-                fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free))
+                fit = replace(
+                    fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact)
+                )
                 is_fresh = True
                 continue
             if damping > _STIFFEST:
                 break
             damping = max(damping * 30.0, 1e-2)
             continue
-        is_fresh = cost - reached > _NEWS * cost or cost - reached > 1.0 or enough < _ENOUGH
-        columns = part.differentiate(state, residual, free) if is_fresh else fit.columns
+        is_fresh = cost - reached > _NEWS * cost or cost - reached > 1.0 or exact
+        columns = fit.columns
+        if is_fresh:
+            columns = part.differentiate(state, residual, free, both_sides=exact)
         fall, cost, damping = cost - reached, reached, max(damping / 30.0, 1e-9)
         fit = replace(fit, state=state, residual=residual, columns=columns)
         if fall < enough:

@@ -24,16 +24,17 @@ if TYPE_CHECKING:
 # of what it leaves (`noise.Noise`) says in closed form how the sum of increments spreads with time.
 
 
-def estimate_floor(problem: Problem) -> Errors:
+def estimate_floor(problem: Problem, residual: Floats) -> Errors:
     """The errors of a model that explains everything but noise and random motion.
 
     They refer to measured wheels if all runs have them, else to the command.
 
     Args:
-        problem: the runs; fitted values have no influence.
+        problem: the runs.
+        residual: increments that a model leaves, from which it is estimated, shape (n, 3).
     """
     part = problem.parts[0]
-    rest = _explain_all(part, part.find_residuals(problem.start_state()))
+    rest = _explain_all(part, residual)
     noise = part.learn(rest)
     after = np.linspace(noise.step_s, HORIZON_S, 8)
     poses, motion = noise.spread_after(after)

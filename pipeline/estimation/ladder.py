@@ -14,6 +14,7 @@ import numpy as np
 from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick, round_digits
 from pipeline.core.arrays import Floats
 from pipeline.estimation.fit import Fitted, fit_model
+from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.problem import Problem
@@ -287,10 +288,11 @@ class Judgement:
         """The fit of all effects."""
         return self.whole.fitted
 
-    @property
+    @cached_property
     def floor(self) -> Errors:
-        """The noise floor of the runs."""
-        return self.problem.floor
+        """The noise floor of the runs: of the ideal and of the whole model, what the better one leaves."""
+        floors = (self.problem.floor, estimate_floor(self.problem, self.physics.fitted.fits[0].residual))
+        return min(floors, key=lambda one: one.t_mrmse_m * one.r_mrmse_rad)
 
 
 def judge_model(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Judgement:

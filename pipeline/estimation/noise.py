@@ -159,14 +159,7 @@ def _measure_rough(values: Floats) -> float:
 
 def _measure_scale(innovations: Floats) -> float:
     """Scale of most likelihood of innovations with a density that falls as exp(-`huber_cost` / 2)."""
-    size = np.abs(innovations)
-    scale = max(_GAUSSIAN * float(np.median(size)), 0.1 * float(size.mean()), 1e-12)
-    for _ in range(_SCALE_ROUNDS):
-        grown = math.sqrt(float(np.mean(np.minimum(size * size, CLIP * scale * size)))) / scale
-        scale *= grown
-        if abs(grown - 1.0) < _SAME_SCALE:
-            break
-    return scale
+    return _find_scale(np.abs(innovations))
 
 
 def huber_cost(innovations: Floats) -> Floats:
@@ -187,12 +180,10 @@ def _maximize(
         phi, part = 1.0 / (1.0 + np.exp(-np.clip(at, -12.0, 12.0)))
         return float(phi) * most, float(part)
 
+    flat, size = np.ascontiguousarray(values[:, 0]), np.empty(values.shape[0])
+
     def cost(at: Floats) -> float:
-        made, deviations = _filter(values, steps, step_s, *read(at))
-        innovations = made[:, 0] / deviations
-        spread = _measure_scale(innovations)
-        squares = float(huber_cost(innovations / spread).sum())
-        return squares + 2.0 * (innovations.size * math.log(spread) + float(np.log(deviations).sum()))
+        return _find_cost(flat, steps.fresh, steps.spans, step_s, *read(at), size)
 
     starts = [(2.0, -2.0), (0.0, 1.0)]
     if known is not None:
@@ -222,6 +213,64 @@ def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: floa
     state = np.empty((2, values.shape[1]))
     _walk(values, steps.fresh, steps.spans, step_s, phi, share, state, made, deviations)
     return made, deviations
+
+
+@compiled("float64(float64[::1])")
+def _find_scale(size: Floats) -> float:
+    """Scale s at which the mean of min(z^2, CLIP z) of the sizes z = size / s is one."""
+    mean = 0.0
+    for value in size:
+        mean += value
+    scale = max(1.2533 * mean / size.size, 1e-12)
+    for _ in range(_SCALE_ROUNDS):
+        total = 0.0
+        for value in size:
+            total += min(value, CLIP * scale) * value
+        grown = math.sqrt(total / size.size) / scale
+        scale *= grown
+        if abs(grown - 1.0) < _SAME_SCALE:
+            break
+    return scale
+
+
+@compiled("float64(float64[::1], boolean[::1], float64[::1], float64, float64, float64, float64[::1])")
+def _find_cost(
+    values: Floats, fresh: Flags, spans: Floats, step_s: float, phi: float, share: float, size: Floats
+) -> float:
+    """Minus twice the logarithm of the likelihood of increments, at the scale of most likelihood.
+
+    Args:
+        values: increments, shape (n,).
+        fresh: steps that do not continue the one before, shape (n,).
+        spans: length of each step [s], shape (n,).
+        step_s: time to which the correlation refers [s].
+        phi: correlation of the disturbance.
+        share: its share in the variance.
+        size: room for the sizes of the innovations, shape (n,).
+    """
+    noise = 1.0 - share
+    of_a, of_both, of_n, a, n, logs = share, 0.0, noise, 0.0, 0.0, 0.0
+    for row in range(values.size):
+        if fresh[row]:
+            of_a, of_both, of_n, a, n = share, 0.0, noise, 0.0, 0.0
+        variance = of_a + of_n - 2.0 * of_both + noise
+        gain_a, gain_n = (of_a - of_both) / variance, noise / variance
+        keep = phi ** (spans[row] / step_s)
+        fresh_part = values[row] - a + n
+        size[row] = abs(fresh_part) / math.sqrt(variance)
+        a = keep * (a + gain_a * fresh_part)
+        n = gain_n * fresh_part
+        after = of_a - gain_a * gain_a * variance
+        of_both = -keep * gain_a * gain_n * variance
+        of_n = noise - gain_n * gain_n * variance
+        of_a = keep * keep * after + (1.0 - keep * keep) * share
+        logs += math.log(variance)
+    scale, cost = _find_scale(size), 0.0
+    for value in size:
+        z = value / scale
+        held = min(z, CLIP)
+        cost += held * (2.0 * z - held)
+    return cost + 2.0 * size.size * math.log(scale) + logs
 
 
 @compiled(

@@ -139,9 +139,18 @@ class Part(ABC):
         """Noise of residuals of shape (n, 3)."""
         return learn_noise(residual, self.steps, self.channels, start)
 
-    def differentiate(self, state: State, residual: Floats, free: Sequence[Free]) -> Floats:
-        """Derivative of the prediction by each number, shape (n, 3, p)."""
-        ends = [number.step_aside(state.get(number), both_sides=True) for number in free]
+    def differentiate(
+        self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
+    ) -> Floats:
+        """Derivative of the prediction by each number, shape (n, 3, p).
+
+        Args:
+            state: where.
+            residual: its residuals, shape (n, 3).
+            free: the numbers.
+            both_sides: use central differences where the bounds allow it, so that fits end alike.
+        """
+        ends = [number.step_aside(state.get(number), both_sides=both_sides) for number in free]
         moved = [[state.set(number, at) for at in steps] for number, steps in zip(free, ends, strict=True)]
         self.look_ahead([one for states in moved for one in states])
         columns = make_columns(residual.shape[0], len(free))
@@ -168,6 +177,13 @@ class Part(ABC):
                 timing = state.timing[run] if self.is_delayed else _NO_DELAY
                 models.append((effects, timing if measured else comparison.complete_timing(effects, timing)))
             comparison.forward.look_ahead(models, measured=measured)
+
+    @cached_property
+    def speed(self) -> float:
+        """Root mean square of the speed that the input asks for, forward and sideways [m/s]."""
+        velocities = [comparison.predict_velocity((), _NO_DELAY) for comparison in self.comparisons]
+        squares = np.concatenate([velocity.x**2 + velocity.y**2 for velocity in velocities])
+        return math.sqrt(float(squares.mean()))
 
     def list_horizon_errors(self, residual: Floats) -> tuple[HorizonError, ...]:
         """Errors of the predictions that these residuals add up to, over `HORIZONS_S`."""

@@ -34,6 +34,12 @@ def is_nameable(effect: Effect, conditions: Conditions) -> bool:
     return find_implausible(effect) is None
 
 
+def is_too_small(effect: Effect, conditions: Conditions) -> bool:
+    """Whether all that keeps an effect from a name is its size: it may be there, and explain what others imitate."""
+    itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
+    return itself and find_implausible(effect) is None and not is_large_enough(effect, conditions)
+
+
 def is_large_enough(effect: Effect, conditions: Conditions) -> bool:
     """Whether an effect exceeds the errors of time stamps, sensor mounting and data sheets."""
     sizes = []

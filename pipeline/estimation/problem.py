@@ -250,7 +250,7 @@ class Problem:
     @cached_property
     def floor(self) -> Errors:
         """The noise floor of these runs, independent of any fit (see `estimate_floor`)."""
-        return estimate_floor(self)
+        return estimate_floor(self, self.parts[0].find_residuals(self.start_state()))
 
     @cached_property
     def folds(self) -> tuple[Fold, ...]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core import enumerate_texts, format_share
-from pipeline.estimation.decision import Found, Search
+from pipeline.estimation.decision import EQUAL, Found, Search, find_cost
 from pipeline.estimation.diagnosis import Json, Unexplained
 from pipeline.estimation.error_regions import ERROR_WORDS
 from pipeline.estimation.folds import errors_as_json
@@ -44,22 +44,36 @@ _LEAST_OF_MOTION = 0.05
 """Share of the motion below which what lasts is not reported."""
 
 
-def search_formula(search: Search, found: Found, *, sideways: bool) -> FormulaEffect | None:
-    """A formula of up to three terms for what the accepted effects leave; None where none is accepted.
+def search_formula(search: Search, found: Found, *, sideways: bool) -> tuple[Found, FormulaEffect | None]:
+    """A formula of up to three terms for what the accepted effects leave, or for one that only imitates it.
 
     Terms pass the same acceptance as effects, at the price of the shapes that they are the best of. What an
     effect of the catalogue would explain as well is no formula, whether or not it was accepted.
+
+    Returns:
+        The effects that stay, and the formula; None where none is accepted.
     """
     terms = list_terms(sideways=sideways)
-    wide = replace(search, candidates=terms, given=frozenset(found.final.ids), shapes=_SHAPES)
-    beyond = wide.run(found.final.state)
-    added = [cast("FormulaEffect", one) for one in beyond.final.state.effects if is_term(one.id)]
+    best, least = found, find_cost(found.final)
+    starts = [found.final, *(found.judged[name].base for name in found.new)]
+    added: list[FormulaEffect] = []
+    for start in starts:
+        wide = replace(search, candidates=terms, given=frozenset(start.ids), shapes=_SHAPES)
+        promised = wide.screen(start).list_singles()
+        gained = start.score - found.final.score
+        if not promised or promised[0].net <= gained:
+            continue
+        beyond = wide.run(start.state)
+        new = [cast("FormulaEffect", one) for one in beyond.final.state.effects if is_term(one.id)]
+        cost = find_cost(beyond.final) + 2.0 * math.log(_SHAPES) * len(new)
+        if new and cost < least - EQUAL:
+            best, least, added = replace(found, final=start), cost, new
     if not added:
-        return None
-    gained = found.final.score - beyond.final.score
-    if any(one.gain > _SAME * gained for one in found.screen.list_singles()):
-        return None
-    return join_formula(added)
+        return found, None
+    gained = best.final.score - least
+    if best is found and any(one.gain > _SAME * gained for one in found.screen.list_singles()):
+        return found, None
+    return best, join_formula(added)
 
 
 def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:

@@ -78,7 +78,7 @@ LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 45
+VERSION = 46
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
