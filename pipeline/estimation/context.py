@@ -11,7 +11,7 @@ from pipeline.core import SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.problem import Problem
 from pipeline.models.catalogue import list_effects
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Excitation, Place
 from pipeline.models.parameter import Conditions, Largest
 from pipeline.run import MotionError, MotionRun
 from pipeline.run.signals import GROUND_UNOBSERVABLE
@@ -25,9 +25,11 @@ class DiagnosisError(SlipError):
     """A diagnosis that cannot be made, in one line."""
 
 
-_FEWEST_WINDOWS = 60
-"""Half seconds of driving with poses that a diagnosis needs, over all of its runs: a quarter of a minute,
-windows overlapping."""
+_FEWEST_WINDOWS = 40
+"""Half seconds of driving with poses that a diagnosis needs, over all of its runs: ten seconds, windows
+overlapping."""
+_LONG_S = 60.0
+"""Shortest run that can show a change with time [s]: in a shorter one its start is what changes."""
 _DRIVETRAIN = frozenset({Place.COMMAND, Place.DRIVE})
 
 
@@ -96,8 +98,12 @@ class Context:
             if self.vehicle.kind in effect.kinds
             and effect.place not in hidden
             and not effect.parts
-            and effect().can_show(self.conditions)
+            and self._can_show(effect())
         )
+
+    def _can_show(self, effect: Effect) -> bool:
+        is_long = max(run.duration_s for run in self.runs) >= _LONG_S
+        return effect.can_show(self.conditions) and (is_long or Excitation.LONG not in effect.needs)
 
     def list_drivetrain(self) -> tuple[Candidate, ...]:
         """Effects between command and wheels."""
@@ -106,7 +112,7 @@ class Context:
             for effect in list_effects()
             if self.vehicle.kind in effect.kinds
             and effect.place in _DRIVETRAIN
-            and effect().can_show(self.conditions)
+            and self._can_show(effect())
         )
 
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, cast
 import numpy as np
 
 from pipeline.core import enumerate_texts, format_share
+from pipeline.estimation.candidates import PRICE
 from pipeline.estimation.decision import EQUAL, Found, Search, find_cost
 from pipeline.estimation.diagnosis import Json, Unexplained
 from pipeline.estimation.error_regions import ERROR_WORDS
@@ -66,7 +67,8 @@ def search_formula(search: Search, found: Found, *, sideways: bool) -> tuple[Fou
         beyond = wide.run(start.state)
         new = [cast("FormulaEffect", one) for one in beyond.final.state.effects if is_term(one.id)]
         cost = find_cost(beyond.final) + 2.0 * math.log(_SHAPES) * len(new)
-        if new and cost < least - EQUAL:
+        # It displaces an effect only where it is far better than beside it.
+        if new and cost < least - (EQUAL if start is found.final else 2.0 * PRICE):
             best, least, added = replace(found, final=start), cost, new
     if not added:
         return found, None
