@@ -36,7 +36,7 @@ from pipeline.simulate.facts import (
 )
 from pipeline.simulate.messages import Field, Sheet, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
-from pipeline.simulate.path import CompactedGround
+from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
 from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, publish
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
@@ -453,7 +453,7 @@ def make_scenario(
     asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
     resolve_effects(asked, scenario.vehicle.kind)
     ground = scenario.ground
-    if not {"slope_drift", "grade_load"}.isdisjoint(asked) and ground == Ground():
+    if not {*SLOPE_EFFECTS, "grade_load"}.isdisjoint(asked) and ground == Ground():
         # On level ground these effects would leave no trace at all.
         ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
     return replace(

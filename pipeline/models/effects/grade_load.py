@@ -45,7 +45,7 @@ class GradeLoad(DriveEffect):
     ways = ("slower", "faster")
     size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE,)
-    confused_with = ("slope_drift", "drive_gain")
+    confused_with = ("slope_creep", "slope_slip", "drive_gain")
     python = """
         load = {k} / R * math.sin(pitch)
         left += load * (abs(left) * R > 0.01)
@@ -54,7 +54,7 @@ class GradeLoad(DriveEffect):
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         radius = context.vehicle.wheel_radius_m
-        load = self.values["k"] / radius * np.sin(context.attitude[:, 1])
+        load = self.values["k"] / radius * context.downhill[0]
 
         def carry(wheel: Floats) -> Floats:
             loaded: Floats = wheel + load * (radius * np.abs(wheel) > LEAST_RIM_SPEED)
