@@ -43,7 +43,6 @@ def close_loop(scene: Scenario, draw: np.random.Generator) -> Scenario:
     fastest = 0.6 * vehicle.max_speed_mps * scene.program.speed_scale
     sharpest = 0.8 * vehicle.max_turn_radps * scene.program.turn_scale
     goals = _place_goals(draw, max(6.0 * fastest, 4.0))
-
     own = scene.extra
 
     def push(state: State) -> tuple[float, float, float]:

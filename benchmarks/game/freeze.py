@@ -5,12 +5,12 @@
     make bench NAME=game/freeze ARGS="compare FOLDER [--jobs 2] [--answers NAME]"
 
 `write` fills a folder for each log, CATEGORY/SEED: its tables in results, and what it hides in truth.json.
-It goes on where it was stopped. With --recordings it writes those of ../shared/logs, too. With --closed every second seed is driven in closed loop, wherever the
-category leaves the driving open. `exam` diagnoses the tables with the code as it is now, keeps the answers
-as NAME.json beside them, with the CPU time of each, and prints what is right, wrong, missed and covered, by
-category, by driving and by input. `compare` diagnoses once more. It prints of each log the largest relative
-difference of all numbers of the two answers and all else that differs, with a summary of both where that
-differs, and the ratio of CPU times by category.
+It goes on where it was stopped. With --recordings it writes those of ../shared/logs, too. With --closed
+every second seed is driven in closed loop, wherever the category leaves the driving open. `exam` diagnoses
+the tables with the code as it is now, keeps the answers as NAME.json beside them, with the CPU time of each,
+and prints what is right, wrong, missed and covered, by category, by driving and by input. `compare` diagnoses
+once more. It prints of each log the largest relative difference of all numbers of the two answers and all
+else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
 """
 
 from __future__ import annotations
