@@ -12,6 +12,7 @@ import math
 from collections.abc import Mapping
 
 from pipeline.models.effect import Column, Excitation, LinearEffect, Parameter, Plausible
+from pipeline.models.parameter import Conditions
 from pipeline.run.signals import Rolling, RunContext, Velocity, find_turning
 
 
@@ -36,7 +37,9 @@ class SlopeCreep(LinearEffect):
     ways = ("downhill", "uphill")
     size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE, Excitation.SPEED_SPREAD)
-    confused_with = ("slope_slip", "grade_load")
+    confused_with = ("slope_slip",)
+    equivalent_to = ("grade_load",)
+    equivalent_when = "if there are no encoders"
     same_at_one_speed = ("slope_slip",)
     python = "v_x = v_x + {c} * math.sin(pitch) * turning"
 
@@ -44,3 +47,7 @@ class SlopeCreep(LinearEffect):
         """See the formula above."""
         ahead, _ = context.downhill
         return {"c": (ahead * find_turning(rolling.wheels, context), 0.0, 0.0)}
+
+    def is_equivalent(self, conditions: Conditions) -> bool:
+        """Without encoders wheels that turn slower uphill are wheels that slip."""
+        return not conditions.encoders

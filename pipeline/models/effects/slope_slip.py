@@ -33,10 +33,9 @@ class SlopeSlip(LinearEffect):
             one_sign=True,
         ),
     )
-    motion = "Slope slip: {percent} {way} travel uphill on a slope of 10 degrees"
-    clause = "travels {percent} {way} uphill on a slope of 10 degrees"
-    ways = ("less", "more")
-    size_in = math.sin(math.radians(10.0))
+    motion = "Slope slip: {share} travel than ideal uphill on a slope of 10 degrees"
+    clause = "travels {share} than ideal uphill on a slope of 10 degrees"
+    share_of = (1.0, -math.sin(math.radians(10.0)))
     needs = (Excitation.SLOPE, Excitation.SPEED_SPREAD)
     confused_with = ("slope_creep", "grade_load", "wheel_radius")
     same_at_one_speed = ("slope_creep",)
