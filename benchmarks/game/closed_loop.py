@@ -14,9 +14,8 @@ from dataclasses import replace
 import numpy as np
 from scipy.signal import lfilter
 
-from pipeline.core.rigid import euler_from_quaternions
 from pipeline.simulate import Disturbance, Scenario, State, simulate_run
-from pipeline.simulate.path import Path
+from pipeline.simulate.messages import Truth
 from pipeline.simulate.programs import Commands
 
 _STEP_S = 0.01
@@ -58,7 +57,7 @@ def close_loop(scene: Scenario, draw: np.random.Generator) -> Scenario:
         controller.drive(begin, min(begin + _LOOK, count))
         asked = controller.asked[::_EVERY]
         closed = replace(closed, played=Commands(np.arange(len(asked)) * _EVERY * _STEP_S, *asked.T))
-        controller.see(simulate_run(closed).truth.path, begin + _LOOK)
+        controller.see(simulate_run(closed).truth, begin + _LOOK)
     return closed
 
 
@@ -107,13 +106,15 @@ class _Controller:
             self._position[now + 1] = self._position[now] + complex(v, y) * np.exp(1j * middle) * _STEP_S
             self._yaw[now + 1] = self._yaw[now] + w * _STEP_S
 
-    def see(self, path: Path, now: int) -> None:
+    def see(self, truth: Truth, now: int) -> None:
         """Take over where the vehicle is, and how it has answered."""
+        path = truth.path
         stride = round(_STEP_S / float(path.time_s[1] - path.time_s[0]))
         now = min(now, len(path.velocity) // stride)
         edges = slice(0, now * stride + 1, stride)
         self._position[: now + 1] = path.position[edges, :2] @ np.array([1.0, 1.0j])
-        self._yaw[: now + 1] = euler_from_quaternions(path.quaternion[edges])[2]
+        x, y, z, w = path.quaternion[edges].T
+        self._yaw[: now + 1] = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
         moved = path.velocity[: now * stride].reshape(now, stride, 3).mean(axis=1) - self._pushes[:now]
         for number, rate in enumerate((moved[:, 0], moved[:, 2])):
             fits = []
