@@ -321,7 +321,8 @@ CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml"
 
 _BY_NAME = {case.name: case for case in CASES}
 _SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
-_LESSON_SLOPE_RAD = math.radians(8.0)
+_LESSON_HILLS = Ground(hill_m=0.5, hill_length_m=20.0)
+"""Ground of a run that is asked for an effect of slopes: hills of up to a quarter of slope."""
 
 
 class Changes(TypedDict, total=False):
@@ -455,7 +456,7 @@ def make_scenario(
     ground = scenario.ground
     if not {*SLOPE_EFFECTS, "grade_load"}.isdisjoint(asked) and ground == Ground():
         # On level ground these effects would leave no trace at all.
-        ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
+        ground = _LESSON_HILLS
     return replace(
         scenario,
         effects=asked,

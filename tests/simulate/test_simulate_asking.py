@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from pipeline.simulate import (
     SLOPE_EFFECTS,
     VEHICLES,
+    Ground,
     Program,
     Scenario,
     Vehicle,
@@ -91,9 +92,9 @@ def test_an_empty_effect_means_its_usual_size() -> None:
 
 
 @pytest.mark.parametrize("name", [*SLOPE_EFFECTS, "grade_load"])
-def test_an_effect_of_slopes_brings_a_slope_along(name: str) -> None:
-    assert make_scenario(None, {name: 0.5}).ground.pitch_rad > 0.1
-    assert make_scenario(None, {}).ground.pitch_rad == 0.0
+def test_an_effect_of_slopes_brings_hills_along(name: str) -> None:
+    assert make_scenario(None, {name: 0.5}).ground.hill_m > 0.0
+    assert make_scenario(None, {}).ground == Ground()
 
 
 def test_a_case_keeps_its_slope() -> None:
