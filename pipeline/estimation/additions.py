@@ -277,7 +277,7 @@ def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -
 
 
 def format_refusals(refusals: Mapping[str, str]) -> str:
-    """Refusals in one clause: `slope_creep is not supported by the data (the reduction is not significant)`.
+    """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
 
     Args:
         refusals: reasons by id, at least one.
