@@ -8,6 +8,8 @@ from pathlib import Path
 import published
 import pytest
 
+import pipeline as slip
+
 
 def make_content(
     *effects: tuple[str, str, float], undecided: tuple[list[str], ...] = ()
@@ -50,7 +52,7 @@ def test_without_the_recordings_it_says_so(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.long
-def test_the_ideal_model_is_off_by_what_was_published(tmp_path: Path) -> None:
+def test_models_are_off_by_what_was_published(tmp_path: Path) -> None:
     folder = published.PUBLISHED / "optiodom_differential"
     if not folder.is_dir():
         pytest.skip("the public recordings are not here")
@@ -59,3 +61,14 @@ def test_the_ideal_model_is_off_by_what_was_published(tmp_path: Path) -> None:
     assert position_m == pytest.approx(0.162, abs=0.005)
     assert heading_deg == pytest.approx(14.5, abs=0.3)
     assert sum(published.measure_turns(run) > 0.0 for run in runs) == 3
+    right_m, left_m = 0.5 * 0.083402, 0.5 * 0.083462
+    radius_m = 0.5 * (right_m + left_m)
+    calibrated = (
+        slip.Model(runs[0].vehicle)
+        + slip.effect("wheel_radius", k=radius_m / 0.042)
+        + slip.effect("wheel_asymmetry", e=(right_m - left_m) / radius_m)
+        + slip.effect("effective_track", k=0.2015 / 0.2)
+    )
+    position_m, heading_deg = published.find_largest(runs, {"named_model": calibrated})
+    assert position_m < 0.035
+    assert heading_deg < published.HEADING_DEG
