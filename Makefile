@@ -21,7 +21,7 @@ ONE_CORE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10
 
 .DEFAULT_GOAL := help
 .PHONY: analyze audit batch bench browser check clean compare damage-season docs docs-outputs docs-tables format fuzz \
-	help inspect lock map measure mysteries pictures reveal samples screenshots serve test test-long trend wheel
+	help inspect lock map measure mysteries pictures published reveal samples screenshots serve test test-long trend wheel
 
 help: ## print this list
 	@awk -F ':.*## ' '/^##@ / { print "\n" substr($$0, 5) "\n" } /^[a-z-]+:.*## / { printf "  make %-14s %s\n", $$1, $$2 }' \
@@ -96,6 +96,9 @@ audit: $(VENV)/.ready-dev ## licences and known advisories of the dependencies, 
 bench: $(VENV)/.ready-dev ## the benchmarks; NAME=reader: one of them [ARGS="--help"]
 	@# Some systems have a NAME in the environment: only one that was given to make counts.
 	@$(ONE_CORE) $(BIN)/python benchmarks $(if $(findstring command,$(origin NAME)),"$$NAME") $$ARGS
+
+published: $(VENV)/.ready-dev ## public recordings with published answers beside what the program says, where they are [ARGS=FOLDER]
+	@$(ONE_CORE) $(BIN)/python benchmarks published $$ARGS
 
 measure: $(VENV)/.ready-dev ## measure what README and handbook say, go on where it was stopped, write the tables [ARGS="paper accuracy rivals_command rivals_measured"]
 	@$(ONE_CORE) $(BIN)/python benchmarks measure $$ARGS

@@ -27,7 +27,7 @@ from pipeline.simulate import Scenario
 SHARES = (0.25, 0.5, 1.0, 2.0)
 ASKED = (
     "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid",
-    "speed_slip", "turning_resistance", "slope_drift", "lateral_drift", "yaw_drift", "time_drift",
+    "speed_slip", "turning_resistance", "slope_creep", "lateral_drift", "yaw_drift", "time_drift",
     "speed_track", "heading_skew", "yaw_misalignment",
 )  # fmt: skip
 

@@ -23,6 +23,7 @@ from game.sizes import draw_size
 from pipeline.simulate import (
     LAYOUTS,
     MACHINES,
+    SLOPE_EFFECTS,
     VEHICLES,
     Disturbance,
     Encoders,
@@ -41,17 +42,17 @@ from pipeline.simulate import (
 
 Category = Literal[
     "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late",
-    "joint",
+    "joint", "hills",
 ]  # fmt: skip
 # New ones go last: a category draws by its place.
 CATEGORIES: tuple[Category, ...] = (
     "single", "small", "sets", "empty", "poor", "odd", "rigid", "equipped", "cars", "natural", "late",
-    "joint",
+    "joint", "hills",
 )  # fmt: skip
 
 DIFFERENTIAL = (
     "wheel_radius", "wheel_asymmetry", "effective_track", "icr_offset", "icr_lateral", "lateral_skid",
-    "speed_slip", "turning_resistance", "slope_drift", "lateral_drift", "yaw_drift", "time_drift",
+    "speed_slip", "turning_resistance", "slope_creep", "lateral_drift", "yaw_drift", "time_drift",
     "terrain_change", "drive_lag", "turn_lag", "transport_delay", "body_speed_limit", "body_turn_limit",
     "turn_droop", "acceleration_limit", "wheel_speed_limit", "deadband", "body_inertia", "heading_skew",
     "yaw_misalignment", "lever_arm", "clock_offset",
@@ -62,7 +63,7 @@ MORE = (
     "wheel_servo", "drive_gain", "difference_gain", "side_gain", "body_acceleration_limit",
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
     "effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play",
-    "motor_imbalance",
+    "motor_imbalance", "slope_slip", "side_slope_slip", "side_slope_creep", "side_slope_turn",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")
@@ -70,11 +71,14 @@ EMPTY = ("plain", "jumps", "noisy", "tilted")
 CLOSED = ("closed", "closed_rough")
 MACHINERY = ("track", "payload", "small_wheels", "slope", "slow_motors", "low_grip")
 _CARS = 0.1
+_BOTH_AXES = 0.4
+_SLOPE = 0.18
+"""Standard deviation of the ground's gradient: the steepest slope that a drive of minutes meets is .25."""
 _ONLY_CARS = {spec.id for spec in list_effects() if spec.kinds == ("ackermann",)}
 # On top of these two an equipped vehicle has one effect more, or nothing.
 _EQUIPMENT = ("effective_track", "drive_lag")
 _MORE = tuple(name for name in DIFFERENTIAL if name not in {*_EQUIPMENT, "turn_lag"})
-_POOR = tuple(name for name in DIFFERENTIAL if name != "slope_drift")
+_POOR = tuple(name for name in DIFFERENTIAL if name != "slope_creep")
 POOLS: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("single", "small"), DIFFERENTIAL + CAR + MORE),
     "equipped": (*_MORE, "nothing"),
@@ -89,6 +93,7 @@ POOLS: dict[str, tuple[str, ...]] = {
         *(name for name in DIFFERENTIAL if name not in {"clock_offset", "terrain_change", "time_drift"}),
         "nothing",
     ),
+    "hills": (*SLOPE_EFFECTS, "grade_load", "nothing"),
 }
 _CAR_SETS = (
     ("drive_lag", "steering_lag"), ("transport_delay", "icr_offset"), ("transport_delay", "understeer"),
@@ -100,6 +105,10 @@ _CAR_SETS = (
 # How far ahead of the rear axle base_link stands: a small car's quarter, a sedan's middle [m].
 _CAR_MIDDLE_M = (0.3, 1.35)
 _NOTHING = 0.4
+_BESIDE = (
+    (), ("effective_track",), ("effective_track", "drive_lag"), ("effective_track", "transport_delay"),
+    ("drive_lag", "icr_offset"), ("wheel_radius", "turn_lag"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -135,7 +144,7 @@ class Riddle:
     more: tuple[Scenario, ...] = ()
 
 
-def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Riddle:
+def draw_riddle(category: Category, seed: int, effect: str | None = None, *, closed: bool = False) -> Riddle:
     """The riddle of a seed.
 
     Args:
@@ -143,6 +152,7 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         seed: from which everything is drawn.
         effect: one of the category's `POOLS`: the effect, the kind of empty log, the odd physics, the
             machine; drawn when None.
+        closed: driven by a controller that follows way points, where the category leaves the driving open.
     """
     maker: dict[Category, Callable[[np.random.Generator, int, str | None], Riddle]] = {
         "single": partial(_draw_single, category="single", share=1.0),
@@ -157,12 +167,25 @@ def draw_riddle(category: Category, seed: int, effect: str | None = None) -> Rid
         "natural": _draw_natural,
         "late": _draw_late,
         "joint": _draw_joint,
+        "hills": _draw_hills,
     }
     if effect is None:
-        return maker[category](np.random.default_rng([CATEGORIES.index(category), seed]), seed, None)
-    # Logs of one seed must share no noise, or many effects on few seeds would count as many logs.
-    generator = np.random.default_rng([CATEGORIES.index(category), seed, zlib.crc32(effect.encode())])
-    return maker[category](generator, int(generator.integers(2**31)), effect)
+        generator = np.random.default_rng([CATEGORIES.index(category), seed])
+        riddle = maker[category](generator, seed, None)
+    else:
+        # Logs of one seed must share no noise, or many effects on few seeds would count as many logs.
+        generator = np.random.default_rng([CATEGORIES.index(category), seed, zlib.crc32(effect.encode())])
+        riddle = maker[category](generator, int(generator.integers(2**31)), effect)
+    return _close(riddle, generator) if closed else riddle
+
+
+def _close(riddle: Riddle, draw: np.random.Generator) -> Riddle:
+    """The riddle driven in closed loop; as it is where its driving is the riddle, and on cars."""
+    fixed = riddle.machine is not None or riddle.answer.category == "poor"
+    if fixed or riddle.scenario.vehicle.kind != "differential" or riddle.scenario.played is not None:
+        return riddle
+    scene, *further = (close_loop(one, draw) for one in (riddle.scenario, *riddle.more))
+    return Riddle(scene, replace(riddle.answer, program="closed loop"), more=tuple(further))
 
 
 def write_riddle(riddle: Riddle, path: Path) -> list[Path]:
@@ -241,7 +264,7 @@ def _draw_single(
 
 def _excite(scene: Scenario, effect: str, draw: np.random.Generator) -> Scenario:
     """What an effect needs to show at all: a slope, or both directions."""
-    if effect in {"slope_drift", "grade_load"}:
+    if effect in {*SLOPE_EFFECTS, "grade_load"}:
         tilt = math.radians(float(draw.uniform(6.0, 11.0)))
         way = float(draw.uniform(0.0, 2.0 * math.pi))
         scene = replace(scene, ground=Ground(tilt * math.cos(way), tilt * math.sin(way)))
@@ -259,7 +282,7 @@ def _draw_set(draw: np.random.Generator, seed: int) -> Riddle:
         ("body_turn_limit", "drive_lag", "effective_track"), ("wheel_radius", "transport_delay"),
         ("acceleration_limit", "effective_track"), ("deadband", "effective_track", "icr_offset"),
         ("heading_skew", "effective_track"), ("yaw_drift", "icr_lateral", "drive_lag"),
-        ("slope_drift", "effective_track"), ("lever_arm", "effective_track", "transport_delay"),
+        ("slope_creep", "effective_track"), ("lever_arm", "effective_track", "transport_delay"),
         ("turning_resistance", "effective_track", "turn_lag"),
     )  # fmt: skip
     names = pools[int(draw.integers(len(pools)))]
@@ -398,6 +421,30 @@ def _draw_joint(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
     return Riddle(scenes[0], answer, more=tuple(scenes[1:]))
 
 
+def _draw_hills(draw: np.random.Generator, seed: int, effect: str | None) -> Riddle:
+    """Hills of up to a quarter of slope, and what gravity does there, along or across the body or both."""
+    chosen = effect or str(draw.choice(POOLS["hills"]))
+    scene = _draw_scene(draw, seed)
+    program = str(draw.choice(["smooth", "teleop", "stop_and_go", "drive_steps", "slalom"]))
+    length = float(draw.uniform(12.0, 30.0))
+    names = [chosen, *_BESIDE[int(draw.integers(len(_BESIDE)))]]
+    other = {"slope_slip": "side_slope_slip", "slope_creep": "side_slope_creep"}.get(chosen)
+    if other is not None and draw.random() < _BOTH_AXES:
+        names.append(other)
+    scene = replace(
+        scene,
+        program=replace(scene.program, name=program),  # type: ignore[arg-type]
+        duration_s=180.0,
+        ground=Ground(hill_m=_SLOPE * length / (2.0 * math.pi), hill_length_m=length),
+    )
+    sensors = str(draw.choice(["all", "no encoders"]))
+    if sensors != "all":
+        scene = replace(scene, encoders=None)
+    asked = {name: draw_size(name, scene, 1.0, draw) for name in names if name != "nothing"}
+    answer = Answer("hills", asked, program=program, note=f"{chosen}, {sensors}")
+    return Riddle(replace(scene, effects=asked), answer)
+
+
 def _draw_one_or_none(draw: np.random.Generator, pool: tuple[str, ...]) -> str:
     """One of a pool, or nothing as often as a log of the field may have nothing to find."""
     return "nothing" if draw.random() < _NOTHING else str(draw.choice(pool[:-1]))
@@ -428,7 +475,7 @@ def _draw_rigid(draw: np.random.Generator, seed: int, effect: str | None) -> Rid
         expected["wheel_asymmetry"] = {}
     elif kind == "slope":
         scene = replace(scene, ground=Ground(math.radians(10.0)))
-        expected["slope_drift"] = {}
+        expected |= {"slope_creep": {}, "side_slope_creep": {}}
     elif kind == "slow_motors":
         scene = replace(scene, effects={"drive_lag": {"tau": 0.5}})
         expected["drive_lag"] = {"tau": 0.5}

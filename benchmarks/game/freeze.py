@@ -1,13 +1,16 @@
-"""Frozen answers: logs taken through the stages once, with the answer of one version of the diagnosis.
+"""An examination: drawn logs taken through the stages once, then diagnosed by any version and scored.
 
-    make bench NAME=game/freeze ARGS="write FOLDER --seeds 910000-910012 [--categories C] [--recordings]"
-    make bench NAME=game/freeze ARGS="compare FOLDER [--jobs 2]"
+    make bench NAME=game/freeze ARGS="write FOLDER --seeds 7701-7713 [--categories C] [--closed]"
+    make bench NAME=game/freeze ARGS="exam FOLDER [--jobs 2] [--answers NAME]"
+    make bench NAME=game/freeze ARGS="compare FOLDER [--jobs 2] [--answers NAME]"
 
-`write` fills a folder for each log: its tables, and what `slip diagnose` says of it, with the CPU time that
-it took. It goes on where it was stopped. `compare` diagnoses the same tables with the code as it is now. It
-prints of each log the largest relative difference of all numbers of the two answers and all else that
-differs, with a summary of both where that differs, and the ratio of CPU times by category. What a log hides
-is drawn again from its category and seed.
+`write` fills a folder for each log, CATEGORY/SEED: its tables in results, and what it hides in truth.json.
+It goes on where it was stopped. With --recordings it writes those of ../shared/logs, too. With --closed
+every second seed is driven in closed loop, wherever the category leaves the driving open. `exam` diagnoses
+the tables with the code as it is now, keeps the answers as NAME.json beside them, with the CPU time of each,
+and prints what is right, wrong, missed and covered, by category, by driving and by input. `compare` diagnoses
+once more. It prints of each log the largest relative difference of all numbers of the two answers and all
+else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
 """
 
 from __future__ import annotations
@@ -25,10 +28,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import msgspec
 from measuring import RECORDINGS
 
-from game.draw import CATEGORIES, draw_riddle, write_riddle
+from game.draw import CATEGORIES, Answer, Riddle, draw_riddle, write_riddle
 from game.play import THREADS, parse_seeds, score_runs
+from game.score import TaskScore, list_misses
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.job import Options
@@ -37,7 +42,7 @@ from pipeline.job.run_results import read_recording
 from pipeline.store import Store
 
 RECORDED = "recordings"
-_FROZEN, _RESULTS = "frozen.json", "results"
+_TRUTH, _RESULTS, _ANSWERS = "truth.json", "results", "answers"
 _TIMES = frozenset({"timing", "cpu_s"})
 """Keys whose numbers no two runs of a program have in common."""
 
@@ -46,10 +51,19 @@ Json = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Case:
-    """A frozen log: of a category and a seed, or a recording by its name."""
+    """A frozen log: of a category and a seed, or a recording by its name.
+
+    Attributes:
+        category, name: what is drawn; the seed of one in closed loop ends with `c`.
+    """
 
     category: str
     name: str
+
+    def draw(self) -> Riddle:
+        """What a drawn log hides, and how it is made."""
+        closed = self.name.endswith("c")
+        return draw_riddle(self.category, int(self.name.removesuffix("c")), closed=closed)  # type: ignore[arg-type]
 
     def folder(self, root: Path) -> Path:
         """Where it stands."""
@@ -78,26 +92,43 @@ class Comparison:
 
 
 def freeze(case: Case, root: Path) -> str:
-    """Draw a log or take a recording, run its stages and diagnose it, once.
+    """Draw a log or take a recording, and run its stages, once.
 
     Returns:
         One line about it.
     """
-    folder = case.folder(root)
-    if (folder / _FROZEN).exists():
+    folder, begin = case.folder(root), time.process_time()
+    if (folder / _TRUTH).exists():
         return f"{case.category} {case.name}: is there"
     folder.mkdir(parents=True, exist_ok=True)
+    answer = Answer(case.category)
     with tempfile.TemporaryDirectory(prefix="freeze_") as scratch:
         if case.category == RECORDED:
             logs = [RECORDINGS / f"{case.name}.mcap"]
         else:
-            riddle = draw_riddle(case.category, int(case.name), None)  # type: ignore[arg-type]
+            riddle = case.draw()
+            answer = riddle.answer
             logs = write_riddle(riddle, Path(scratch) / "run.mcap")
         for log in logs:
-            analyze_log(log, Options(out=folder / _RESULTS, report=False, diagnosis=False))
-    told, spent = diagnose(case, root)
-    (folder / _FROZEN).write_text(json.dumps({"cpu_s": spent, "runs": told}, indent=1), encoding="utf-8")
-    return f"{case.category} {case.name}: {spent:.1f} s"
+            try:
+                analyze_log(log, Options(out=folder / _RESULTS, report=False, diagnosis=False))
+            except SlipError as error:
+                return f"{case.category} {case.name}: refused: {error}"
+    (folder / _TRUTH).write_bytes(msgspec.json.encode(answer))
+    return f"{case.category} {case.name}: {time.process_time() - begin:.1f} s"
+
+
+def read_truth(case: Case, root: Path) -> Answer:
+    """What a frozen log hides; of a recording only its category."""
+    return msgspec.json.decode((case.folder(root) / _TRUTH).read_bytes(), type=Answer)
+
+
+def answer(case: Case, root: Path, answers: str) -> tuple[list[dict[str, Any]], float]:
+    """Diagnose a frozen log, and keep the answer beside its tables."""
+    said, spent = diagnose(case, root)
+    path = case.folder(root) / f"{answers}.json"
+    path.write_text(json.dumps({"cpu_s": spent, "runs": said}, indent=1), encoding="utf-8")
+    return said, spent
 
 
 def diagnose(case: Case, root: Path) -> tuple[list[dict[str, Any]], float]:
@@ -112,9 +143,9 @@ def diagnose(case: Case, root: Path) -> tuple[list[dict[str, Any]], float]:
     return told, time.process_time() - begin
 
 
-def compare(case: Case, root: Path) -> Comparison:
+def compare(case: Case, root: Path, answers: str = _ANSWERS) -> Comparison:
     """The frozen answer beside that of the code as it is now."""
-    frozen = json.loads((case.folder(root) / _FROZEN).read_text(encoding="utf-8"))
+    frozen = json.loads((case.folder(root) / f"{answers}.json").read_text(encoding="utf-8"))
     told, spent = diagnose(case, root)
     largest, at, others = 0.0, "", list[str]()
     for place, old, new in walk(frozen["runs"], told):
@@ -123,7 +154,8 @@ def compare(case: Case, root: Path) -> Comparison:
             others.append(f"{place}: {_shorten(old)} -> {_shorten(new)}")
         elif ratio > largest:
             largest, at = ratio, place
-    summaries = summarize(case, frozen["runs"]), summarize(case, told)
+    truth = read_truth(case, root)
+    summaries = summarize(truth, frozen["runs"]), summarize(truth, told)
     return Comparison(case, summaries, largest, at, tuple(others), (frozen["cpu_s"], spent))
 
 
@@ -154,7 +186,7 @@ def _shorten(value: object, most: int = 60) -> str:
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
-def summarize(case: Case, runs: Sequence[Json]) -> str:
+def summarize(truth: Answer, runs: Sequence[Json]) -> str:
     """What an answer comes to, in one line."""
     said = sorted(str(effect["id"]) for effect in runs[0]["effects"])
     groups = ["|".join(sorted(group["candidates"])) for group in runs[0]["undecided"]]
@@ -162,9 +194,8 @@ def summarize(case: Case, runs: Sequence[Json]) -> str:
     errors = " ".join(f"{ladder[-1].get(key, float('nan')):.4f}" for key in ("t_mrmse_m", "r_mrmse_rad"))
     flag = (runs[0].get("unexplained") or {}).get("channel", "")
     verdict = ""
-    if case.category != RECORDED:
-        answer = draw_riddle(case.category, int(case.name), None).answer  # type: ignore[arg-type]
-        score = score_runs(answer, runs)
+    if truth.category != RECORDED:
+        score = score_runs(truth, runs)
         ways = ", ".join(f"{name} {outcome}" for name, outcome in score.outcomes.items())
         verdict = f"{ways}{f', false {list(score.false)}' if score.false else ''}; "
     return f"{verdict}{', '.join(said) or 'nothing'} {groups or ''} {flag} | {errors}"
@@ -184,34 +215,101 @@ def describe(one: Comparison, most: int = 8) -> list[str]:
 
 def list_cases(root: Path) -> list[Case]:
     """All that is frozen."""
-    return [Case(path.parent.parent.name, path.parent.name) for path in sorted(root.glob(f"*/*/{_FROZEN}"))]
+    return [Case(path.parent.parent.name, path.parent.name) for path in sorted(root.glob(f"*/*/{_TRUTH}"))]
+
+
+@dataclass(frozen=True)
+class Marks:
+    """What an answer to a frozen log comes to.
+
+    Attributes:
+        groups: the lines of the table that it belongs to.
+        score: the answer beside the truth.
+        cpu_s: of the diagnosis [s].
+    """
+
+    groups: tuple[str, ...]
+    score: TaskScore
+    cpu_s: float
+
+
+def examine(case: Case, root: Path, answers: str) -> Marks:
+    """Diagnose a frozen log and score what was said."""
+    said, spent = answer(case, root, answers)
+    truth = read_truth(case, root)
+    driving = "closed loop" if truth.program == "closed loop" else "programs"
+    groups = (case.category, driving, f"input {said[0].get('input', 'none')}", "all")
+    return Marks(groups, score_runs(truth, said, f"{case.category} {case.name}"), spent)
+
+
+def write_marks(marks: Sequence[Marks]) -> list[str]:
+    """A table: of each group of logs how many are right, how many claims are wrong, missed and covered."""
+    heads = ("logs", "right", "wrong name", "other false", "hidden", "named", "open", "missed", "numbers")
+    lines = [f"{'':<14}" + "".join(f"{head:>12}" for head in (*heads, "hold", "CPU [s]"))]
+    names = [name for kind in zip(*(one.groups for one in marks), strict=True) for name in sorted(set(kind))]
+    for group in names:
+        scores = [one.score for one in marks if group in one.groups]
+        wrong = sum(bool(one.wrong_names) for one in scores)
+        other = sum(bool(set(one.false) - set(one.wrong_names)) for one in scores)
+        outcomes = [said for one in scores for name, said in one.outcomes.items() if name != "nothing"]
+        intervals = [one.holds for score in scores for one in score.intervals]
+        right = sum(not one.false and set(one.outcomes.values()) == {"right"} for one in scores)
+        counts = [sum(said in kinds for said in outcomes) for kinds in (_NAMED, _OPEN, _MISSED)]
+        held = f"{sum(intervals) / len(intervals):.1%}" if intervals else "-"
+        cpu = statistics.median(one.cpu_s for one in marks if group in one.groups)
+        values = (
+            len(scores),
+            right,
+            wrong,
+            other,
+            len(outcomes),
+            *counts,
+            len(intervals),
+            held,
+            f"{cpu:.2f}",
+        )
+        lines.append(f"{group:<14}" + "".join(f"{value:>12}" for value in values))
+    return [*lines, "", *list_misses([one.score for one in marks])]
+
+
+_NAMED, _OPEN, _MISSED = {"right"}, {"undecided", "unobservable"}, {"abstained", "wrong"}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("verb", choices=["write", "compare"])
+    parser.add_argument("verb", choices=["write", "exam", "compare"])
     parser.add_argument("folder", type=Path)
     parser.add_argument("--seeds", type=parse_seeds, default=[])
     parser.add_argument("--categories", help="with commas; all where not given")
     parser.add_argument("--recordings", action="store_true", help="write those of ../shared/logs, too")
+    parser.add_argument("--closed", action="store_true", help="every second seed in closed loop")
+    parser.add_argument("--answers", default=_ANSWERS, help="name under which `exam` keeps what was said")
     parser.add_argument("--jobs", type=int, default=1)
 
 
 def run(given: argparse.Namespace) -> None:
-    """Write or compare."""
+    """Write, examine or compare."""
     os.environ.update(dict.fromkeys(THREADS, "1"))
     wanted = given.categories.split(",") if given.categories else [*CATEGORIES, RECORDED]
     with ProcessPoolExecutor(given.jobs, multiprocessing.get_context("spawn")) as pool:
         if given.verb == "write":
             names = sorted(log.stem for log in RECORDINGS.glob("*.mcap")) if given.recordings else []
             cases = [Case(RECORDED, name) for name in names]
-            cases += [Case(one, str(seed)) for seed in given.seeds for one in wanted if one != RECORDED]
+            seeds = [f"{seed}{'c' * (given.closed and seed % 2)}" for seed in given.seeds]
+            cases += [Case(one, seed) for seed in seeds for one in wanted if one != RECORDED]
             for line in pool.map(freeze, cases, [given.folder] * len(cases)):
                 print(line, flush=True)
             return
         cases = [case for case in list_cases(given.folder) if case.category in wanted]
+        count = len(cases)
+        if given.verb == "exam":
+            drawn = [case for case in cases if case.category != RECORDED]
+            count = len(drawn)
+            marks = list(pool.map(examine, drawn, [given.folder] * count, [given.answers] * count))
+            print(*write_marks(marks), sep="\n")
+            return
         ratios: dict[str, list[float]] = {}
         changed = 0
-        for one in pool.map(compare, cases, [given.folder] * len(cases)):
+        for one in pool.map(compare, cases, [given.folder] * count, [given.answers] * count):
             changed += bool(one.others) or one.largest > 0.0
             ratios.setdefault(one.case.category, []).append(one.cpu_s[1] / one.cpu_s[0])
             print(*describe(one), sep="\n", flush=True)

@@ -88,7 +88,11 @@ _CONTACT = (
     "wheel_radius", "drive_lag", "turn_lag", "acceleration_limit", "difference_gain", "turn_droop",
     "wheel_servo", "speed_track", "contact_friction", "other",
 )  # fmt: skip
-_BUILT_IN = {"payload": ("icr_lateral",), "small_wheels": ("wheel_asymmetry", "icr_lateral")}
+_BUILT_IN = {
+    "payload": ("icr_lateral",),
+    "small_wheels": ("wheel_asymmetry", "icr_lateral"),
+    "slope": ("slope_slip", "side_slope_slip", "side_slope_turn"),
+}
 _NEUTRAL = {(spec.id, item.name): item.neutral for spec in list_effects() for item in spec.parameters}
 
 Told = Callable[[str], None]

@@ -53,6 +53,8 @@ ALIKE: Mapping[str, frozenset[str]] = {
     "contact_friction": frozenset({"effective_track"}),
     "drive_lag": frozenset({"body_inertia"}),
     "body_inertia": frozenset({"drive_lag"}),
+    "grade_load": frozenset({"slope_creep"}),
+    "slope_creep": frozenset({"grade_load"}),
 }
 # A point beside base_link is a centre of rotation shifted in two directions: both together, whatever is said.
 TOGETHER: Mapping[str, frozenset[str]] = {"lever_arm": frozenset({"icr_offset", "icr_lateral"})}

@@ -22,6 +22,7 @@ _KINDS: dict[str, Callable[[Record], str]] = {
     "odd": lambda record: record.answer.odd,
     "poor": lambda record: record.answer.program,
     "equipped": lambda record: record.answer.note,
+    "hills": lambda record: record.answer.note,
 }
 
 

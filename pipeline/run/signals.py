@@ -264,6 +264,12 @@ class RunContext:
         return round_off(np.column_stack((moved.real, moved.imag, yaw)))
 
     @property
+    def downhill(self) -> tuple[Floats, Floats]:
+        """Direction of gravity in the body's frame: ahead and to the left [1], each of shape (n,)."""
+        roll, pitch = self.attitude[:, 0], self.attitude[:, 1]
+        return np.sin(pitch), -np.cos(pitch) * np.sin(roll)
+
+    @property
     def slope_rad(self) -> float:
         """Half of the range of pitch in the central nine tenths of its values [rad]."""
         low, high = np.quantile(self.attitude[:, 1], (0.05, 0.95))

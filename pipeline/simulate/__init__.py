@@ -36,7 +36,7 @@ from pipeline.simulate.facts import (
 )
 from pipeline.simulate.messages import Field, Sheet, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
-from pipeline.simulate.path import CompactedGround
+from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
 from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, publish
 from pipeline.simulate.programs import read_played
 from pipeline.simulate.scenario import (
@@ -321,7 +321,8 @@ CASES = tuple(_make_case(name, given) for name, given in read_facts("cases.toml"
 
 _BY_NAME = {case.name: case for case in CASES}
 _SAMPLES = ("husky_tile", "warthog_ice", "ackermann_gravel")
-_LESSON_SLOPE_RAD = math.radians(8.0)
+_LESSON_HILLS = Ground(hill_m=0.5, hill_length_m=20.0)
+"""Ground of a run that is asked for an effect of slopes: hills of up to a quarter of slope."""
 
 
 class Changes(TypedDict, total=False):
@@ -453,9 +454,9 @@ def make_scenario(
     asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
     resolve_effects(asked, scenario.vehicle.kind)
     ground = scenario.ground
-    if not {"slope_drift", "grade_load"}.isdisjoint(asked) and ground == Ground():
+    if not {*SLOPE_EFFECTS, "grade_load"}.isdisjoint(asked) and ground == Ground():
         # On level ground these effects would leave no trace at all.
-        ground = Ground(pitch_rad=_LESSON_SLOPE_RAD)
+        ground = _LESSON_HILLS
     return replace(
         scenario,
         effects=asked,

@@ -234,6 +234,8 @@ class Path:
 
 Vector = tuple[float, float, float]
 
+SLOPE_EFFECTS = ("slope_slip", "slope_creep", "side_slope_slip", "side_slope_creep", "side_slope_turn")
+"""Effects by which gravity moves the body on a slope."""
 _WAVES = 6
 
 
@@ -296,38 +298,26 @@ def integrate_path(
     Args:
         motion: velocities before slope and place act.
         drive: wheels, for odd physics that looks at them.
-        effects: slope_drift and a terrain_change at a place act here.
+        effects: those of `SLOPE_EFFECTS` and a terrain_change at a place act here.
         ground: shape of the ground.
         extra: odd physics.
         start: x [m], y [m] in the plane and yaw [rad].
         generator: source of the hills.
     """
     is_local = effects.is_active("terrain_change") and math.isfinite(effects.value("terrain_change", "at_x"))
-    if extra is None and ground.hill_m == 0.0 and not is_local:
-        return _cross_plane(motion, drive.step_s, effects.value("slope_drift", "k"), ground, start)
+    is_pulled = any(map(effects.is_active, SLOPE_EFFECTS))
+    if extra is None and ground.hill_m == 0.0 and not is_local and not is_pulled:
+        return _cross_plane(motion, drive.step_s, ground, start)
     surface = make_surface(ground, generator)
     return _cross_surface(_Walk(motion, drive, effects, extra), surface, ground, start)
 
 
 def _cross_plane(
-    motion: BodyMotion, step_s: float, slope_gain: float, ground: Ground, start: tuple[float, float, float]
+    motion: BodyMotion, step_s: float, ground: Ground, start: tuple[float, float, float]
 ) -> Path:
     tilt = ground.tilt
     velocity = motion.velocity
     heading = start[2] + integrate_cells(velocity[:, 2], step_s=step_s)
-    if slope_gain != 0.0:
-        middle = 0.5 * (heading[:-1] + heading[1:])
-        cosine, sine = np.cos(middle), np.sin(middle)
-        up_x, up_y, _ = rotate(tilt * np.array([-1.0, -1.0, -1.0, 1.0]), np.array([0.0, 0.0, 1.0])).tolist()
-        downhill = -slope_gain * motion.turning
-        velocity = velocity + np.stack(
-            (
-                downhill * (cosine * up_x + sine * up_y),
-                downhill * (cosine * up_y - sine * up_x),
-                np.zeros_like(downhill),
-            ),
-            axis=1,
-        )
     walked = walk_in_plane(velocity[:, 0], velocity[:, 1], heading, step_s=step_s)
     in_plane = np.array([*start[:2], 0.0]) + walked
     time = np.arange(heading.size, dtype=np.float64) * step_s
@@ -410,7 +400,11 @@ class _Forces:
     def __init__(self, walk: _Walk) -> None:
         effects = walk.effects
         self._walk = walk
-        self._slope = effects.value("slope_drift", "k")
+        self._slip, self._creep = effects.value("slope_slip", "k"), effects.value("slope_creep", "c")
+        self._side_slip = effects.value("side_slope_slip", "k")
+        self._side_creep = effects.value("side_slope_creep", "c")
+        self._side_turn = effects.value("side_slope_turn", "k")
+        self._centre = effects.value("icr_offset", "x_icr"), effects.value("icr_lateral", "y_icr")
         self._border = effects.value("terrain_change", "at_x")
         self._gain_v = effects.value("terrain_change", "k_v")
         self._gain_w = effects.value("terrain_change", "k_w")
@@ -426,8 +420,12 @@ class _Forces:
         self, index: int, at: tuple[float, float], *, axes: tuple[Vector, Vector], attitude: Vector
     ) -> tuple[float, float, float]:
         """Velocity to add in this cell: d_x [m/s], d_y [m/s], d_w [rad/s]."""
-        downhill = -self._slope * self._turning[index]
-        d_x, d_y, d_w = downhill * axes[0][2], downhill * axes[1][2], 0.0
+        speed, turning = self._signals["v0"][index], self._turning[index]
+        ahead, aside = -axes[0][2], -axes[1][2]
+        d_w = self._side_turn * aside * speed
+        # The centre of rotation stands aside for whatever turns the body.
+        d_x = (self._slip * abs(speed) + self._creep * turning) * ahead + self._centre[1] * d_w
+        d_y = (self._side_slip * abs(speed) + self._side_creep * turning) * aside - self._centre[0] * d_w
         if at[0] > self._border:
             base = self._walk.velocity[index]
             d_x += (self._gain_v - 1.0) * float(base[0])

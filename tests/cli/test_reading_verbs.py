@@ -243,7 +243,7 @@ def test_a_diagnosis_is_searched_once_and_anew_where_what_is_kept_is_of_other_ta
 def test_an_error_that_rises_is_said_and_not_taken_unless_asked_for(place: Path) -> None:
     """Effects that the vehicle lacks cost something on data that they were not fitted to."""
     ask_verb("model", "add", "husky.toml", "effective_track", "drive_lag", "--on", "field/wide")
-    useless = ("slope_drift", "lateral_skid", "heading_skew", "turn_lag")
+    useless = ("slope_creep", "lateral_skid", "heading_skew", "turn_lag")
     before = (place / "husky.toml").read_bytes()
     refused = run_verb("model", "add", "husky.toml", *useless, "--on", "field/wide", "--quiet")
     assert (refused.returncode, "are not supported by the data (" in refused.stderr) == (1, True)

@@ -203,7 +203,7 @@ def test_no_docstring_and_no_change_of_the_log_has_a_phrase_of_the_glossary() ->
         "explained 100% of what can be explained; now 0.0164 m, floor 0.0164 m",
         "of 0.291 m/s of slip (mean square): effective_track 77%",
         "The budget: who carries the slip",
-        "tell of slope_drift from this log",
+        "tell of slope_creep from this log",
         "to see them: drive on a slope",
         "what is larger than wheel_radius 1.2%",
         "drive_lag.tau only within 0.031 s, 7 min of such driving are needed",
@@ -294,7 +294,7 @@ def test_a_planted_sentence_is_found_where_it_would_be_shown(tmp_path: Path) -> 
     [
         "Lag of the drive: the wheels follow commands with a time constant of 0.30 s",
         "remaining error 1.6 cm, at the noise floor",
-        "not observable in this log: slope_drift",
+        "not observable in this log: slope_creep",
         "there is no run with a date",
         "the compression is no longer supported",
         "median slip modulus 0.594 m/s from commands",

@@ -41,7 +41,7 @@ READING = {
     "model.txt": [
         ("model", "show", "husky.toml"),
         ("model", "add", "husky.toml", "effective_track", *ON),
-        ("model", "add", "husky.toml", "slope_drift", *ON),
+        ("model", "add", "husky.toml", "slope_creep", *ON),
         ("model", "add", "husky.toml", "drive_lag", *ON, "--input", "measured"),
         ("model", "add", "husky.toml", "drive_lag", *ON),
         ("model", "add", "husky.toml", "motor_imbalance", *ON),

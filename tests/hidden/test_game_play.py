@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from game.draw import CATEGORIES, POOLS, Answer, draw_riddle, write_riddle
-from game.freeze import Case, compare, freeze
+from game.freeze import Case, Marks, answer, compare, examine, freeze, read_truth, write_marks
 from game.freeze import describe as describe_comparison
 from game.paired import compare as compare_versions
 from game.play import (
@@ -37,11 +38,12 @@ from game.tables import (
 )
 from game.true_model import Checked, Held
 
+from pipeline.core.rigid import rotate
 from pipeline.estimation import diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
-from pipeline.simulate import EffectSpec, State, list_effects
+from pipeline.simulate import EffectSpec, State, list_effects, simulate_run
 
 
 def test_a_log_does_not_hold_its_answer(tmp_path: Path) -> None:
@@ -126,6 +128,31 @@ def test_every_kind_of_every_category_can_be_drawn() -> None:
             assert set(riddle.answer.effects) == set(riddle.scenario.effects) or category == "rigid"
 
 
+def test_a_controller_answers_where_hidden_effects_bring_the_vehicle() -> None:
+    riddle, programmed = (draw_riddle("natural", 3, "drive_lag", closed=one) for one in (True, False))
+    assert riddle.answer == replace(programmed.answer, program="closed loop")
+    assert riddle.scenario.effects == programmed.scenario.effects
+    lame = simulate_run(replace(riddle.scenario, effects={"wheel_radius": 0.5})).truth.path
+    plain = simulate_run(riddle.scenario).truth.path
+    # Its own vehicle comes back to the way points again and again; another one leaves them with its commands.
+    assert np.ptp(plain.position[:, :2]) < 15.0
+    assert np.abs(lame.position - plain.position).max() > 2.0
+
+
+def test_where_the_driving_is_the_riddle_it_stays() -> None:
+    for category in ("poor", "rigid"):
+        assert draw_riddle(category, 3, closed=True).scenario.played is None
+
+
+def test_hills_are_as_steep_as_a_quarter() -> None:
+    slopes = []
+    for seed in range(4):
+        path = simulate_run(draw_riddle("hills", seed).scenario).truth.path
+        normal = rotate(path.quaternion, np.tile([0.0, 0.0, 1.0], (path.time_s.size, 1)))
+        slopes.append(np.hypot(normal[:, 0], normal[:, 1]).max())
+    assert 0.15 < np.median(slopes) < 0.35
+
+
 def test_an_equipped_vehicle_hides_what_it_has_as_well() -> None:
     assert set(draw_riddle("equipped", 1, "deadband").answer.effects) == {
         "effective_track",
@@ -165,9 +192,10 @@ def test_two_versions_are_compared_on_logs_that_both_played() -> None:
 def test_a_frozen_answer_is_compared_number_by_number(tmp_path: Path) -> None:
     case = Case("empty", "910100")
     freeze(case, tmp_path)
+    answer(case, tmp_path, "answers")
     same = compare(case, tmp_path)
     assert (same.largest, same.others) == (0.0, ())
-    path = case.folder(tmp_path) / "frozen.json"
+    path = case.folder(tmp_path) / "answers.json"
     frozen = json.loads(path.read_text("utf-8"))
     frozen["runs"][0]["noise_floor"]["t_mrmse_m"] *= 0.5
     frozen["runs"][0]["input"] = "measured"
@@ -345,3 +373,28 @@ def test_a_heading_skew_that_no_prediction_shows_is_a_finding_and_no_name(tmp_pa
     assert {effect.id for effect in run.effects} == {"deadband", "effective_track", "icr_offset"}
     (said,) = [one["text"] for one in run.findings if one["id"] == "idle_effect"]
     assert str(said).startswith("heading_skew reduces the error over half a second, but not ")
+
+
+@pytest.mark.long
+def test_a_frozen_log_in_closed_loop_is_examined(tmp_path: Path) -> None:
+    case = Case("hills", "910101c")
+    freeze(case, tmp_path)
+    assert read_truth(case, tmp_path) == case.draw().answer
+    marks = examine(case, tmp_path, "mine")
+    assert marks.groups[:2] == ("hills", "closed loop")
+    assert set(marks.score.outcomes) == set(case.draw().answer.effects)
+    assert (case.folder(tmp_path) / "mine.json").exists()
+
+
+def test_marks_are_counted_by_category_driving_and_input() -> None:
+    right = score_runs(Answer("hills", {"slope_slip": {}}), [_name("slope_slip")])
+    wrong = score_runs(Answer("empty"), [_name("lateral_skid")])
+    marks = [
+        Marks(("hills", "programs", "input command", "all"), right, 1.0),
+        Marks(("empty", "programs", "input measured", "all"), wrong, 2.0),
+    ]
+    lines = {line[:14].strip(): line[14:].split() for line in write_marks(marks)}
+    assert lines["hills"][:4] == ["1", "1", "0", "0"]
+    assert lines["empty"][:4] == ["1", "0", "1", "0"]
+    assert lines["all"][:4] == ["2", "1", "1", "0"]
+    assert lines["input measured"][-1] == "2.00"

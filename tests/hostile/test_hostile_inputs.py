@@ -78,7 +78,7 @@ WORDS: list[tuple[str, str]] = [
     ("model add husky.toml effective_track --on text.mcap", "text.mcap"),
     ("model add husky.toml drive_lag --on", "--on names no run"),
     ("model add husky.toml drive_lag --on field/wide --input measured", "acts between command and wheels"),
-    ("model add husky.toml slope_drift --on field/wide", "is not supported by the data"),
+    ("model add husky.toml slope_creep --on field/wide", "is not supported by the data"),
     ("model drop husky.toml drive_lag --on field/wide", "drive_lag"),
     ("model remove husky.toml drive_lag --on field/wide", "drive_lag"),
     ("model fit husky.toml --on text.mcap", "text.mcap"),

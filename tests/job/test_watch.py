@@ -344,7 +344,7 @@ def test_it_asks_until_it_knows_enough() -> None:
     floor = {"t_mrmse_m": 0.01, "r_mrmse_rad": 0.01}
     diagnosis = {
         "effects": [known],
-        "unobservable_why": {"slope_drift": {"reason": "no excitation", "manoeuvre": "drive on a slope"}},
+        "unobservable_why": {"slope_creep": {"reason": "no excitation", "manoeuvre": "drive on a slope"}},
         "ladder": [
             {"effects": [], "t_mrmse_m": 0.05, "r_mrmse_rad": 0.05},
             {"effects": ["effective_track"], **floor},

@@ -188,7 +188,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     truth = hidden[effect.id]
     more = vehicle_and_program(effect.kinds[0])
     if Excitation.SLOPE in effect.needs:
-        from pipeline.simulate import Ground  # noqa: PLC0415 - two effects need it
+        from pipeline.simulate import Ground  # noqa: PLC0415 - effects of slopes need it
 
         more["ground"] = Ground(pitch_rad=0.14)
     if effect.late is Late.POSES:
@@ -201,8 +201,8 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     if "wheel_servo" in names:
         # A force that falls with speed shows on wheels that turn at metres a second.
         more, vehicle = more | {"vehicle": VEHICLES["warthog"]}, "warthog"
-    # What only shows where fast turns stand beside slow ones takes longer.
-    duration_s = 240.0 if effect.id in {"speed_track", "understeer"} else 100.0
+    # What only shows where fast turns stand beside slow ones, or across a slope, takes longer.
+    duration_s = 240.0 if effect.id in {"speed_track", "understeer", "side_slope_turn"} else 100.0
     run = simulate(hidden, duration_s=duration_s, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(vehicle), source)

@@ -23,7 +23,7 @@ TRUE: Mapping[str, tuple[str, float]] = {
     "effective_track": ("k", 1.6),
     "drive_lag": ("tau", 0.5),
     "lateral_skid": ("c", 0.2),
-    "slope_drift": ("k", 0.7),
+    "slope_creep": ("c", 0.7),
     "body_turn_limit": ("limit", 0.5),
 }
 
@@ -31,7 +31,7 @@ TRUE: Mapping[str, tuple[str, float]] = {
 @cache
 def problem_of(name: str) -> Problem:
     """A log that was simulated with one effect alone."""
-    more = {"ground": Ground(pitch_rad=0.2, roll_rad=0.1)} if name == "slope_drift" else {}
+    more = {"ground": Ground(pitch_rad=0.2, roll_rad=0.1)} if name == "slope_creep" else {}
     key, value = TRUE[name]
     run = simulate({name: {key: value}}, duration_s=150.0, seed=3, **more)
     return Problem([run], vehicle_of("husky_a200"), Input.COMMAND)

@@ -14,7 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.simulate import (
+    SLOPE_EFFECTS,
     VEHICLES,
+    Ground,
     Program,
     Scenario,
     Vehicle,
@@ -35,7 +37,11 @@ CATALOGUE_IDS = {
         "speed_slip",
         "speed_track",
         "turning_resistance",
-        "slope_drift",
+        "slope_slip",
+        "slope_creep",
+        "side_slope_slip",
+        "side_slope_creep",
+        "side_slope_turn",
         "lateral_drift",
         "yaw_drift",
         "time_drift",
@@ -85,9 +91,13 @@ def test_an_empty_effect_means_its_usual_size() -> None:
     assert make_scenario(None, {"icr_offset": {}}).effects["icr_offset"] == {"x_icr": 0.12}
 
 
-def test_slope_drift_brings_a_slope_along() -> None:
-    assert make_scenario(None, {"slope_drift": 0.5}).ground.pitch_rad > 0.1
-    assert make_scenario(None, {"grade_load": 0.5}).ground.pitch_rad > 0.1
+@pytest.mark.parametrize("name", [*SLOPE_EFFECTS, "grade_load"])
+def test_an_effect_of_slopes_brings_hills_along(name: str) -> None:
+    assert make_scenario(None, {name: 0.5}).ground.hill_m > 0.0
+    assert make_scenario(None, {}).ground == Ground()
+
+
+def test_a_case_keeps_its_slope() -> None:
     assert make_scenario("jackal_slope").ground == find_case("jackal_slope").scenario.ground
 
 

@@ -384,9 +384,7 @@ def test_a_usual_size_of_every_effect_moves_what_is_reported(name: str) -> None:
 
 
 def test_both_integrators_agree_on_a_plane() -> None:
-    base = Scenario(
-        duration_s=60.0, ground=Ground(0.15, -0.1), effects={"slope_drift": 0.4, "drive_lag": 0.3}
-    )
+    base = Scenario(duration_s=60.0, ground=Ground(0.15, -0.1), effects={"icr_offset": 0.1, "drive_lag": 0.3})
     at_once = simulate_run(base).truth.path
     stepwise = simulate_run(replace(base, extra=lambda _: (0.0, 0.0, 0.0))).truth.path
     np.testing.assert_allclose(stepwise.position, at_once.position[::5], atol=2e-3)

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.core.rigid import euler_from_quaternions, rotate
+from pipeline.core.rigid import euler_from_quaternions
+from pipeline.simulate import SLOPE_EFFECTS
 from pipeline.simulate.messages import simulate_run
 from pipeline.simulate.scenario import Ground, Program, Scenario
 
@@ -18,7 +19,7 @@ def test_slope_pulls_downhill_whatever_the_heading() -> None:
         program=Program("spins"),
         duration_s=60.0,
         ground=Ground(pitch_rad=0.1, roll_rad=-0.05),
-        effects={"slope_drift": 0.6},
+        effects={"slope_creep": 0.6, "side_slope_creep": 0.6},
     )
     path = simulate_run(slope).truth.path
     moved = path.position[-1] - path.position[0]
@@ -31,21 +32,34 @@ def test_slope_pulls_downhill_whatever_the_heading() -> None:
     assert np.linalg.norm(moved) == pytest.approx(0.6 * steepest * turning, rel=1e-3)
 
 
-def test_slope_follows_pitch_and_roll_of_the_body() -> None:
-    run = simulate_run(
-        Scenario(
-            duration_s=40.0,
-            ground=Ground(pitch_rad=0.2),
-            effects={"slope_drift": 0.5},
-            start_pose=(0, 0, 1.0),
-        )
-    )
-    path = run.truth.path
-    k = np.flatnonzero(run.truth.motion.turning)[::777]
-    up = rotate(path.quaternion[k] * np.array([-1, -1, -1, 1]), np.tile([0.0, 0.0, 1.0], (k.size, 1)))
-    pushed = path.velocity[k, :2] - run.truth.motion.velocity[k, :2]
-    # sin(pitch) = -up_x, cos(pitch) sin(roll) = up_y.
-    np.testing.assert_allclose(pushed, -0.5 * up[:, :2], atol=2e-4)
+@pytest.mark.parametrize("effect", SLOPE_EFFECTS)
+@pytest.mark.parametrize("ground", [Ground(pitch_rad=0.2), Ground(hill_m=0.5, hill_length_m=15.0)])
+def test_slope_follows_pitch_and_roll_of_the_body(effect: str, ground: Ground) -> None:
+    driving = Program("teleop")
+    truth = simulate_run(
+        Scenario(duration_s=30.0, program=driving, ground=ground, effects={effect: 0.5}, start_pose=(0, 0, 1))
+    ).truth
+    path = truth.path
+    stride = round(truth.motion.v0.size / len(path.velocity))
+
+    def average(signal: np.ndarray) -> np.ndarray:
+        return signal.reshape(len(path.velocity), stride, -1).mean(axis=1).squeeze()
+
+    roll, pitch, _ = euler_from_quaternions(path.quaternion[:-1])
+    ahead, aside = np.sin(pitch), -np.cos(pitch) * np.sin(roll)
+    speed, turning = average(truth.motion.v0), average(truth.motion.turning)
+    channel, added = {
+        "slope_slip": (0, ahead * np.abs(speed)),
+        "slope_creep": (0, ahead * turning),
+        "side_slope_slip": (1, aside * np.abs(speed)),
+        "side_slope_creep": (1, aside * turning),
+        "side_slope_turn": (2, aside * speed),
+    }[effect]
+    moved = path.velocity - average(truth.motion.velocity)
+    assert np.abs(moved).max() > 0.01
+    expected = np.zeros_like(moved)
+    expected[:, channel] = 0.5 * added
+    np.testing.assert_allclose(moved, expected, atol=1e-12)
 
 
 @pytest.mark.long

@@ -19,7 +19,11 @@ EFFECTS = {
     "lateral_skid": 0.08,
     "speed_slip": 0.06,
     "turning_resistance": 0.2,
-    "slope_drift": 0.5,
+    "slope_creep": 0.5,
+    "slope_slip": 0.3,
+    "side_slope_creep": 0.4,
+    "side_slope_slip": 0.2,
+    "side_slope_turn": 0.1,
     "icr_offset": 0.1,
     "icr_lateral": -0.05,
     "transport_delay": 0.123,
@@ -39,9 +43,11 @@ def change(time: float, state: np.ndarray, asked: tuple[float, float]) -> list[f
     v0 = fade * (rim_left + rim_right) / 2
     w0 = fade * (rim_right - rim_left) / (1.7 * TRACK)
     turning = RADIUS * max(abs(left), abs(right)) > 0.01
-    downhill = 0.5 * np.sin(PITCH) * turning
-    v_x = z_x - 0.06 * v0 * abs(v0) - 0.2 * v0 * abs(w0) - 0.05 * w + downhill * np.cos(yaw)
-    v_y = z_y - 0.08 * v0 * w0 - 0.1 * w - downhill * np.sin(yaw)
+    ahead, aside = np.sin(PITCH) * np.cos(yaw), -np.sin(PITCH) * np.sin(yaw)
+    v_w = w + 0.1 * v0 * aside
+    v_x = z_x - 0.06 * v0 * abs(v0) - 0.2 * v0 * abs(w0) - 0.05 * v_w
+    v_x += (0.5 * turning + 0.3 * abs(v0)) * ahead
+    v_y = z_y - 0.08 * v0 * w0 - 0.1 * v_w + (0.4 * turning + 0.2 * abs(v0)) * aside
     return [
         (asked_left - left_wheel) / 0.35,
         (asked_right - right_wheel) / 0.35,
@@ -52,7 +58,7 @@ def change(time: float, state: np.ndarray, asked: tuple[float, float]) -> list[f
         (w0 - w) / 0.4,
         v_x * np.cos(yaw) - v_y * np.sin(yaw),
         v_x * np.sin(yaw) + v_y * np.cos(yaw),
-        w,
+        v_w,
     ]
 
 
@@ -78,5 +84,5 @@ def test_all_continuous_effects_together_agree_with_a_general_solver() -> None:
     in_plane = path.position[-1] / [np.cos(PITCH), 1.0, 1.0]
     # The path is some 15 m long; the threshold of turning wheels costs a fraction of a millimetre.
     assert in_plane[:2] == pytest.approx([x, y], abs=2e-3)
-    turned = np.sum(path.velocity[:, 2]) * scenario.step_s
+    turned = np.diff(path.time_s) @ path.velocity[:, 2]
     assert turned == pytest.approx(yaw, abs=2e-4)

@@ -42,7 +42,10 @@ def test_a_map_of_another_scale_is_the_wheels_radius(drive: TakeThrough) -> None
     "more",
     [
         {},
-        {"ground": Ground(pitch_rad=0.12), "effects": {"drive_lag": 0.3, "slope_drift": 0.6}},
+        {
+            "ground": Ground(pitch_rad=0.12),
+            "effects": {"drive_lag": 0.3, "slope_creep": 0.6, "side_slope_creep": 0.6},
+        },
         {"effects": {"drive_lag": 0.3, "effective_track": 1.8, "speed_slip": 0.1, "turning_resistance": 0.2}},
     ],
     ids=["plain", "slope", "slip"],

@@ -4,7 +4,7 @@
 
 pitch > 0 is nose down. k [m/s]: 0.6 takes 0.1 m/s of any speed on a slope of 10 degrees. It is the load
 torque over the gain of the speed controller, so that a controller with an integral part shows it for moments
-only. Without encoders it may be wheels that slip ahead. Drive a slope in several directions.
+only. Without encoders nothing distinguishes it from `slope_creep`. Drive a slope in several directions.
 
 Source: a speed controller's error under a steady load; Astrom and Murray, Feedback Systems, chapter 10.
 """
@@ -45,7 +45,9 @@ class GradeLoad(DriveEffect):
     ways = ("slower", "faster")
     size_in = math.sin(math.radians(10.0))
     needs = (Excitation.SLOPE,)
-    confused_with = ("slope_drift", "drive_gain")
+    confused_with = ("slope_slip", "drive_gain")
+    equivalent_to = ("slope_creep",)
+    equivalent_when = "if there are no encoders"
     python = """
         load = {k} / R * math.sin(pitch)
         left += load * (abs(left) * R > 0.01)
@@ -54,13 +56,17 @@ class GradeLoad(DriveEffect):
     def drive_wheels(self, wheels: Wheels, context: RunContext) -> Wheels:
         """See the formula above."""
         radius = context.vehicle.wheel_radius_m
-        load = self.values["k"] / radius * np.sin(context.attitude[:, 1])
+        load = self.values["k"] / radius * context.downhill[0]
 
         def carry(wheel: Floats) -> Floats:
             loaded: Floats = wheel + load * (radius * np.abs(wheel) > LEAST_RIM_SPEED)
             return loaded
 
         return replace(wheels, left=carry(wheels.left), right=carry(wheels.right))
+
+    def is_equivalent(self, conditions: Conditions) -> bool:
+        """Without encoders wheels that turn slower uphill are wheels that slip."""
+        return not conditions.encoders
 
     def can_show(self, conditions: Conditions) -> bool:
         """Not on level ground, nor where pitch was not recorded."""

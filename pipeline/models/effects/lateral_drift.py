@@ -21,7 +21,7 @@ class LateralDrift(LinearEffect):
     motion = "Lateral drift: {size:.2g} m/s to the {way} while the wheels turn"
     clause = "drifts {size:.2g} m/s to the {way} while its wheels turn"
     needs = (Excitation.BOTH_SIGNS,)
-    confused_with = ("yaw_misalignment", "slope_drift")
+    confused_with = ("yaw_misalignment", "side_slope_creep")
     python = "v_y = v_y + {c} * turning"
 
     def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:

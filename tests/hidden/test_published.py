@@ -1,0 +1,74 @@
+"""The benchmark `published`: questions with published answers, read from ids and numbers of a diagnosis."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import published
+import pytest
+
+import pipeline as slip
+
+
+def make_content(
+    *effects: tuple[str, str, float], undecided: tuple[list[str], ...] = ()
+) -> dict[str, object]:
+    return {
+        "effects": [{"id": name, "parameters": {key: {"value": value}}} for name, key, value in effects],
+        "undecided": [{"candidates": group} for group in undecided],
+    }
+
+
+def judge(content: dict[str, object]) -> str:
+    return published.judge_number("track", published.TRACK, content, "effective_track.k").verdict
+
+
+def test_a_number_is_right_within_its_margin_and_under_its_own_name() -> None:
+    assert judge(make_content(("effective_track", "k", 1.0141))) == "right"
+    assert judge(make_content(("effective_track", "k", 1.02))) == "wrong"
+    assert judge(make_content(("wheel_radius", "k", 1.0141))) == "wrong"
+    assert judge(make_content()) == "wrong"
+    assert judge(make_content(undecided=(["effective_track", "yaw_drift"],))) == "undecided"
+    assert judge({"refused": "too_short"}) == "refused"
+
+
+def test_an_open_question_needs_all_its_candidates_in_one_group() -> None:
+    wanted = {"effective_track", "wheel_asymmetry"}
+
+    def judge_group(content: dict[str, object]) -> str:
+        return published.judge_undecided("circles", wanted, content).verdict
+
+    assert judge_group(make_content(undecided=([*wanted, "yaw_drift"],))) == "right"
+    assert judge_group(make_content(undecided=(["effective_track"], ["wheel_asymmetry"]))) == "wrong"
+    assert judge_group(make_content(("effective_track", "k", 1.01))) == "wrong"
+
+
+def test_without_the_recordings_it_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    parser = argparse.ArgumentParser()
+    published.add_arguments(parser)
+    assert not published.run(parser.parse_args([str(tmp_path / "absent")]))
+    assert "not here" in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_models_are_off_by_what_was_published(tmp_path: Path) -> None:
+    folder = published.PUBLISHED / "optiodom_differential"
+    if not folder.is_dir():
+        pytest.skip("the public recordings are not here")
+    runs = published.analyze(sorted(folder.glob("diff_circular_*.mcap")), tmp_path)
+    position_m, heading_deg = published.find_largest(runs, None)
+    assert position_m == pytest.approx(0.162, abs=0.005)
+    assert heading_deg == pytest.approx(14.5, abs=0.3)
+    assert sum(published.measure_turns(run) > 0.0 for run in runs) == 3
+    right_m, left_m = 0.5 * 0.083402, 0.5 * 0.083462
+    radius_m = 0.5 * (right_m + left_m)
+    calibrated = (
+        slip.Model(runs[0].vehicle)
+        + slip.effect("wheel_radius", k=radius_m / 0.042)
+        + slip.effect("wheel_asymmetry", e=(right_m - left_m) / radius_m)
+        + slip.effect("effective_track", k=0.2015 / 0.2)
+    )
+    position_m, heading_deg = published.find_largest(runs, {"named_model": calibrated})
+    assert position_m < 0.035
+    assert heading_deg < published.HEADING_DEG
