@@ -60,23 +60,18 @@ class Answer:
         findings: value by id, None where it has none.
         undecided: ids of all groups.
         unobservable: ids.
-        immaterial: numbers of effects that are listed as too small to be felt.
         estimates: numbers of effects that were not named.
         detectable: how large numbers would have had to be to be seen.
         rivals: numbers of effects that are one explanation of several, each in the place of the others.
-        unless: by id of an effect that may act, too, its numbers and those of others beside it, and by id of
-            one that is said not to be significant, its estimates.
     """
 
     numbers: Mapping[str, Number]
     findings: Mapping[str, float | None] = field(default_factory=dict)
     undecided: Sequence[str] = ()
     unobservable: Sequence[str] = ()
-    immaterial: Mapping[str, Number] = field(default_factory=dict)
     estimates: Mapping[str, Number] = field(default_factory=dict)
     detectable: Mapping[str, float] = field(default_factory=dict)
     rivals: Mapping[str, Number] = field(default_factory=dict)
-    unless: Mapping[str, Mapping[str, Number]] = field(default_factory=dict)
 
     @property
     def names(self) -> set[str]:
@@ -89,12 +84,12 @@ class Answer:
 
     @property
     def mentioned(self) -> set[str]:
-        """Ids of the effects that are named, one explanation of several, or too small to be felt."""
-        return {label.split(".")[0] for label in (*self.numbers, *self.immaterial)} | {*self.undecided}
+        """Ids of the effects that are named, or one explanation of several."""
+        return self.names | {*self.undecided}
 
     def find_told(self, label: str) -> Number | None:
-        """A number that is told: of an effect that is named, too small to be felt, or one of several."""
-        return self.numbers.get(label) or self.immaterial.get(label) or self.rivals.get(label)
+        """A number that is told: of an effect that is named, or one of several."""
+        return self.numbers.get(label) or self.rivals.get(label)
 
     def find_number(self, label: str) -> Number:
         """What is known of a number: as told, as estimated, or that it is less than would have been seen."""
@@ -141,28 +136,10 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         {str(one["id"]): cast("float | None", one.get("value")) for one in findings},
         tuple(name for item in told.undecided for name in item.candidates),
         tuple(item.id for item in told.unobservable),
-        _list_numbers(told.immaterial),
         estimates,
         {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
         _list_values(pair for item in told.undecided for pair in item.numbers.items()),
-        _list_unless(told.effects) | _list_doubted(findings, estimates),
     )
-
-
-def _list_doubted(findings: Iterable[Mapping[str, Any]], estimates: Mapping[str, Number]) -> dict[str, Json]:
-    """Estimates of the effects that are said not to be significant, by id."""
-    ids = [str(one["where"]) for one in findings if one["id"] == "insignificant_effect"]
-    known = {name: {k: v for k, v in estimates.items() if k.startswith(f"{name}.")} for name in ids}
-    return {name: numbers for name, numbers in known.items() if numbers}
-
-
-def _list_unless(effects: Iterable[Named]) -> dict[str, dict[str, Number]]:
-    found: dict[str, dict[str, Number]] = {}
-    for effect in effects:
-        for one in effect.unless:
-            beside = _list_values([(one.id, one.parameters), (effect.id, one.instead)])
-            found.setdefault(one.id, {}).update(beside)
-    return found
 
 
 def _list_numbers(effects: Iterable[Named]) -> dict[str, Number]:
@@ -184,7 +161,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
         return "reported", []
     effects = {label.split(".")[0] for label in injection.numbers}
     along = {label.split(".")[0] for label in injection.along if comes_along(injection, label, before, after)}
-    expected = before.mentioned | find_foretold(before, after) | find_contained(before, after)
+    expected = before.mentioned | find_contained(before, after)
     extra = sorted(after.names - expected - effects - along)
     if injection.same:
         return _judge_same(before, after, extra), extra
@@ -210,10 +187,7 @@ def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, lis
 def _judge_same(before: Answer, after: Answer, extra: Sequence[str]) -> str:
     """Whether an answer is the same, or the same but for names that one of the two does not dare to say."""
     lost, come = before.names - after.mentioned, after.names - before.mentioned
-    expected = dict(before.numbers)
-    for name in come & find_foretold(before, after):
-        expected |= before.unless[name]
-    if not all(is_close(expected[label], after.numbers[label]) for label in shared(before, after)):
+    if not all(is_close(before.numbers[label], after.numbers[label]) for label in shared(before, after)):
         return "missed"
     if not lost and not come:
         return "recovered"
@@ -231,19 +205,6 @@ def _is_news(finding: str, before: Answer, after: Answer) -> bool:
         return False
     old, new = before.findings.get(finding), after.findings[finding]
     return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
-
-
-def find_foretold(before: Answer, after: Answer) -> set[str]:
-    """Names that the unchanged recording says may come, which came with the numbers that it says."""
-    return {
-        name
-        for name, numbers in before.unless.items()
-        if all(
-            is_close(number, after.numbers[label])
-            for label, number in numbers.items()
-            if label.startswith(f"{name}.") and label in after.numbers
-        )
-    }
 
 
 def is_recovered(injection: Injection, label: str, before: Answer, after: Answer) -> bool:

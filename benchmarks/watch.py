@@ -71,7 +71,7 @@ def look(log: Path, out: Path) -> dict[str, object]:
         diagnosis = cast("Content", outcome.summary.get("diagnosis") or {})
     except SlipError as error:
         diagnosis = {"error": str(error)}
-    kept = ("id", "clause", "tentative", "corrected", "parameters", "equivalent_to", "selection_frequency")
+    kept = ("id", "clause", "corrected", "parameters", "equivalent_to", "selection_frequency")
     effects = [
         {**{key: one[key] for key in kept}, "growth": {"evidence": {"t": [measure_t(one)]}}}
         for one in cast("list[Content]", diagnosis.get("effects") or [])

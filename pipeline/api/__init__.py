@@ -304,7 +304,7 @@ class Diagnosis:
 
     Attributes:
         verdict: one to three sentences for people.
-        effects: one row each: ``effect sentence tentative``.
+        effects: one row each: ``effect sentence``.
         parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
         ladder: held-out errors over 2 s, effect by effect: ``added t_mrmse_m r_mrmse_rad explained_share``.
         model: the model with these effects; None where nothing could be judged.
@@ -319,9 +319,8 @@ class Diagnosis:
             {
                 "effect": list(effects),
                 "sentence": [str(one["sentence"]) for one in effects.values()],
-                "tentative": [bool(one["tentative"]) for one in effects.values()],
             },
-            schema={"effect": pl.String, "sentence": pl.String, "tentative": pl.Boolean},
+            schema={"effect": pl.String, "sentence": pl.String},
         )
         self.parameters = tabulate_parameters(
             {f"{name}.{key}": mapping_in(mapping_in(one, "parameters"), key)

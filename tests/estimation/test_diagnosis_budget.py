@@ -12,7 +12,7 @@ from pipeline.core.compute import usual_budget
 from pipeline.estimation import diagnose_runs, parse_budget
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.selection import DiagnosisError
+from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from pipeline.estimation.acceptance import find_exceeded, find_implausible, is_nameable
+from pipeline.estimation.plausibility import find_exceeded, find_implausible, is_nameable
 from pipeline.models import find_effect
 from pipeline.models.parameter import Conditions, Largest
 

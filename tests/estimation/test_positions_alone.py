@@ -40,14 +40,14 @@ def _diagnose(scenario: Scenario, folder: Path) -> RunDiagnosis:
 def test_without_a_gyro_nothing_that_is_sideways_is_named_or_bounded(tmp_path: Path) -> None:
     told = _diagnose(replace(_DRIVE, imu=None), tmp_path)
     assert {"drive_lag", "effective_track"} <= {effect.id for effect in told.effects}
-    mentioned = {one.id for one in (*told.effects, *told.immaterial, *told.detectable)}
+    mentioned = {one.id for one in (*told.effects, *told.detectable)}
     assert not mentioned & _SIDEWAYS
     assert {one.id for one in told.unobservable} >= _SIDEWAYS
 
 
 def test_with_a_gyro_the_numbers_are_those_that_were_hidden(tmp_path: Path) -> None:
     told = _diagnose(replace(_DRIVE, imu=Imu()), tmp_path)
-    found = {one.id: one.parameters for one in (*told.effects, *told.immaterial)}
+    found = {one.id: one.parameters for one in told.effects}
     assert set(found) == set(_HIDDEN)
     assert found["effective_track"]["k"].value == pytest.approx(1.5, rel=0.01)
     assert found["lateral_skid"]["c"].value == pytest.approx(0.08, abs=0.005)

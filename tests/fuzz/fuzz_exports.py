@@ -119,7 +119,6 @@ def draw_model(rng: random.Random) -> str:
     lines += [f"{key} = {draw_number(rng, GEOMETRY[key])!r}" for key in given]
     known = [effect for effect in list_effects() if kind in effect.kinds or rng.random() < 0.002]
     effects = rng.sample(known, rng.choice((0, 1, 2, 5, 12)))
-    labels = []
     for effect in effects:
         lines += ["[[effect]]", f'id = "{effect.id}"']
         for one in effect.parameters:
@@ -128,17 +127,16 @@ def draw_model(rng: random.Random) -> str:
                 ends = sorted((draw_number(rng, one.typical), draw_number(rng, one.typical)))
                 interval = f", low = {ends[0]!r}, high = {ends[1]!r}" if rng.random() < 0.5 else ""
                 lines.append(f"{one.name} = {{ value = {value!r}{interval} }}")
-                labels.append(f"{effect.id}.{one.name}")
     if rng.random() < 0.5:
         bounds = rng.choice(("", ", bounds = [-1, 1]", ", bounds = [-1e300, 1e300]"))
         lines += ["[[effect]]", f'id = "{rng.choice(("wind", "a---", "é--", "x-y"))}"']
         lines += [f'v_y = "{rng.choice(FORMULAS)}"', f"k = {{ value = {draw_number(rng, 0.1)!r}{bounds} }}"]
     if rng.random() < 0.7:
-        lines += _draw_fit(rng, [effect.id for effect in effects], labels)
+        lines += _draw_fit(rng, [effect.id for effect in effects])
     return "\n".join(lines) + "\n"
 
 
-def _draw_fit(rng: random.Random, ids: list[str], labels: list[str]) -> list[str]:
+def _draw_fit(rng: random.Random, ids: list[str]) -> list[str]:
     source = rng.choice(("command", "measured", draw_name(rng)))
     lines = ["[fit]", f"input = {format_value(source)}", f"{format_value(draw_name(rng))} = 1"]
     if ids:
@@ -151,9 +149,6 @@ def _draw_fit(rng: random.Random, ids: list[str], labels: list[str]) -> list[str
         errors = ", ".join(repr(draw_number(rng, 0.1)) for _ in range(3))
         some = ", ".join(format_value(one) for one in ids[: rng.randint(0, len(ids))])
         lines += ["[[fit.ladder]]", f"effects = [{some}]", f"velocity_rms = [{errors}]"]
-    if labels:
-        lines += ["[[fit.unless]]", f"parameter = {format_value(rng.choice(labels))}"]
-        lines += [f"effect = {format_value(draw_name(rng))}", f"value = {draw_number(rng, 1.0)!r}"]
     return lines
 
 

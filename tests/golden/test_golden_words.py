@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 PRESETS = {vehicle.id: vehicle for vehicle in list_presets()}
 SHORT = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
 POOR = [{"id": "too_short", "text": "run: 9 s of driving. Drive longer.", "where": "diagnosis"}]
-SMALL = {"id": "lateral_skid", "parameters": {"c": {"value": 0.04, "undetermined": False}}}
-OPEN = {"id": "acceleration_limit", "parameters": {"limit": {"value": 143.0, "undetermined": True}}}
 TRACK, LAG, ASYMMETRY = {"k": 1.5}, {"tau": 0.3}, {"e": 0.02}
 CLOSE, FAR = [(0.055, 0.02)], [(0.4, 0.2)]
 UNDECIDED = [{"candidates": ["body_inertia", "lateral_skid"], "in_model": "body_inertia"}]
@@ -40,11 +38,6 @@ DRAWN = {
         {"effective_track": {"k": 1.79}, "turn_lag": {"tau_mean": 0.4, "tau_diff": 1.08}},
         [(1.06, 0.96), (0.44, 0.14), (0.1, 0.04)],
     ),
-    "something below the detection threshold": draw_diagnosis(
-        {"drive_lag": LAG}, [(1.0, 0.5), (0.3, 0.2)], immaterial=[SMALL, OPEN]
-    ),
-    "only that": draw_diagnosis({}, FAR, immaterial=[SMALL]),
-    "only that, and open": draw_diagnosis({}, FAR, immaterial=[OPEN]),
     "a third that removes less than a tenth": draw_diagnosis(
         {"effective_track": TRACK, "drive_lag": LAG, "wheel_asymmetry": ASYMMETRY},
         [(1.0, 0.5), (0.5, 0.05), (0.1, 0.04), (0.05, 0.02)],

@@ -11,7 +11,6 @@ from game.draw import draw_riddle, write_riddle
 from game.true_model import build_true
 
 from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
-from pipeline.estimation.floor import _take_away_changes, split_differences
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
@@ -47,38 +46,6 @@ def test_the_floor_is_what_the_true_model_leaves_though_no_model_is_asked(tmp_pa
     assert np.mean(np.abs(velocity - 1.0) < 0.2) >= 0.85
     assert np.abs(np.median(over_2s, axis=0) - 1.0).max() < 0.2
     assert np.mean(np.abs(over_2s - 1.0) < 0.3) >= 0.85
-
-
-def test_noise_below_what_can_be_resolved_is_not_reported_as_zero() -> None:
-    """Squares of differences that grow faster than any noise does, as on ice: their scatter bounds it."""
-    squares = np.array([0.0068, 0.0152, 0.0256, 0.034, 0.042])
-    for windows in (2_500, 250_000):
-        parts = split_differences(squares, windows)
-        noise = 1.5 * parts.jitter + parts.walk + parts.passing.sum()
-        standard_error = squares[0] * np.sqrt(2.0 * 1.7 / windows)
-        assert noise >= (2.0 - 1e-9) * standard_error
-        assert parts.lasting.sum() > 10.0 * noise
-    assert noise < 0.03 * squares[0]
-
-
-def test_noise_that_grows_with_turning_counts_as_often_as_the_vehicle_turns() -> None:
-    """As that of a localization by a laser: most driving is calm and straight, most error arises in turns."""
-    draw = np.random.default_rng(3)
-    turns = np.arange(4000) % 5 == 0
-    turning = np.where(turns, 0.8, 0.01) * draw.uniform(0.9, 1.1, 4000)
-    change = draw.normal(size=(4000, 4)) * np.where(turns, 0.5, 0.3)[:, None]
-    noise = draw.normal(size=(4000, 3)) * np.where(turns, 0.1, 0.01)[:, None]
-    square, _ = _take_away_changes(0.3 * change[:, :3] + noise, change, turning)
-    assert square == pytest.approx(0.5 * np.mean(noise**2, axis=0), rel=0.2)
-
-
-def test_gaps_without_pairs_of_windows_do_not_lower_the_noise() -> None:
-    squares = np.array([1.5e-4, 1e-4, 1e-4, 1e-4, 1e-4])
-    whole = split_differences(squares, 2_500).jitter
-    for unknown in ([2], [1, 2], [4]):
-        gaps = squares.copy()
-        gaps[unknown] = np.nan
-        assert split_differences(gaps, 2_500).jitter == pytest.approx(whole)
 
 
 def _measure_floor(effects: dict[str, dict[str, float]], folder: Path) -> float:

@@ -222,29 +222,6 @@ def test_what_a_change_makes_besides_is_no_extra_name_where_it_is_right() -> Non
     assert judge(commands, Answer({}), Answer({"drive_gain.g": (0.9, 0.01)})) == ("number", [])
 
 
-def test_a_name_that_was_foretold_is_no_news() -> None:
-    """With the numbers that were said it is at the edge of the evidence; with others it is one more name."""
-    same = BY_NAME["1 cm of noise"]
-    told = {"body_inertia": {"body_inertia.tau": (0.18, 0.02), "lateral_skid.c": (0.1, 0.02)}}
-    before = Answer({"lateral_skid.c": (0.27, 0.01)}, unless=told)
-    for tau, skid, verdict in (
-        (0.17, 0.11, ("edge", [])),
-        (0.9, 0.11, ("missed", ["body_inertia"])),
-        (0.17, 0.2, ("missed", [])),
-    ):
-        after = Answer({"lateral_skid.c": (skid, 0.01), "body_inertia.tau": (tau, 0.02)})
-        assert judge(same, before, after) == verdict
-    track = BY_NAME["track x 1.2"]
-    before = Answer({"effective_track.k": (1.5, 0.02), "lateral_skid.c": (0.27, 0.01)}, unless=told)
-    for tau, extra in ((0.17, []), (0.9, ["body_inertia"])):
-        numbers = {
-            "effective_track.k": (1.8, 0.02),
-            "lateral_skid.c": (0.1, 0.01),
-            "body_inertia.tau": (tau, 0.02),
-        }
-        assert judge(track, before, Answer(numbers)) == ("recovered", extra)
-
-
 def test_a_special_case_with_the_same_number_is_no_extra_name() -> None:
     wider, sliding = {"effective_track.k": (1.72, 0.02)}, {"contact_friction.k": (1.71, 0.02)}
     plain, noise = Answer({**sliding, "contact_friction.friction": (0.9, 0.2)}), BY_NAME["1 cm of noise"]

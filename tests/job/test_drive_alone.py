@@ -16,7 +16,7 @@ from verbs import print_verb, run_slip, run_verb
 from pipeline.core import SlipError
 from pipeline.estimation import Recording as Diagnosed
 from pipeline.estimation import choose_input, diagnose_runs, load_recording
-from pipeline.estimation.selection import DiagnosisError
+from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.verdict import NO_GROUND
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -98,7 +98,7 @@ def contains(number: dict[str, Any], truth: float) -> bool:
 
 def list_ids(diagnosis: dict[str, Any]) -> set[str]:
     """Every effect that a diagnosis mentions."""
-    ids = {one["id"] for name in ("effects", "immaterial") for one in diagnosis[name]}
+    ids = {one["id"] for one in diagnosis["effects"]}
     ids |= {name for one in diagnosis["undecided"] for name in one["candidates"]}
     ids |= {name for one in diagnosis["effects"] for name in one.get("equivalent_to", ())}
     return ids | {one["effect"] for one in diagnosis["detectable"]}

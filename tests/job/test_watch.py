@@ -320,10 +320,10 @@ def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
     assert seen[-1]["distance_m"] == pytest.approx(once["distance_m"], rel=0.05)
 
 
-def name(effect: str, t: float, *, tentative: bool = False) -> dict[str, object]:
+def name(effect: str, t: float) -> dict[str, object]:
     number = {"value": 1.8, "low": 1.7, "high": 1.9, "unit": "1"}
     return {
-        "id": effect, "clause": f"shows {effect}", "tentative": tentative, "corrected": False,
+        "id": effect, "clause": f"shows {effect}", "corrected": False,
         "parameters": {"k": number}, "growth": {"evidence": {"t": [1.0, t]}},
     }  # fmt: skip
 
@@ -331,7 +331,6 @@ def name(effect: str, t: float, *, tentative: bool = False) -> dict[str, object]
 def test_a_name_needs_more_evidence_than_in_a_finished_log_and_a_second_look() -> None:
     weak, strong = name("effective_track", 0.9 * RUNNING_T), name("effective_track", 1.1 * RUNNING_T)
     assert list_passing({"effects": [weak]}) == []
-    assert list_passing({"effects": [name("effective_track", 99.0, tentative=True)]}) == []
     assert list_passing({"effects": [strong]}) == ["effective_track"]
     assert list_stated({"effects": [strong]}, []) == []
     (stated,) = list_stated({"effects": [strong]}, ["effective_track"])

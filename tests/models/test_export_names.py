@@ -56,7 +56,6 @@ def make_named(kind: str, name: str) -> ModelFile:
         "input": name,
         "runs": [{"run": name, "terrain": name, "driven_speed_mps": 1.5, "driven_yaw_rate_radps": 1.0}],
         "undecided": [["drive_lag", name]],
-        "unless": [{"parameter": "wheel_radius.k", "effect": name, "value": 0.98}],
         name or "empty": name,
     }
     known = {"wheel_radius.k": (0.96, 0.98), "a---é.k": (0.0, 0.2), "body_speed_limit.limit": (0.8, 1.0)}

@@ -134,5 +134,5 @@ def test_effects_that_were_not_named_have_numbers_that_hold_the_truth() -> None:
         assert found["wheel_radius.k"].low < 1.0 < found["wheel_radius.k"].high
         # It is known as well as it is where it was named.
         with_skid = fit(seed, "lateral_skid")
-        named = estimate_intervals(with_skid.problem, with_skid).find("lateral_skid.c")
+        named = estimate_intervals(with_skid).find("lateral_skid.c")
         assert found["lateral_skid.c"].standard_error == pytest.approx(named.standard_error, rel=0.2)

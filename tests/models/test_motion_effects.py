@@ -208,7 +208,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
     problem = Problem([run], vehicle_of(vehicle), source)
     searched = tuple(kind() for kind in EFFECTS if kind.id in names)
     fitted = fit_model(problem, Model(problem.vehicle, searched))
-    estimates = estimate_intervals(problem, fitted)
+    estimates = estimate_intervals(fitted)
     for name, value in truth.items():
         item = estimates.find(f"{effect.id}.{name}")
         half = 0.5 * (item.high - item.low)

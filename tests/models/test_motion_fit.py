@@ -38,7 +38,7 @@ def test_several_effects_come_back_together() -> None:
     run = simulate(truth, duration_s=200.0)
     problem = Problem([run], HUSKY, Input.COMMAND)
     fitted = fit_model(problem, model_of(*truth))
-    estimates = estimate_intervals(problem, fitted)
+    estimates = estimate_intervals(fitted)
     expected = {
         "effective_track.k": 1.8,
         "turn_lag.tau_mean": 0.1,
@@ -84,7 +84,7 @@ def test_runs_share_a_parameter_or_have_their_own() -> None:
     runs = [simulate({"effective_track": k, "icr_offset": 0.1}, seed=i) for i, k in enumerate((1.5, 1.9))]
     problem = Problem(runs, HUSKY, Input.MEASURED)
     fitted = fit_model(problem, model_of("effective_track", "icr_offset"), per_run=["effective_track.k"])
-    estimates = estimate_intervals(problem, fitted)
+    estimates = estimate_intervals(fitted)
     own = [item for item in estimates.items if item.free.label == "effective_track.k"]
     assert [item.free.run for item in own] == [0, 1]
     assert [item.value for item in own] == pytest.approx([1.5, 1.9], abs=0.03)
@@ -122,7 +122,7 @@ def test_without_a_gyro_the_poses_own_heading_serves() -> None:
     problem = Problem([run], HUSKY, Input.COMMAND)
     assert not problem.comparisons[0].has_gyro
     fitted = fit_model(problem, model_of("effective_track", "heading_skew"))
-    skew = estimate_intervals(problem, fitted).find("heading_skew.d")
+    skew = estimate_intervals(fitted).find("heading_skew.d")
     assert skew.low < 0.1 < skew.high
     assert skew.high - skew.low < 0.1
     with_gyro = simulate({"effective_track": 1.7})
@@ -277,7 +277,7 @@ def test_slip_against_the_true_model_is_noise_where_slip_against_the_ideal_is_no
 
 def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:
     problem = Problem([simulate({}, duration_s=40.0)], HUSKY, Input.COMMAND)
-    item = estimate_intervals(problem, fit_model(problem, model_of("drive_lag"))).find("drive_lag.tau")
+    item = estimate_intervals(fit_model(problem, model_of("drive_lag"))).find("drive_lag.tau")
     assert item.low == item.free.bounds[0] > item.value - item.half
     # Other runs are weighed by all of it.
     assert item.deviation > (item.high - item.low) / 3.92
@@ -286,7 +286,7 @@ def test_an_interval_ends_where_the_number_can_be_no_smaller() -> None:
 
 def test_the_interval_of_a_threshold_ends_where_it_can_be_no_smaller() -> None:
     problem = Problem([simulate({}, duration_s=60.0)], HUSKY, Input.COMMAND)
-    item = estimate_intervals(problem, fit_model(problem, model_of("deadband"))).find("deadband.d")
+    item = estimate_intervals(fit_model(problem, model_of("deadband"))).find("deadband.d")
     assert 0.0 <= item.low <= item.value <= item.high < 0.5
 
 
@@ -298,7 +298,7 @@ def test_intervals_of_forty_seconds_hold_the_truth() -> None:
         track = float(np.random.default_rng(seed).uniform(1.3, 2.2))
         run = simulate({"effective_track": track}, seed=seed, duration_s=40.0)
         problem = Problem([run], HUSKY, Input.MEASURED)
-        item = estimate_intervals(problem, fit_model(problem, model_of("effective_track"))).items[0]
+        item = estimate_intervals(fit_model(problem, model_of("effective_track"))).items[0]
         held += item.low <= track <= item.high
     assert held >= 93
 
@@ -327,7 +327,7 @@ def test_nine_of_ten_intervals_hold_the_truth() -> None:
         for seed in range(10):
             run = simulate(truth, seed=100 + seed, duration_s=200.0)
             problem = Problem([run], HUSKY, Input.COMMAND)
-            estimates = estimate_intervals(problem, fit_model(problem, model_of(*truth)))
+            estimates = estimate_intervals(fit_model(problem, model_of(*truth)))
             for name, value in truth.items():
                 effect = find_effect(name)
                 numbers = value if isinstance(value, dict) else {effect.parameters[0].name: value}

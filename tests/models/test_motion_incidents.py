@@ -180,7 +180,7 @@ def fit(scenario: Scenario) -> dict[str, tuple[float, float, float]]:
     run = as_run(simulate_run(scenario))
     problem = Problem([run], HUSKY, Input.COMMAND)
     fitted = fit_model(problem, Model(HUSKY, tuple(find_effect(name)() for name in TRUTH)), exact=True)
-    items = estimate_intervals(problem, fitted).items
+    items = estimate_intervals(fitted).items
     return {item.free.label: (item.value, item.low, item.high) for item in items if item.free.effect}
 
 

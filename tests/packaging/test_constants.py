@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 from constants import choose_numbers, compare, replace_number
 
-from pipeline.estimation import search
+from pipeline.estimation import decision
 from pipeline.run import signals
 from pipeline.stages import align, pose_faults, timing, trust
 
@@ -30,7 +30,7 @@ def test_a_private_number_of_another_file_is_another_number() -> None:
 
 def test_without_files_all_rooms_that_decide_answers_are_asked() -> None:
     every = choose_numbers([], [])
-    assert ("pipeline.estimation.search", "_WHOLE", 0.9) in every
+    assert ("pipeline.estimation.decision", "EQUAL", 12.0) in every
     assert not any(module.startswith("pipeline.web") for module, _, _ in every)
-    (one,) = choose_numbers([Path(search.__file__)], ["_WHOLE"])
+    (one,) = choose_numbers([Path(decision.__file__)], ["EQUAL"])
     assert one in every

@@ -64,9 +64,7 @@ def named_in(results: Path, run: str) -> set[str]:
     named = set(file.model.ids)
     refused = {effect.id for effect in file.model if explain_refusal(effect, file.intervals)}
     # Nothing is held back of which the diagnosis is certain.
-    tentative = {effect["id"] for effect in told["effects"] if effect["tentative"]}
-    open_ = {name for group in told["undecided"] for name in group["candidates"]}
-    assert refused <= tentative | open_
+    assert refused <= {name for group in told["undecided"] for name in group["candidates"]}
     return named - refused
 
 
