@@ -259,7 +259,7 @@ class Search:
             simpler = effect.collapse() if effect.is_degenerate(self.conditions) else None
             known = {one.id for one in self.candidates} - set(fit.ids)
             if simpler is not None and simpler.id in known:
-                return self._fit(fit.state.drop([effect.id]).add(simpler))
+                return self._reduce(self._fit(fit.state.drop([effect.id]).add(simpler)), base)
             if effect.id in base.ids:
                 # An effect that another one makes superfluous goes with it.
                 return self._reduce(self._drop(fit, [effect.id]), base)

@@ -162,7 +162,7 @@ def join_covariance(fit: PartFit, normal: Floats) -> Floats:
     inverse = invert(normal)
     plain = fit.overdispersion * inverse
     white, part = fit.white, fit.part
-    label = part.run if part.run[-1] + 1 >= _FEWEST_RUNS else part.block
+    label = part.run if part.run[-1] + 1 >= _FEWEST_RUNS else part.unit
     count = int(label.max()) + 1
     if count < _FEWEST_RUNS:
         return plain
