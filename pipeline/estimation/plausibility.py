@@ -15,7 +15,7 @@ from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.estimation.fit import Fitted
+    from pipeline.estimation.model_fit import Fitted
 
 _AT_BOUND = 1e-3
 """Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
