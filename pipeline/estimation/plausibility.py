@@ -35,7 +35,7 @@ def is_nameable(effect: Effect, conditions: Conditions) -> bool:
 
 
 def is_too_small(effect: Effect, conditions: Conditions) -> bool:
-    """Whether all that keeps an effect from a name is its size: it may be there, and explain what others imitate."""
+    """Whether all that keeps an effect from a name is its size: others may only imitate it."""
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     return itself and find_implausible(effect) is None and not is_large_enough(effect, conditions)
 
