@@ -1,15 +1,15 @@
 """An examination: drawn logs taken through the stages once, then diagnosed by any version and scored.
 
     make bench NAME=game/freeze ARGS="write FOLDER --seeds 7701-7713 [--categories C] [--closed]"
-    make bench NAME=game/freeze ARGS="exam FOLDER [--jobs 2] [--answers NAME]"
+    make bench NAME=game/freeze ARGS="exam FOLDER [--jobs 2] [--answers NAME] [--input measured]"
     make bench NAME=game/freeze ARGS="compare FOLDER [--jobs 2] [--answers NAME]"
 
 `write` fills a folder for each log, CATEGORY/SEED: its tables in results, and what it hides in truth.json.
 It goes on where it was stopped. With --recordings it writes those of ../shared/logs, too. With --closed
 every second seed is driven in closed loop, wherever the category leaves the driving open. `exam` diagnoses
 the tables with the code as it is now, keeps the answers as NAME.json beside them, with the CPU time of each,
-and prints what is right, wrong, missed and covered, by category, by driving and by input. `compare` diagnoses
-once more. It prints of each log the largest relative difference of all numbers of the two answers and all
+and prints what is right, wrong, missed and covered, by category, driving, sensors and input. `compare`
+diagnoses once more. It prints of each log the largest relative difference of all numbers of the two answers and all
 else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
 """
 
@@ -36,7 +36,7 @@ from game.play import THREADS, parse_seeds, score_runs
 from game.score import TaskScore, list_misses
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
-from pipeline.job import Options
+from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.store import Store
@@ -123,20 +123,22 @@ def read_truth(case: Case, root: Path) -> Answer:
     return msgspec.json.decode((case.folder(root) / _TRUTH).read_bytes(), type=Answer)
 
 
-def answer(case: Case, root: Path, answers: str) -> tuple[list[dict[str, Any]], float]:
+def answer(
+    case: Case, root: Path, answers: str, inputs: Sequence[str] = INPUTS
+) -> tuple[list[dict[str, Any]], float]:
     """Diagnose a frozen log, and keep the answer beside its tables."""
-    said, spent = diagnose(case, root)
+    said, spent = diagnose(case, root, inputs)
     path = case.folder(root) / f"{answers}.json"
     path.write_text(json.dumps({"cpu_s": spent, "runs": said}, indent=1), encoding="utf-8")
     return said, spent
 
 
-def diagnose(case: Case, root: Path) -> tuple[list[dict[str, Any]], float]:
+def diagnose(case: Case, root: Path, inputs: Sequence[str] = INPUTS) -> tuple[list[dict[str, Any]], float]:
     """What `slip diagnose --json` says of a frozen log, and the CPU time that it took [s]."""
     read = [read_recording(manifest) for manifest in Store(case.folder(root) / _RESULTS).manifests()]
     begin = time.process_time()
     try:
-        answer = diagnose_runs([recording for _, recording in read], read[0][0])
+        answer = diagnose_runs([recording for _, recording in read], read[0][0], inputs=inputs)
         told = json.loads(json.dumps(answer.to_json()))
     except SlipError as error:
         told = [{"error": error.code, "effects": [], "undecided": [], "unobservable": []}]
@@ -233,12 +235,16 @@ class Marks:
     cpu_s: float
 
 
-def examine(case: Case, root: Path, answers: str) -> Marks:
+def examine(case: Case, root: Path, answers: str, inputs: Sequence[str] = INPUTS) -> Marks:
     """Diagnose a frozen log and score what was said."""
-    said, spent = answer(case, root, answers)
+    said, spent = answer(case, root, answers, inputs)
     truth = read_truth(case, root)
     driving = "closed loop" if truth.program == "closed loop" else "programs"
-    groups = (case.category, driving, f"input {said[0].get('input', 'none')}", "all")
+    tables = {
+        name for manifest in Store(case.folder(root) / _RESULTS).manifests() for name in manifest.tables
+    }
+    sensors = "encoders" if "wheels" in tables else "no encoders"
+    groups = (case.category, driving, sensors, f"by {said[0].get('input', 'none')}", "all")
     return Marks(groups, score_runs(truth, said, f"{case.category} {case.name}"), spent)
 
 
@@ -283,6 +289,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--recordings", action="store_true", help="write those of ../shared/logs, too")
     parser.add_argument("--closed", action="store_true", help="every second seed in closed loop")
     parser.add_argument("--answers", default=_ANSWERS, help="name under which `exam` keeps what was said")
+    parser.add_argument("--input", choices=["both", *INPUTS], default="both", help="for `exam`")
     parser.add_argument("--jobs", type=int, default=1)
 
 
@@ -304,7 +311,9 @@ def run(given: argparse.Namespace) -> None:
         if given.verb == "exam":
             drawn = [case for case in cases if case.category != RECORDED]
             count = len(drawn)
-            marks = list(pool.map(examine, drawn, [given.folder] * count, [given.answers] * count))
+            inputs = INPUTS if given.input == "both" else (given.input,)
+            same = ([one] * count for one in (given.folder, given.answers, inputs))
+            marks = list(pool.map(examine, drawn, *same))
             print(*write_marks(marks), sep="\n")
             return
         ratios: dict[str, list[float]] = {}

@@ -45,7 +45,8 @@ def read_run(run: Json) -> Answer:
     return Answer(
         effects,
         same_as,
-        not (effects or undecided or other),
+        # What was refused denies nothing.
+        not (effects or undecided or other or "error" in run),
         undecided,
         frozenset(map(str, _list(run, "unobservable"))),
         other,

@@ -23,10 +23,10 @@ from pipeline.estimation.context import Context, DiagnosisError, prepare
 from pipeline.estimation.decision import Search
 from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
 from pipeline.estimation.encoder_scale import find_encoder_scale
-from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.ladder import climb
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import (
     Prediction,
     Problem,

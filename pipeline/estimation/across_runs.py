@@ -27,8 +27,9 @@ from pipeline.core import CONFIDENCE, format_share
 from pipeline.core.arrays import Floats, Ints
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.decision import list_costs
-from pipeline.estimation.fit import Fitted, PartFit, fit_model, invert
+from pipeline.estimation.fit import PartFit, invert
 from pipeline.estimation.folds import HeldOut, number_predictions
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Prior, State

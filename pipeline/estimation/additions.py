@@ -16,7 +16,6 @@ from pipeline.core import format_share
 from pipeline.estimation.candidates import Screen
 from pipeline.estimation.context import Context
 from pipeline.estimation.decision import LEAST_T, measure_t
-from pipeline.estimation.fit import Fitted
 from pipeline.estimation.folds import Errors, number_predictions
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import (
@@ -29,6 +28,7 @@ from pipeline.estimation.ladder import (
     raises_errors,
 )
 from pipeline.estimation.learned_step import explain_no_help
+from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model
 from pipeline.models.catalogue import explain_idle
 from pipeline.models.learned_term import LEARNED

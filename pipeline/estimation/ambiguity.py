@@ -25,8 +25,8 @@ from pipeline.sources import Vehicle
 
 if TYPE_CHECKING:
     from pipeline.estimation.context import Context
-    from pipeline.estimation.fit import Fitted
     from pipeline.estimation.ladder import Judgement
+    from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import State
 
 DETECTED = LEAST_T + 1.3

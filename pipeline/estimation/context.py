@@ -110,9 +110,7 @@ class Context:
         return tuple(
             cast("Candidate", effect)
             for effect in list_effects()
-            if self.vehicle.kind in effect.kinds
-            and effect.place in _DRIVETRAIN
-            and self._can_show(effect())
+            if self.vehicle.kind in effect.kinds and effect.place in _DRIVETRAIN and self._can_show(effect())
         )
 
 

@@ -45,12 +45,12 @@ LEAST_TURN_RAD = 0.0025
 """Heading change over 2 s that it must make otherwise [rad]: a quarter of such a cell beside the path."""
 _FELT_S = 2.0
 _UNUSUAL = 8.0
-"""Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than a
-wrong track, a lag or a limit."""
+"""Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than
+a wrong track, a lag or a limit."""
 SHOWN = 0.05
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
 _RISEN = 2.0
-"""Standard errors beyond which a rise of a held-out error is no chance: it may not exceed the largest fall."""
+"""Standard errors beyond which a rise of a held-out error is no chance, and may not exceed the largest fall."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
 _MOST_EFFECTS = 8
@@ -259,7 +259,7 @@ class Search:
             simpler = effect.collapse() if effect.is_degenerate(self.conditions) else None
             known = {one.id for one in self.candidates} - set(fit.ids)
             if simpler is not None and simpler.id in known:
-                return self._fit(fit.state.drop([effect.id]).add(simpler))
+                return self._reduce(self._fit(fit.state.drop([effect.id]).add(simpler)), base)
             if effect.id in base.ids:
                 # An effect that another one makes superfluous goes with it.
                 return self._reduce(self._drop(fit, [effect.id]), base)
@@ -426,7 +426,7 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
 
 
 def _is_material(part: Part, change: Floats) -> bool:
-    """Whether a change of the predicted increments is felt over two seconds, root mean square over the run."""
+    """Whether a change of the predicted increments is felt over two seconds, as its rms over the run."""
     length = max(round(_FELT_S / float(np.median(part.spans))), 1)
     sums = np.cumsum(np.concatenate((np.zeros((1, 3)), change)), axis=0)
     length = min(length, change.shape[0])

@@ -12,8 +12,8 @@ import numpy as np
 
 from pipeline.core import finite_or_none, format_angle, format_digits, format_length, format_share
 from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.estimation.fit import Fitted
 from pipeline.estimation.intervals import narrow_part
+from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.models.catalogue import find_effect
 from pipeline.run.windows import NODE_S

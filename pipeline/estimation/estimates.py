@@ -13,10 +13,11 @@ from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
 from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import BREVITY
-from pipeline.estimation.fit import Fitted, PartFit, invert
+from pipeline.estimation.fit import PartFit, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_part
 from pipeline.estimation.ladder import Judgement
+from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.state import State
 from pipeline.estimation.verdict import SEARCH_CUT
 from pipeline.estimation.window_residuals import count_seconds

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from pipeline.estimation.comparison import Comparison
-    from pipeline.estimation.fit import Fitted
+    from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import State
     from pipeline.estimation.window_residuals import WindowResiduals

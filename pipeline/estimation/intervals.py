@@ -15,7 +15,8 @@ from pipeline.models.parameter import cut_interval, stands_at_bound
 
 if TYPE_CHECKING:
     from pipeline.core.arrays import Floats
-    from pipeline.estimation.fit import Fitted, PartFit
+    from pipeline.estimation.fit import PartFit
+    from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import Free
 
 _ALWAYS_CARRIED = 0.25

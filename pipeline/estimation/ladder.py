@@ -13,10 +13,10 @@ import numpy as np
 
 from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick, round_digits
 from pipeline.core.arrays import Floats
-from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models.model import Model, Timing

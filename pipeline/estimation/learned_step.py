@@ -19,7 +19,6 @@ from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, format_share, pick
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.error_regions import ABOVE_FLOOR
-from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import (
     Errors,
     HeldOut,
@@ -39,6 +38,7 @@ from pipeline.estimation.ladder import (
     list_rises,
     read_error,
 )
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.state import State
 from pipeline.estimation.window_residuals import CLIP

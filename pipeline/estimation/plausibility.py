@@ -15,7 +15,7 @@ from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from pipeline.estimation.fit import Fitted
+    from pipeline.estimation.model_fit import Fitted
 
 _AT_BOUND = 1e-3
 """Fraction of a parameter's range; a value closer than this to a bound is at the bound."""
@@ -35,7 +35,7 @@ def is_nameable(effect: Effect, conditions: Conditions) -> bool:
 
 
 def is_too_small(effect: Effect, conditions: Conditions) -> bool:
-    """Whether all that keeps an effect from a name is its size: it may be there, and explain what others imitate."""
+    """Whether all that keeps an effect from a name is its size: others may only imitate it."""
     itself = _has_its_sign(effect) and not effect.is_degenerate(conditions)
     return itself and find_implausible(effect) is None and not is_large_enough(effect, conditions)
 

@@ -12,9 +12,10 @@ import numpy as np
 from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
 from pipeline.core.compute import Newest
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
-from pipeline.estimation.fit import Fitted, PartFit, fit_model
+from pipeline.estimation.fit import PartFit
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, Fold, HeldOut, find_near, hold_out, make_folds
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.estimation.window_residuals import WindowResiduals

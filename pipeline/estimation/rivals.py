@@ -24,9 +24,9 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import CONFIDENCE, JSON_DIGITS, SlipError, finite_or_none
 from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, robust_spreads, student_quantile
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
 from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models.effect import AddedEffect, Effect, Place
@@ -37,8 +37,8 @@ from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
 from pipeline.run.windows import WINDOW_S
 
 if TYPE_CHECKING:
-    from pipeline.estimation.fit import Fitted
     from pipeline.estimation.folds import HeldOut
+    from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import State
 
 

@@ -16,11 +16,11 @@ from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
-from pipeline.estimation.fit import Fitted, fit_model
 from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, note_fit, step_as_json
 from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
+from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,

@@ -85,6 +85,11 @@ def test_a_name_counts_for_another_only_where_both_are_the_same_thing() -> None:
     assert _score("icr_lateral", _name("icr_lateral", "icr_offset")) == ("right", ("icr_offset",))
 
 
+def test_a_log_that_was_refused_is_missed_and_not_denied() -> None:
+    assert _score("drive_lag", {"effects": []}) == ("wrong", ("none",))
+    assert _score("drive_lag", {"error": "too_short", "effects": []}) == ("abstained", ())
+
+
 def test_each_run_has_a_clock_of_its_own() -> None:
     number = {"value": 0.1, "low": 0.05, "high": 0.15}
     run = {"effects": [{"id": "clock_offset", "parameters": {"d": number}}]}

@@ -1,0 +1,128 @@
+"""A model fitted to runs, part by part of the way from command to motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+from pipeline.estimation.candidates import Screen, Unset
+from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.models.model import Model
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.core.arrays import Floats
+    from pipeline.estimation.parts import Part
+    from pipeline.estimation.problem import Problem
+    from pipeline.estimation.state import Free, State
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A model fitted to runs.
+
+    Attributes:
+        problem: the runs.
+        state: model, per-run values and delays.
+        fits: the fit of each part of the path.
+    """
+
+    problem: Problem = field(repr=False)
+    state: State
+    fits: tuple[PartFit, ...] = field(repr=False)
+
+    @cached_property
+    def residuals(self) -> Floats:
+        """Residuals in windows of the whole path, shape (n, 3)."""
+        return self.problem.find_residuals(self.state)
+
+    @property
+    def model(self) -> Model:
+        """The fitted model with the effects that act on the input."""
+        return Model(self.problem.vehicle, self.state.effects)
+
+    @property
+    def free(self) -> tuple[Free, ...]:
+        """All fitted parameters."""
+        return tuple(number for fit in self.fits for number in fit.free)
+
+    @property
+    def per_run(self) -> tuple[str, ...]:
+        """Labels ``effect.name`` of the parameters with one fitted value per run."""
+        own = (number.label for number in self.free if number.effect and number.run is not None)
+        return tuple(dict.fromkeys(own))
+
+
+def fit_model(
+    problem: Problem,
+    model: Model,
+    *,
+    per_run: Sequence[str] = (),
+    start: Fitted | None = None,
+    exact: bool = False,
+) -> Fitted:
+    """Fit a model's free parameters and the recording's delays.
+
+    If wheels are measured as well as commanded, effects of the drivetrain are fitted from the command to
+    the wheels and those of the ground from the wheels to the body: the unexplained residual of one part
+    does not bias the parameters of the other.
+
+    Args:
+        problem: the runs.
+        model: effects at neutral values are searched from several starts; others start at their values.
+        per_run: labels ``effect.name`` or ids with one value per run.
+        start: a fit of nearly the same model, from whose values those of common effects start.
+        exact: iterate until the parameters converge, so that the same model has the same estimates from
+            every start; otherwise until the likelihood converges, which is enough to compare models.
+
+    Returns:
+        The fit; for a parameter at its bound, the data would fit better beyond it.
+    """
+    known = () if start is None else start.state.hold([e for e in start.state.effects if e.id in model])
+    state = problem.start_state(known)
+    effects = problem.active_effects(model)
+    common = {effect.id: effect for effect in state.effects}
+    fits: list[PartFit] = []
+    for part in problem.parts:
+        mine = state.hold([common.get(effect.id, effect) for effect in effects if part.owns(effect)])
+        begin = (part, mine.effects, mine.timing, repr(mine.own), tuple(per_run), exact)
+        fit = problem.fits.recall(begin, partial(_fit_from, problem, part, mine, per_run, exact=exact))
+        fits.append(fit)
+        own = {run: {**state.own.get(run, {}), **numbers} for run, numbers in fit.state.own.items()}
+        state = replace(fit.state, effects=state.effects, own={**state.own, **own}).add(*fit.state.effects)
+    acting = {effect.id for effect in effects}
+    return Fitted(problem, state.hold([one for one in state.effects if one.id in acting]), tuple(fits))
+
+
+def _fit_from(problem: Problem, part: Part, state: State, per_run: Sequence[str], *, exact: bool) -> PartFit:
+    """The fit from a state; effects without values start where they promise most, one after the other."""
+    fresh = [
+        effect
+        for effect in state.effects
+        if effect.fixed != {parameter.name for parameter in effect.parameters}
+        # A value shared by all runs is no start for the clock of each run.
+        and (effect.is_neutral or (effect.id in part.clocks and not state.has_own(effect.id)))
+    ]
+    fit = fit_part(part, state.drop([effect.id for effect in fresh]), per_run=per_run)
+    for effect in fresh:
+        extended = fit.state.add(effect)
+        starts = Screen(fit, [Unset(effect)], problem.largest).list_starts()
+        if starts:
+            extended = starts[0].add_to(fit.state)
+            started = extended.find(effect.id)
+            # Values that the start does not change may be fitted here.
+            extended = extended if started is None else extended.add(effect.change(**started.values))
+        fit = fit_part(part, extended, noise=fit.noise, per_run=per_run)
+    if exact:
+        fit = fit_part(part, fit.state, per_run=per_run, exact=True)
+        fit = _write_down(fit)
+    return replace(fit, state=fit.state.centred)
+
+
+def _write_down(fit: PartFit) -> PartFit:
+    """The fit at values as model files have them."""
+    part, state = fit.part, fit.state.hold([effect.rounded for effect in fit.state.effects])
+    residual = part.find_residuals(state)
+    return replace(fit, state=state, residual=residual)
