@@ -10,46 +10,181 @@ import pytest
 from game.closed_loop import close_loop
 from motion_runs import as_run, make_scenario, simulate, vehicle_of
 
-from pipeline.core.compute import Budget
 from pipeline.estimation import Input
 from pipeline.estimation.ambiguity import find_undecided
 from pipeline.estimation.context import prepare
-from pipeline.estimation.decision import LEAST_T, Found, Search, judge, make_folds, measure_t
+from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, make_folds, measure_t
 from pipeline.estimation.fit import fit_part
 from pipeline.estimation.intervals import estimate_part
-from pipeline.estimation.parts import BLOCK_S
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import find_effect
-from pipeline.simulate import VEHICLES, Disturbance, PoseSensor, Program, simulate_run
+from pipeline.simulate import Disturbance, Encoders, Program, simulate_run
+from pipeline.simulate.programs import Commands
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection
 
+    from pipeline.estimation.decision import Found
+    from pipeline.estimation.state import State
+    from pipeline.models import Effect
     from pipeline.run import MotionRun
+    from pipeline.simulate import State as Moment
 
 HUSKY = vehicle_of("husky_a200")
 USUAL = Disturbance(0.03, 0.05)
-QUIET = Disturbance(0.003, 0.004)
+BY_HAND = Program("teleop")
 
 
-def drive(effects: Mapping[str, object], seed: int = 1, **more: object) -> MotionRun:
-    """A minute of driving by hand, or more."""
-    usual = {"duration_s": 60.0, "program": Program("teleop"), "disturbance": USUAL}
-    return simulate(effects, seed=seed, **{**usual, **more})  # type: ignore[arg-type]
+def drive(effects: object, **more: object) -> MotionRun:
+    """A minute of driving by hand, or as is asked."""
+    usual = {"duration_s": 60.0, "program": BY_HAND, "disturbance": USUAL}
+    return simulate(effects, **{**usual, **more})  # type: ignore[arg-type]
 
 
-def open_search(run: MotionRun, source: Input = Input.MEASURED, names: Sequence[str] = ()) -> Search:
-    """A search on the path behind the wheels; of some candidates, or of all."""
-    context = prepare([run], HUSKY, source)
-    candidates = context.list_candidates(source)
-    chosen = tuple(one for one in candidates if not names or one.id in names)
-    return Search(context.problem.parts[0], chosen, context.conditions)
+def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, Found, State]:
+    """The ground searched from the wheels, with candidates of these names or with all; and its start."""
+    context = prepare(runs, HUSKY, Input.MEASURED)
+    candidates = [one for one in context.list_candidates(Input.MEASURED) if not names or one.id in names]
+    made = Search(context.problem.parts[0], tuple(candidates), context.conditions)
+    start = context.problem.start_state()
+    return made, made.run(start), start
 
 
-def find(run: MotionRun, names: Sequence[str] = ()) -> tuple[Search, Found]:
-    search = open_search(run, names=names)
-    return search, search.run(search.part.comparisons and start_of(search))
+def judge_alone(run: MotionRun, effect: Effect) -> Judged:
+    """How one effect beside nothing is judged."""
+    made, found, start = search(run, names=(effect.id,))
+    return judge(found.start, fit_part(made.part, start.add(effect)), made.conditions)
 
 
-def start_of(search: Search) -> object:
-    raise NotImplementedError
+@pytest.mark.parametrize("seed", range(20))
+def test_nothing_is_named_where_only_noise_was_drawn(seed: int) -> None:
+    """A third in closed loop: a driver who steers against drift makes commands that follow residuals."""
+    scenario = make_scenario({}, seed=seed, duration_s=60.0, program=BY_HAND, disturbance=USUAL)
+    if seed % 3 == 0:
+        scenario = close_loop(scenario, np.random.default_rng(seed))
+    _, found, _ = search(as_run(simulate_run(scenario)))
+    assert found.new == ()
+
+
+def test_a_hidden_track_is_named_with_an_interval_that_holds_it() -> None:
+    _, found, _ = search(drive({"effective_track": 1.6}))
+    assert found.new == ("effective_track",)
+    number = estimate_part(found.final).find("effective_track.k")
+    assert number.low < 1.6 < number.high
+    assert number.high - number.low < 0.2
+    judged = found.judged["effective_track"]
+    assert judged.gain > 0.0
+    assert judged.frequency > 0.95
+    assert np.nanmax(judged.falls) > 0.05
+
+
+@pytest.mark.parametrize(("turns", "is_named"), [(1, False), (2, True)])
+def test_what_ten_seconds_bring_is_refused(turns: int, *, is_named: bool) -> None:
+    times = np.arange(0.0, 90.0, 0.05)
+    turn = np.zeros(times.size)
+    for number in range(turns):
+        turn[(times > 20.0 + 30.0 * number) & (times < 27.0 + 30.0 * number)] = 0.6
+    speed = np.where((times > 2.0) & (times < 88.0), 0.8, 0.0)
+    run = drive({"effective_track": 1.6}, duration_s=90.0, played=Commands(times, speed, turn))
+    judged = judge_alone(run, find_effect("effective_track")(k=1.5))
+    assert measure_t(judged.fit, judged.fit.state.effects[0], judged.base) > 1.5 * LEAST_T
+    assert judged.refusal == ("" if is_named else "ten seconds bring it all")
+
+
+def test_what_nobody_would_notice_has_no_name_however_evident_it_is() -> None:
+    run = drive({"effective_track": 1.006}, disturbance=Disturbance())
+    judged = judge_alone(run, find_effect("effective_track")(k=1.1))
+    assert measure_t(judged.fit, judged.fit.state.effects[0], judged.base) > 2.0 * LEAST_T
+    assert judged.refusal
+    _, found, _ = search(run, names=("effective_track",))
+    assert found.new == ()
+    # It explains all the same what others would only imitate.
+    assert found.final.ids == ("effective_track",)
+
+
+def test_a_lag_that_sampling_makes_has_no_name_and_keeps_a_limit_from_one() -> None:
+    run = drive({"drive_lag": 0.02}, encoders=Encoders(rate_hz=20.0, noise_radps=0.003))
+    context = prepare([run], HUSKY, Input.COMMAND)
+    part, start = context.problem.parts[1], context.problem.start_state()
+    found = Search(part, context.list_drivetrain(), context.conditions).run(start)
+    assert found.new == ()
+    assert found.final.ids == ("drive_lag",)
+
+
+def test_of_two_effects_that_do_the_same_both_are_reported() -> None:
+    """Where nothing but turning on the spot was driven, radius and track are one number."""
+    made, found, _ = search(drive({"effective_track": 1.3}, program=Program("spins")))
+    (chosen,) = found.new
+    (group,) = find_undecided(made, found)
+    assert chosen in group.candidates
+    assert {"effective_track", "wheel_radius"} <= set(group.candidates)
+    assert group.separate_by
+    for name in ("effective_track", "wheel_radius"):
+        (value,) = group.numbers[name].values()
+        expected = 1.3 if name == "effective_track" else 1.0 / 1.3
+        assert value.low < expected < value.high
+
+
+def test_a_refusal_says_why() -> None:
+    run = drive({"effective_track": 1.6})
+    reasons = {
+        effect.id: judge_alone(run, effect).refusal
+        for effect in (
+            find_effect("effective_track")(k=1.5),
+            find_effect("lateral_drift")(c=0.01),
+            find_effect("turning_resistance")(k=0.05),
+        )
+    }
+    assert reasons["effective_track"] == ""
+    assert reasons["lateral_drift"].startswith("lateral_drift: t = ")
+    assert reasons["turning_resistance"].startswith("turning_resistance: ")
+
+
+def test_more_shapes_ask_for_more_evidence() -> None:
+    made, _, _ = search(drive({}))
+    few, many = made._least_t, replace(made, shapes=1000)._least_t
+    assert few == LEAST_T
+    assert many**2 - few**2 == pytest.approx(2.0 * np.log(1000.0))
+
+
+def test_a_limit_counts_by_its_inverse_and_several_numbers_cost_evidence() -> None:
+    made, found, start = search(drive({"effective_track": 1.6}))
+    assert measure_t(found.final, found.final.state.effects[0]) > LEAST_T
+    # A second number that brings nothing costs one of chi-square.
+    both = fit_part(made.part, start.add(find_effect("terrain_change")(k_v=0.99, k_w=0.7, at_s=30.0)))
+    change = both.state.effects[0]
+    one = abs(change.values["k_w"] - 1.0) / np.sqrt(both.covariance[1, 1])
+    assert measure_t(both, change) > 0.5 * one
+
+
+def test_blocks_are_held_out_of_one_run_and_runs_of_three() -> None:
+    runs = [drive({}, seed=seed, duration_s=45.0) for seed in range(3)]
+    one = search(runs[0], names=("effective_track",))[0].part
+    assert [np.unique(make_folds(one)[one.block == block]).size for block in range(int(one.block.max()) + 1)]
+    three = search(*runs, names=("effective_track",))[0].part
+    folds = make_folds(three)
+    assert all(np.unique(folds[three.run == run]).size == 1 for run in range(3))
+    assert np.unique(folds).size == 3
+
+
+def _push_sideways(moment: Moment) -> tuple[float, float, float]:
+    """What no effect of the catalogue does."""
+    return 0.0, 0.15 * abs(moment.w0), 0.0
+
+
+def test_what_only_a_formula_explains_is_one() -> None:
+    made, found, _ = search(drive({}, duration_s=90.0, extra=_push_sideways))
+    assert found.new == ()
+    _, formula = search_formula(made, found, sideways=False)
+    assert formula is not None
+    assert formula.formulas == {"v_y": "k_1 * abs(w0)"}
+    assert formula.values["k_1"] == pytest.approx(0.15, abs=0.03)
+
+
+def test_a_term_that_an_effect_of_the_catalogue_explains_as_well_is_no_formula() -> None:
+    made, found, _ = search(drive({"turning_resistance": 0.2}))
+    assert found.new == ("turning_resistance",)
+    assert search_formula(made, found, sideways=False) == (found, None)
+    # Not even where it was not accepted.
+    refused = replace(found, final=found.start, new=(), judged={}, screen=made.screen(found.start))
+    assert search_formula(made, refused, sideways=False)[1] is None
