@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 _ENOUGH = 0.01
 """Fall of chi-square below which a step is not worth taking."""
 _SETTLED = 1e-7
-"""The same for a model that is written: from the same values it ends at the same values."""
+"""The same for a model that is written, and for its noise: it ends at the same values from every start."""
 _NEWS = 0.02
 """Relative fall of the cost above which derivatives are computed anew."""
 _MOST_STEPS = 20
@@ -218,18 +218,17 @@ def fit_part(
             if not number.is_smooth:
                 fit = _walk_grid(fit, number, enough)
         learned = part.learn(fit.residual, None if exact else fit.noise)
-        is_same = _is_same(learned, fit.noise)
-        if is_same:
+        if _is_same(learned, fit.noise, _SETTLED if exact else _SAME_NOISE):
             break
         fit = replace(fit, noise=learned)
     return fit
 
 
-def _is_same(one: Noise, other: Noise) -> bool:
+def _is_same(one: Noise, other: Noise, tolerance: float) -> bool:
     sizes = one.spread, other.spread
     apart = [one.correlation - other.correlation, one.share - other.share]
     apart.append((sizes[0] - sizes[1]) / np.maximum(sizes[1], 1e-300))
-    return bool(np.abs(apart)[:, other.known].max(initial=0.0) < _SAME_NOISE)
+    return bool(np.abs(apart)[:, other.known].max(initial=0.0) < tolerance)
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:

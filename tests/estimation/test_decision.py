@@ -1,8 +1,9 @@
-"""The one decision: what is named is there, holds its number, and is more than chance, an event or a trifle."""
+"""The one decision: what is named is there, and is more than chance, an event or a trifle."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,8 +17,9 @@ from pipeline.estimation.context import prepare
 from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, make_folds, measure_t
 from pipeline.estimation.fit import fit_part
 from pipeline.estimation.intervals import estimate_part
+from pipeline.estimation.state import State
 from pipeline.estimation.unexplained import search_formula
-from pipeline.models import find_effect
+from pipeline.models import Timing, find_effect
 from pipeline.simulate import Disturbance, Encoders, Program, simulate_run
 from pipeline.simulate.programs import Commands
 
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection
 
     from pipeline.estimation.decision import Found
-    from pipeline.estimation.state import State
+    from pipeline.estimation.fit import PartFit
     from pipeline.models import Effect
     from pipeline.run import MotionRun
     from pipeline.simulate import State as Moment
@@ -148,13 +150,17 @@ def test_more_shapes_ask_for_more_evidence() -> None:
 
 
 def test_a_limit_counts_by_its_inverse_and_several_numbers_cost_evidence() -> None:
-    made, found, start = search(drive({"effective_track": 1.6}))
-    assert measure_t(found.final, found.final.state.effects[0]) > LEAST_T
-    # A second number that brings nothing costs one of chi-square.
-    both = fit_part(made.part, start.add(find_effect("terrain_change")(k_v=0.99, k_w=0.7, at_s=30.0)))
-    change = both.state.effects[0]
-    one = abs(change.values["k_w"] - 1.0) / np.sqrt(both.covariance[1, 1])
-    assert measure_t(both, change) > 0.5 * one
+    limit, change = find_effect("body_speed_limit")(limit=2.0), find_effect("side_lag")
+    sides = change(tau_left=0.3, tau_right=0.4)
+
+    def make_fit(effect: Effect, *errors: float) -> PartFit:
+        state = State((effect,), (Timing(),))
+        free = tuple(number for number in state.list_free(()) if number.effect)
+        return SimpleNamespace(free=free, state=state, covariance=np.diag(np.square(errors)))  # type: ignore[return-value]
+
+    # No limit is at infinity: a limit that is known to a tenth is ten standard errors from none.
+    assert measure_t(make_fit(limit, 0.2), limit) == pytest.approx(10.0)
+    assert measure_t(make_fit(sides, 0.1, 0.1), sides) ** 2 == pytest.approx(9.0 + 16.0 - 1.0)
 
 
 def test_blocks_are_held_out_of_one_run_and_runs_of_three() -> None:

@@ -10,9 +10,9 @@ import pytest
 
 from pipeline.core.compute import usual_budget
 from pipeline.estimation import diagnose_runs, parse_budget
+from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
@@ -59,7 +59,7 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
     vehicle, recording = read_recording(manifest)
     monkeypatch.setattr(
         "pipeline.estimation.problem.estimate_floor",
-        lambda problem: replace(estimate_floor(problem), t_mrmse_m=0.0, r_mrmse_rad=0.0),
+        lambda *given: replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
     )
     monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
     # A search that is cut leaves a structure with a lead.

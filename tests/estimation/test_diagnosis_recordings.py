@@ -18,8 +18,8 @@ from pipeline.estimation import (
     fit_model,
     load_recording,
 )
-from pipeline.estimation.plausibility import find_implausible
 from pipeline.estimation.folds import measure_errors
+from pipeline.estimation.plausibility import find_implausible
 from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log

@@ -12,7 +12,7 @@ from test_diagnosis import _SCENE, _diagnose
 
 from pipeline.estimation.error_regions import Region, _expect_square, _list_responses, pick_regions
 
-_NOISE = np.full((4, 3), 1e-3)
+_NOISE = np.full(3, 1e-3)
 
 
 def _find_circumstances(

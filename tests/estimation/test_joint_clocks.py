@@ -6,21 +6,18 @@ import json
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import TYPE_CHECKING
 
-import numpy as np
 import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.ambiguity import find_undecided
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
-from pipeline.models import find_effect, read_model, write_model
+from pipeline.models import read_model, write_model
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -116,35 +113,3 @@ def test_one_run_has_one_clock_and_runs_with_gyros_are_dated_by_them(tmp_path: P
     for runs, clocks in (([blind], ()), ([run, run], ()), ([run, blind], ("clock_offset",))):
         problem = Problem(runs, vehicle, Input.COMMAND)
         assert all(part.clocks == clocks for part in problem.parts)
-
-
-@pytest.mark.parametrize("others", [("drive_lag", "drive_lag"), ("drive_lag", "brake_lag")])
-def test_undecided_are_rivals_of_as_many_numbers_once_each(
-    monkeypatch: pytest.MonkeyPatch, others: tuple[str, ...]
-) -> None:
-    """Two rivals that have become the same simpler effect are one; what needs more numbers is none."""
-    monkeypatch.setattr("pipeline.estimation.ambiguity._read_numbers", lambda *_: {})
-    effect = find_effect("transport_delay")(d=0.2)
-
-    def model(ids: tuple[str, ...], residual: float) -> SimpleNamespace:
-        rest = np.full((4, 3), residual)
-        fit = SimpleNamespace(residual=rest)
-        return SimpleNamespace(ids=ids, held=rest, score=1.0, fit=fit, is_rough=False)
-
-    final = model(("transport_delay",), 1.0)
-    final.state = SimpleNamespace(effects=(effect,))
-    largest = SimpleNamespace(is_one_motion=False, is_one_speed=False)
-    weights = SimpleNamespace(scale=1.0)
-    models = [model((name,), 1.0) for name in others]
-    selection = SimpleNamespace(
-        drop=lambda *_: model((), 0.0),
-        loss=lambda _: 1.0,
-        rivals={(final.ids, ("transport_delay",)): SimpleNamespace(weights=weights, models=models)},
-        given=frozenset(),
-        budget=SimpleNamespace(is_spent=lambda: False),
-        weights=weights,
-        candidates=tuple(map(find_effect, others)),
-        largest=largest,
-    )
-    (found,) = find_undecided(selection, final)  # type: ignore[arg-type]
-    assert found.candidates == ("transport_delay", "drive_lag")

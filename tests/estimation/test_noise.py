@@ -129,7 +129,9 @@ def test_no_disturbance_lasts_longer_than_noise_does() -> None:
     """What drifts for a minute is an effect or the ground, and would be hidden by noise that explains it."""
     steps = make_steps(3000)
     drift = np.sin(np.arange(3000) * STEP_S / 20.0)[:, None] * SCALE
-    learned = learn_noise(drift + 0.1 * SCALE * np.random.default_rng(8).normal(size=(3000, 3)), steps, CHANNELS)
+    learned = learn_noise(
+        drift + 0.1 * SCALE * np.random.default_rng(8).normal(size=(3000, 3)), steps, CHANNELS
+    )
     times = -STEP_S / np.log(learned.correlation)
     assert times.max() <= 2.0 * (1.0 + 1e-6)
 

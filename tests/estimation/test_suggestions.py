@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from verbs import run_verb
 
-from pipeline.estimation import Input, acceptance
-from pipeline.estimation.acceptance import find_idle
 from pipeline.estimation.additions import rank_named
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.ladder import lowers_errors, raises_errors
@@ -64,46 +61,6 @@ def test_an_effect_raises_or_lowers_the_errors_by_one_rule(
     before = errors_of((1.0, 1.0))
     assert raises_errors(before, errors_of(after)) is raises
     assert lowers_errors(before, errors_of(after)) is lowers
-
-
-def judge_by_table(table: dict[Input, dict[frozenset[str], Pair]]) -> Any:  # noqa: ANN401 - a stand-in
-    """A stand-in for `judge_whole` that reads errors from a table by input and effects."""
-
-    def judge(source: Any, model: Model) -> Any:  # noqa: ANN401
-        def step(names: frozenset[str]) -> Any:  # noqa: ANN401
-            held = SimpleNamespace(residuals=np.ones((4, 3)))
-            errors = errors_of(table[source][names])
-            drop = lambda name: step(names - {name})  # noqa: E731
-            return SimpleNamespace(effects=tuple(names), errors=errors, held_out=held, drop=drop)
-
-        return step(frozenset(model.ids))
-
-    return judge
-
-
-def test_what_raises_the_errors_of_the_model_that_is_written_is_not_named(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """From the wheels a misalignment served; from commands, the input of the model, both errors rose."""
-    radius, psi = "wheel_radius", "yaw_misalignment"
-    both, one, other = frozenset({radius, psi}), frozenset({radius}), frozenset({psi})
-    table = {
-        Input.COMMAND: {
-            both: (0.0156, 0.014),
-            one: (0.012, 0.0137),
-            other: (0.08, 0.05),
-            frozenset(): (1.0, 1.0),
-        },
-        Input.MEASURED: {both: (0.01, 0.01), one: (0.02, 0.01), other: (0.08, 0.05), frozenset(): (1.0, 1.0)},
-    }
-    monkeypatch.setattr(acceptance, "judge_whole", judge_by_table(table))
-    assert HUSKY is not None
-    model = Model(HUSKY, (find_effect(radius)(), find_effect(psi)()))
-    problems: Any = {source: source for source in Input}
-    ground = dict.fromkeys(model.ids, (Input.MEASURED,))
-    assert find_idle(model, problems, ground, (), (psi,)) == [psi]
-    # Where the model predicts from the wheels, it stays.
-    assert find_idle(model, {Input.MEASURED: problems[Input.MEASURED]}, ground, (), (psi,)) == []
 
 
 def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_not() -> None:

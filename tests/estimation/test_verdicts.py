@@ -4,17 +4,11 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
-import numpy as np
-import pytest
 from test_diagnosis import _SCENE, _diagnose
 
-from pipeline.estimation.acceptance import NotSignificant
-from pipeline.estimation.conclude import _find_lead
 from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.verdict import NOTHING_MISSING
-from pipeline.models import find_effect
 from pipeline.simulate import VEHICLES
 
 _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
@@ -49,24 +43,3 @@ def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) 
     assert "from 0 to 30 s: 90 % of the yaw error in 20 % of the time" in run.unexplained.where
     assert run.unexplained.where in describe(diagnosis)
     assert not any(claim in f"{describe(diagnosis)} {run.to_json()}" for claim in _CLAIMS)
-
-
-@pytest.mark.parametrize(
-    ("error", "gain", "is_told"), [(0.2, 0.12, True), (0.14, 0.12, False), (0.2, 0.08, False)]
-)
-def test_an_effect_that_is_not_significant_is_told_where_the_error_is_far_above_the_floor(
-    monkeypatch: pytest.MonkeyPatch, error: float, gain: float, *, is_told: bool
-) -> None:
-    monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
-    monkeypatch.setattr("pipeline.estimation.conclude.find_places", lambda _: np.zeros((3, 2)))
-    part = SimpleNamespace(comparisons=[None])
-    search = SimpleNamespace(selection=SimpleNamespace(part=part), final=SimpleNamespace(held=None))
-    declined = [NotSignificant(find_effect("lateral_skid")(c=0.1), share, 0.8) for share in (0.02, gain)]
-    ways = [SimpleNamespace(search=search, not_significant=declined)]
-    judgement = SimpleNamespace(
-        whole=SimpleNamespace(errors=SimpleNamespace(t_mrmse_m=error)), floor=SimpleNamespace(t_mrmse_m=0.1)
-    )
-    lead = _find_lead(ways, judgement)  # type: ignore[arg-type]
-    assert ("lateral_skid would remove 12 %" in lead) == is_told
-    assert bool(lead) == is_told
-    assert _find_lead(ways, None) == ""  # type: ignore[arg-type]

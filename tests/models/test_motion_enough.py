@@ -27,10 +27,7 @@ def fitted() -> Fitted:
 
 
 def test_the_last_width_is_the_stated_interval(fitted: Fitted) -> None:
-    stated = {
-        item.free.label: 0.5 * (item.high - item.low)
-        for item in estimate_intervals(fitted).items
-    }
+    stated = {item.free.label: 0.5 * (item.high - item.low) for item in estimate_intervals(fitted).items}
     curves = narrow_intervals(fitted)
     assert set(curves) == {"effective_track.k", "icr_offset.x_icr", "drive_lag.tau"}
     for label, curve in curves.items():

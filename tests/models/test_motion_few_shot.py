@@ -76,7 +76,7 @@ def test_a_sure_prior_holds_and_a_vague_one_changes_nothing(run: MotionRun) -> N
 
 
 def test_the_posterior_is_narrower_than_the_prior_and_holds_the_truth(run: MotionRun) -> None:
-    problem = tie_to_prior(problem_of(cut_run(run, end_s=find_driven(run, 8.0))), MODEL, KNOWN)
+    problem = tie_to_prior(problem_of(cut_run(run, end_s=find_driven(run, 8.0))), KNOWN)
     fitted = fit_model(problem, MODEL, exact=True)
     estimates = estimate_intervals(fitted)
     for label, truth in (("effective_track.k", 1.8), ("lateral_skid.c", 0.08)):

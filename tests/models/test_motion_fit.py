@@ -18,9 +18,9 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
-from pipeline.estimation.floor import split_residuals
 from pipeline.estimation.folds import GAP_S, measure_by_terrain
 from pipeline.estimation.ladder import judge_model, judge_whole
+from pipeline.estimation.unexplained import summarize_disturbance
 from pipeline.models import Model, Timing, find_effect
 from pipeline.run.heading import HeadingSource
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Program
@@ -227,9 +227,9 @@ def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
     run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
     problem = Problem([run], HUSKY, Input.MEASURED)
     for rung in climb(problem, model_of("effective_track", "icr_offset")).steps:
-        x, y, _ = split_residuals(problem.comparisons, rung.held_out.residuals)
-        assert x.pose_noise == pytest.approx(0.03, rel=0.15)
-        assert y.pose_noise == pytest.approx(0.03, rel=0.25)
+        noise = summarize_disturbance(rung.fitted.fits[0], "")["pose_noise"]
+        assert noise[0] == pytest.approx(0.03, rel=0.15)  # type: ignore[index, call-overload]
+        assert noise[1] == pytest.approx(0.03, rel=0.25)  # type: ignore[index, call-overload]
 
 
 def test_motion_that_lasts_is_no_noise_though_nothing_recorded_tells_of_it() -> None:

@@ -21,6 +21,7 @@ from pipeline.estimation.learned_step import (
     learn_beyond,
     learn_fold,
     learn_where_it_helps,
+    learned_as_json,
     make_learned_step,
     regress,
 )
@@ -94,7 +95,10 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     kept = hold_out(complete, fitted, learn_where_it_helps(complete)).pooled
     assert kept.t_mrmse_m <= 1.02 * below.pooled.t_mrmse_m
     assert kept.r_mrmse_rad <= 1.02 * below.pooled.r_mrmse_rad
-    told = learn_beyond(judge_model(complete, fitted.model))
+    judged = judge_model(complete, fitted.model)
+    step = learn_beyond(judged)
+    assert step is not None
+    told = learned_as_json(step, judged.ideal.errors, judged.floor)
     assert told["kept"] is False
     assert told["reason"] == "the remaining error is at the noise floor"
     assert told["term"] is None

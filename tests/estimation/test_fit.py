@@ -1,0 +1,86 @@
+"""Fits: one answer from every start, and from what is written, and residuals of what is held out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from motion_runs import simulate, vehicle_of
+
+from pipeline.estimation import Input, Problem, fit_model
+from pipeline.estimation.decision import make_folds
+from pipeline.estimation.fit import fit_part, hold_out
+from pipeline.models import Model, ModelFile, find_effect, format_model
+from pipeline.models.model_file import parse_model
+from pipeline.simulate import Disturbance, Program
+
+HUSKY = vehicle_of("husky_a200")
+TRUTH = {"effective_track": 1.7, "icr_offset": 0.1, "drive_lag": 0.3}
+STARTS = (
+    (find_effect("effective_track")(), find_effect("icr_offset")(), find_effect("drive_lag")()),
+    (
+        find_effect("effective_track")(k=1.2),
+        find_effect("icr_offset")(x_icr=-0.2),
+        find_effect("drive_lag")(tau=0.6),
+    ),
+    (
+        find_effect("effective_track")(k=2.4),
+        find_effect("icr_offset")(x_icr=0.3),
+        find_effect("drive_lag")(tau=0.05),
+    ),
+)
+
+
+@pytest.fixture(scope="module")
+def problem() -> Problem:
+    run = simulate(TRUTH, duration_s=60.0, program=Program("teleop"), disturbance=Disturbance(0.03, 0.05))
+    return Problem([run], HUSKY, Input.COMMAND)
+
+
+def read_values(model: Model) -> dict[str, float]:
+    return {f"{effect.id}.{name}": value for effect in model for name, value in effect.values.items()}
+
+
+def test_an_exact_fit_ends_at_the_same_values_from_every_start(problem: Problem) -> None:
+    ends = [read_values(fit_model(problem, Model(HUSKY, start), exact=True).model) for start in STARTS]
+    for other in ends[1:]:
+        assert other == pytest.approx(ends[0], rel=2e-6, abs=2e-6)
+    assert ends[0]["drive_lag.tau"] == pytest.approx(0.3, abs=0.01)
+
+
+def test_the_fit_of_a_written_model_is_the_model(problem: Problem) -> None:
+    fitted = fit_model(problem, Model(HUSKY, STARTS[0]), exact=True)
+    written = parse_model(format_model(ModelFile(fitted.model)), "model.toml").model
+    assert written == fitted.model
+    # Also where nothing is remembered.
+    fresh = Problem(problem.runs, HUSKY, Input.COMMAND)
+    again = read_values(fit_model(fresh, written, exact=True).model)
+    assert again == pytest.approx(read_values(written), rel=2e-6, abs=2e-6)
+
+
+def test_numbers_stay_within_their_bounds(problem: Problem) -> None:
+    """Nothing skids, so that a number from near a bound moves away from it."""
+    skid = find_effect("lateral_skid")
+    low, high = skid.parameters[0].bounds
+    for start in (0.9 * low, 0.9 * high):
+        fitted = fit_model(problem, Model(HUSKY, (*STARTS[1], skid(c=start))))
+        assert low <= fitted.model.effect("lateral_skid").values["c"] <= high
+
+
+def test_what_is_held_out_is_what_a_fit_without_it_leaves(problem: Problem) -> None:
+    part = problem.parts[0]
+    fit = fit_part(part, problem.start_state([find_effect("effective_track")(k=1.6)]))
+    folds = make_folds(part)
+    held = hold_out(fit, fit.noise, folds)
+    # Each fold by one step of the numbers, to those that the others ask for.
+    assert held.shape == fit.residual.shape
+    moved = held - fit.residual
+    for fold in np.unique(folds).tolist():
+        mine = folds == fold
+        step, *_ = np.linalg.lstsq(
+            fit.columns[mine].reshape(-1, len(fit.free)), -moved[mine].ravel(), rcond=None
+        )
+        left = -moved[mine].ravel() - fit.columns[mine].reshape(-1, len(fit.free)) @ step
+        assert np.abs(left).max() < 1e-9
+        assert np.abs(step[0]) < 4.0 * np.sqrt(fit.covariance[0, 0])
+    # What a fit says of itself is too good.
+    assert np.mean(held[:, 2] ** 2) > np.mean(fit.residual[:, 2] ** 2)
