@@ -9,8 +9,8 @@ It goes on where it was stopped. With --recordings it writes those of ../shared/
 every second seed is driven in closed loop, wherever the category leaves the driving open. `exam` diagnoses
 the tables with the code as it is now, keeps the answers as NAME.json beside them, with the CPU time of each,
 and prints what is right, wrong, missed and covered, by category, driving, sensors and input. `compare`
-diagnoses once more. It prints of each log the largest relative difference of all numbers of the two answers and all
-else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
+diagnoses once more. It prints of each log the largest relative difference of all numbers of the two answers
+and all else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
 """
 
 from __future__ import annotations
