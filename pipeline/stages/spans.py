@@ -402,14 +402,15 @@ def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple
     fit = _fit(blocks, asked, target, known, is_command=True)
     if fit is None:
         return [], []
-    pauses = find_runs(np.asarray(np.abs(last).sum(axis=1) > LIVE_SHARE * rims.top))
+    silent: Flags = np.asarray(rims.expired.any(axis=1), dtype=bool)
+    pauses = [(float(rims.times[a]), float(rims.times[b - 1])) for a, b in find_runs(silent)]
     spans, findings = list[Span](), list[Finding]()
     if pauses:
         # Does the base keep its last command, or does it stop?
         keeps = _fit(blocks, asked + last, target, known, is_command=True)
         if keeps is not None and keeps.total - fit.total > blocks.price:
             fit, asked = keeps, asked + last
-            longest = max(float(blocks.end[b - 1] - blocks.start[a]) for a, b in pauses)
+            longest = max(end - start for start, end in pauses)
             text = (
                 f"in {len(pauses)} pauses the vehicle continues its last command until the next, for up to "
                 f"{longest:.1f} s beyond command.hold_s: the base holds its last command; set "
@@ -435,7 +436,7 @@ class _Contradiction(NamedTuple):
         start, end: [s].
         nats: gain in log-likelihood.
         is_driven: whether the source moves.
-        motion: ``stands``, ``turned`` (of the usual length), ``longer`` or ``shorter``, whichever is likeliest.
+        motion: ``stands``, ``turned`` (of the usual length), ``longer`` or ``shorter``: the likeliest.
     """
 
     start: float
@@ -468,16 +469,23 @@ def _list_contradictions(blocks: _Blocks, fit: _Fit, source: Floats) -> list[_Co
 
 
 def _list_silent(
-    rims: Rims, blocks: _Blocks, fit: _Fit, asked: Floats, pauses: Sequence[tuple[int, int]], hold_s: float
+    rims: Rims,
+    blocks: _Blocks,
+    fit: _Fit,
+    asked: Floats,
+    pauses: Sequence[tuple[float, float]],
+    hold_s: float,
 ) -> list[Span]:
     """Pauses of the commands in which the vehicle stopped; none if that is its usual end of a motion."""
     goes_on = fit.likelihood(blocks.list_columns(asked, fit.top, fit.friction) @ fit.gains)
     stops = np.where(fit.is_judged, fit.likelihood(np.zeros_like(asked)) - goes_on, 0.0)
-    silent = [
-        Span("commands_silent", float(blocks.start[a]) - hold_s, float(blocks.end[b - 1]), nats)
-        for a, b in pauses
-        if (nats := float(stops[a:b].sum())) > 2.0 * blocks.price
-    ]
+    total = np.append(0.0, np.cumsum(stops))
+    silent = []
+    for start, end in pauses:
+        first, last = np.searchsorted(blocks.start, (start, end))
+        nats = float(total[last] - total[first])
+        if nats > 2.0 * blocks.price:
+            silent.append(Span("commands_silent", start - hold_s, end, nats))
     driven_s = BLOCK_S * float((np.abs(fit.target).sum(axis=1) > LIVE_SHARE * rims.top).sum())
     return silent if len(silent) <= max(driven_s / USUAL_S, 1.0) else []
 

@@ -246,7 +246,7 @@ _FEWEST = 40
 """Least number of samples for a usual ratio: two seconds of driving."""
 _SMOOTH_S = 0.5
 """Width of a running mean [s], below the 0.75 s over which poses are differentiated."""
-_JOINED_S = 1.0
+_JOINED_S = 1.5
 """Largest gap [s] between events of one kind that are merged."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
 _MEANS = {
