@@ -54,13 +54,13 @@ _SAME = 0.03
 _LASTS_NATS = 0.1
 """Price of every block of a span [nats], so that it ends with the last block that shows it."""
 _FEWEST_BLOCKS = 40
-"""Least number of blocks for a fit of some thirty coefficients."""
+"""Least number of blocks for a fit of eighteen coefficients."""
 _ROUNDS = 8
 """Reweighting iterations."""
 _FRICTIONS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3)
 """Fractions of the usual largest speed up to which a command may not overcome friction: the likeliest."""
-_TINY = 1e-6
-"""Share of a column's power that is added to it: columns without motion are no columns."""
+_TINY = 1e-3
+"""Share of a column's power that is added to it: what a short run does not determine stays small."""
 _SLOW_S = 1.0
 """Time constant of the slowest of the lags that a fit mixes [s]."""
 _COASTS_S = 3.0
@@ -265,7 +265,7 @@ class _Blocks:
         before = self.delay(now)
         ahead, turned = source[:, :1], source[:, 2:] / top
         product = np.hstack((ahead * turned, ahead * np.abs(turned), np.abs(ahead) * turned))
-        return np.hstack((now, before, self.delay(before), self.follow(before), product, self.delay(product)))
+        return np.hstack((now, before, self.follow(before), product))
 
     def list_spans(self, gains: Floats) -> list[slice]:
         """Likeliest spans that do not follow (Viterbi).
