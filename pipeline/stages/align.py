@@ -165,8 +165,8 @@ def _align(
     if known:
         cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
         spans = find_spans(velocities, tables["poses"], known, vehicle, hold)
-        usual = {name: ideal.leave_out(spans.left_out) for name, ideal in known.items()}
-        bad = spans.wrong | spans.left_out
+        usual = {name: ideal.leave_out(spans.excluded) for name, ideal in known.items()}
+        bad = spans.wrong | spans.excluded
         if not is_drive_alone:
             events = find_events(velocities, known, vehicle, spans)
         findings += [*spans.findings, *events.findings]

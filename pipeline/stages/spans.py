@@ -87,13 +87,13 @@ class Spans:
 
     Attributes:
         wrong: samples of the grid with wrong poses, shape (n,).
-        left_out: samples with an incident, or about one, shape (n,).
+        excluded: samples with an incident, or about one, shape (n,).
         findings: on all of them.
         incidents: what happened to the vehicle, in order.
     """
 
     wrong: Flags
-    left_out: Flags
+    excluded: Flags
     findings: tuple[Finding, ...] = field(default=())
     incidents: tuple[Span, ...] = field(default=())
 
@@ -333,7 +333,7 @@ class _Fit:
         The target stands; it moves in any way; each of its parts does this or that; or its length follows,
         and its direction does not.
         """
-        still, any_way = (
+        still, broad = (
             np.column_stack([list_likelihoods(self.target[:, i], one[i]) for i in range(3)])
             for one in (self.scale, self.spread)
         )
@@ -345,7 +345,7 @@ class _Fit:
             - LOG_PEAK
             + list_likelihoods(self.target[:, 2] - self.expected[:, 2], self.scale[2])
         )
-        parts = (still, any_way, np.maximum(still, any_way))
+        parts = (still, broad, np.maximum(still, broad))
         made = np.column_stack((*(one.sum(axis=1) for one in parts), turned))
         follows = self.likelihood(self.expected)[:, None]
         return np.where(self.is_judged[:, None], made - follows, 0.0)
