@@ -17,6 +17,7 @@ import numpy as np
 
 from pipeline.core import format_share
 from pipeline.core.arrays import Flags, Floats, number_stretches
+from pipeline.core.machine_code import compiled
 from pipeline.core.rigid import find_runs
 from pipeline.core.student import LOG_PEAK, find_scale, list_likelihoods, weigh
 from pipeline.run.signals import LIVE_SHARE, STILL_MPS
@@ -212,6 +213,14 @@ def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
     )
 
 
+@compiled("void(float64[:, ::1], boolean[::1], float64)")
+def _follow(values: Floats, is_first: Flags, gain: float) -> None:
+    for k in range(1, values.shape[0]):
+        if not is_first[k]:
+            for i in range(values.shape[1]):
+                values[k, i] = values[k - 1, i] + gain * (values[k, i] - values[k - 1, i])
+
+
 class _Blocks:
     """Blocks of the grid, none across a gap.
 
@@ -246,10 +255,8 @@ class _Blocks:
 
     def follow(self, values: Floats) -> Floats:
         """Values after a first-order lag, shape (m, k)."""
-        made, gain = values.copy(), 1.0 - float(np.exp(-BLOCK_S / _SLOW_S))
-        for k in range(1, len(made)):
-            if not self.is_first[k]:
-                made[k] = made[k - 1] + gain * (values[k] - made[k - 1])
+        made = np.array(values, order="C")
+        _follow(made, self.is_first, 1.0 - float(np.exp(-BLOCK_S / _SLOW_S)))
         return made
 
     def list_columns(self, source: Floats, top: float, friction: float) -> Floats:
