@@ -50,7 +50,7 @@ a wrong track, a lag or a limit."""
 SHOWN = 0.05
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
 _RISEN = 2.0
-"""Standard errors beyond which a rise of a held-out error is no chance, and may not exceed the largest fall."""
+"""Standard errors beyond which a rise of a held-out error is no chance: no fall may be smaller than it."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
 _MOST_EFFECTS = 8

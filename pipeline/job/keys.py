@@ -544,7 +544,7 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 13, "align": 20, "velocity": 6, "slip": 14, "aggregate": 3}
+VERSIONS: Mapping[str, int] = {"extract": 13, "align": 21, "velocity": 6, "slip": 14, "aggregate": 3}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": EXTRACTED,

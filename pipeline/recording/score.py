@@ -15,6 +15,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats, Ints
 from pipeline.core.machine_code import compiled
+from pipeline.core.student import find_scale, list_likelihoods, weigh
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""
@@ -24,7 +25,6 @@ LEAST_NATS = 0.02
 """Least gain in log-likelihood per step of a decision: below it a difference is of no importance."""
 FEWEST_STEPS = 30
 """Least number of steps for a likelihood."""
-_FREEDOM = 4.0
 _ROUNDING_S = 1e-6
 _NOISES = ((0.0, 0.0), *((phi, theta) for phi in (0.0, 0.4, 0.7, 0.9) for theta in (0.0, 0.3, 0.6, 0.85)
                          if phi != theta))  # fmt: skip
@@ -89,34 +89,10 @@ def _whiten_rows(values: Floats, phi: float, theta: float, fresh: Flags) -> None
             before = value
 
 
-@compiled("float64(float64[::1], float64)")
-def _reweigh_scale(rest: Floats, power: float) -> float:
-    for _ in range(12):
-        total = 0.0
-        for k in range(rest.size):
-            square = rest[k] * rest[k]
-            total += 5.0 * square / (4.0 + square / power)
-        power = max(total / rest.size, 1e-16)
-    return power
-
-
 def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
     """Innovations u_k = d_k - phi d_(k-1) + theta u_(k-1) of every column, restarted at gaps."""
     made = np.array(values, dtype=np.float64, order="C")
     _whiten_rows(made, *noise, steps.fresh)
-    return made
-
-
-def _find_scale(rest: Floats) -> float:
-    """Scale of Student's t with four degrees of freedom by reweighting."""
-    rest = np.ascontiguousarray(rest)
-    return float(np.sqrt(_reweigh_scale(rest, max(1.5 * float(np.median(rest * rest)), 1e-16))))
-
-
-def _list_likelihoods(rest: Floats) -> Floats:
-    """Log-likelihood of every residual, up to a constant."""
-    scale = _find_scale(rest)
-    made: Floats = -np.log(scale) - 0.5 * (_FREEDOM + 1.0) * np.log1p((rest / scale) ** 2 / _FREEDOM)
     return made
 
 
@@ -131,7 +107,7 @@ def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Fl
             normal, right = weighted.T @ weighted, weighted.T @ (values * weight)
             gains = np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0], dtype=np.float64)
         rest = np.asarray(values - columns @ gains, dtype=np.float64)
-        weight = np.sqrt((_FREEDOM + 1.0) / (_FREEDOM + (rest / _find_scale(rest)) ** 2))
+        weight = np.sqrt(weigh(rest))
         if not gains.size:
             break
     return gains, rest, weight
@@ -151,13 +127,13 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     some = steps.block % max(1, rest.size // _MOST_ROWS) == 0
     part, few = rest[some][:, None], steps.take(some)
     for each in _NOISES:
-        score = float(_list_likelihoods(_whiten(part, each, few)[:, 0]).sum())
+        score = float(list_likelihoods(_whiten(part, each, few)[:, 0]).sum())
         if score > best + 2.0:
             noise, best = each, score
     white = _whiten(np.column_stack([values, columns]), noise, steps)
     design = white[:, 1:]
     gains, rest, weight = _solve(white[:, 0], design)
-    blocks: Floats = np.bincount(steps.block, _list_likelihoods(rest)).astype(np.float64)
+    blocks: Floats = np.bincount(steps.block, list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
         return Fit(gains, gains, blocks)
     inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
@@ -168,7 +144,7 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
 
 def measure_share(values: Floats, model: Floats) -> float:
     """Part of the size of some increments that a model explains, outliers discounted, from 0 to 1."""
-    return 1.0 - min(1.0, (_find_scale(values - model) / _find_scale(values)) ** 2)
+    return 1.0 - min(1.0, (find_scale(values - model) / find_scale(values)) ** 2)
 
 
 def compare(one: Floats, other: Floats) -> float:

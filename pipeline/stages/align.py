@@ -7,7 +7,7 @@ findings, and every reader of the run gets corrected data.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import msgspec
@@ -25,10 +25,10 @@ from pipeline.sources.configuration import SlipSection, VelocitySection
 from pipeline.stages import Finding
 from pipeline.stages.drive import Drive, interpolate_readings
 from pipeline.stages.drive_numbers import find_timeout, mark_late_starts, report_timeout
-from pipeline.stages.incidents import find_incidents
 from pipeline.stages.pose_choice import find_steady_gain
-from pipeline.stages.pose_faults import align_poses, find_bad_stretches
-from pipeline.stages.slip_stage import Ideal, Steps, cut_steps, interpolate_wheels, keep_known, read_inputs
+from pipeline.stages.pose_faults import align_poses
+from pipeline.stages.slip_stage import Ideal, cut_steps, interpolate_wheels, keep_known, read_inputs
+from pipeline.stages.spans import find_spans
 from pipeline.stages.trust import (
     LEAST_CORRELATION,
     ONE_SCALE,
@@ -164,13 +164,12 @@ def _align(
     events = MotionEvents()
     if known:
         cut = cut_steps(velocities, known, _STEPS.length_scale_m, _STEPS.transitory_s)
-        incidents = find_incidents(velocities, tables, known, vehicle, hold)
-        usual = {name: ideal.leave_out(incidents.excluded) for name, ideal in known.items()}
-        bad, contradictions = _find_contradictions(velocities, {} if is_drive_alone else usual, cut)
+        spans = find_spans(velocities, tables["poses"], known, vehicle, hold)
+        usual = {name: ideal.leave_out(spans.excluded) for name, ideal in known.items()}
+        bad = spans.wrong | spans.excluded
         if not is_drive_alone:
-            events = find_events(velocities, known, vehicle, bad, incidents.spans)
-        bad |= incidents.excluded
-        findings += [*contradictions, *incidents.findings, *events.findings]
+            events = find_events(velocities, known, vehicle, spans)
+        findings += [*spans.findings, *events.findings]
         grid = _Grid(velocities, bad, _tabulate_steps(velocities, known, cut.step, bad))
         samples = gather_samples(velocities, usual, cut, body_commanded=body_commanded)
         scale = measure_command_scale(
@@ -213,15 +212,6 @@ def _align(
     findings += _report_poses(alignment)
     made = {**corrected, "poses": poses, "alignments": tabulate_alignment(alignment), "events": events.table}
     return Aligned(made, alignment, aligned_vehicle, tuple(findings))
-
-
-def _find_contradictions(
-    velocities: pl.DataFrame, inputs: Mapping[str, Ideal], cut: Steps
-) -> tuple[Flags, Sequence[Finding]]:
-    """Samples in stretches with implausible poses, and findings on them; none without an input."""
-    if not inputs:
-        return np.zeros(velocities.height, dtype=bool), ()
-    return find_bad_stretches(velocities, {name: ideal.velocity for name, ideal in inputs.items()}, cut.step)
 
 
 @dataclass(frozen=True)

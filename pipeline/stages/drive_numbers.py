@@ -31,8 +31,8 @@ from pipeline.run.signals import MOVING_MPS
 from pipeline.sources.candidates import PowerSource, Signal
 from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
-from pipeline.stages.incidents import LIVE
 from pipeline.stages.slip_stage import hold_commands, interpolate_wheels
+from pipeline.stages.spans import LIVE
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

@@ -23,7 +23,7 @@ from pipeline.run.heading import SPAN_S
 from pipeline.run.signals import ANSWERS_S, DriveSeries, Limits, find_limits, trace_traction
 from pipeline.sources.configuration import VelocitySection
 from pipeline.stages import Finding, StageError
-from pipeline.stages.incidents import LIVE, USUAL_S, Span, gather_rims, mark_excluded, measure_gain
+from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_excluded
 from schemas import tabulate
 
 if TYPE_CHECKING:
@@ -238,9 +238,15 @@ def _differentiate_segment(
     }
 
 
+_FALSE_MOTION = {"pushed", "localization_frozen"}
+"""Incidents in which the body's motion says nothing about the ground under the wheels."""
 _WIDTH = 5
 """Samples over which the size of an event is averaged: shorter peaks are noise of the poses."""
-_JOINED_S = 1.0
+_FEWEST = 40
+"""Least number of samples for a usual ratio: two seconds of driving."""
+_SMOOTH_S = 0.5
+"""Width of a running mean [s], below the 0.75 s over which poses are differentiated."""
+_JOINED_S = 1.5
 """Largest gap [s] between events of one kind that are merged."""
 _KINDS = {1: "digging_in", 2: "spinning", 3: "sliding"}
 _MEANS = {
@@ -262,8 +268,7 @@ def find_events(
     velocities: pl.DataFrame,
     inputs: Mapping[str, Ideal],
     vehicle: Vehicle,
-    bad: Flags,
-    incidents: Sequence[Span],
+    spans: Spans,
 ) -> MotionEvents:
     """All events of a run in order.
 
@@ -271,34 +276,36 @@ def find_events(
         velocities: table `velocities`, of poses alone.
         inputs: ideal velocities by input; without measured wheels only incidents are detected.
         vehicle: its track converts yaw rates to rim speeds.
-        bad: samples with wrong poses, shape (n,).
-        incidents: kind, begin and end [s] of each.
+        spans: contradictions of the run.
     """
     times = velocities["t"].to_numpy()
     rims = gather_rims(velocities, inputs, vehicle)
     loss, events = np.zeros(times.size), list[_Event]()
-    if rims is not None and rims.wheels is not None:
-        unknown = bad | np.isnan(rims.wheels)
-        unknown |= mark_excluded(times, [span for span in incidents if span[0] != "stuck"])
-        gain = measure_gain(rims, 0)
+    if rims is not None and rims.driven is not None:
+        fastest, driven = np.abs(rims.driven).sum(axis=1), np.nan_to_num(rims.driven)
+        unknown = spans.wrong | np.isnan(fastest)
+        unknown |= mark_excluded(times, [one for one in spans.incidents if one.kind in _FALSE_MOTION])
+        moved = _smooth(times, rims.moved)
+        gain = _measure_gain(rims, driven[:, 0], moved[:, 0])
         limits = find_limits(rims.top, gain)
-        brought = gain * rims.driven[:, 0]
+        brought = gain * driven[:, 0]
         signals = _Signals(
             times,
             np.where(unknown, 0.0, brought),
-            rims.driven[:, 2],
-            np.where(unknown, 0.0, _count_sideways(rims.moved, brought)),
+            driven[:, 2],
+            np.where(unknown, 0.0, _count_sideways(moved, brought)),
         )
-        events = _leave_out_usual(_find_traction(signals, limits), times, rims.wheels > LIVE * rims.top)
-        events = _end_where_stuck(events, times, incidents)
+        events = _leave_out_usual(_find_traction(signals, limits), times, fastest > LIVE * rims.top)
+        events = _end_where_stuck(events, times, spans.incidents)
         wheels = np.where(signals.wheels == 0.0, np.inf, signals.wheels)
         loss = 1.0 - signals.body / wheels
     rows = [
         _make_row(velocities, kind, (times[a], times[b], times[known]), _measure_size(kind, loss[a : b + 1]))
         for kind, a, b, known in events
     ]
-    for kind, start, end in incidents:
-        rows.append(_make_row(velocities, kind, (start, end, min(start + ANSWERS_S, end)), None))
+    for one in spans.incidents:
+        ends = (one.start, one.end, min(one.start + ANSWERS_S, one.end))
+        rows.append(_make_row(velocities, one.kind, ends, None))
     findings = [
         Finding(kind, "warning", _MEANS[kind], t_start=float(times[a]), t_end=float(times[b]))
         for kind, a, b, _ in events
@@ -319,6 +326,24 @@ class _Signals:
     wheels: Floats
     turning: Floats
     body: Floats
+
+
+def _smooth(times: Floats, values: Floats) -> Floats:
+    """Running mean over `_SMOOTH_S`, shape (n, k)."""
+    steps = arrays.count_steps(times, _SMOOTH_S)
+    total = np.concatenate((np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)))
+    low = np.maximum(np.arange(times.size) - steps // 2, 0)
+    high = np.minimum(np.arange(times.size) + steps // 2 + 1, times.size)
+    means: Floats = (total[high] - total[low]) / (high - low)[:, None]
+    return means
+
+
+def _measure_gain(rims: Rims, driven: Floats, moved: Floats) -> float:
+    """Usual ratio of the body's forward motion to that of the wheels; 0 if the wheels never moved."""
+    turning = np.abs(driven) > LIVE * rims.top
+    if turning.sum() < _FEWEST:
+        return 0.0
+    return max(float(np.median(moved[turning] / driven[turning])), 0.0)
 
 
 def _count_sideways(moved: Floats, brought: Floats) -> Floats:
@@ -383,7 +408,7 @@ def _leave_out_usual(events: Sequence[_Event], times: Floats, driven: Flags) -> 
 
 def _end_where_stuck(events: Sequence[_Event], times: Floats, incidents: Sequence[Span]) -> list[_Event]:
     """The events up to the time at which the vehicle is stuck, which explains the later ones."""
-    for kind, start, end in incidents:
+    for kind, start, end, _ in incidents:
         if kind == "stuck":
             last = int(np.searchsorted(times, start))
             events = [

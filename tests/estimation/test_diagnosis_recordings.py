@@ -52,7 +52,7 @@ _FAULTS: Mapping[str, set[str]] = {
     "warthog_wheels_grass_2024_8_8_16h19s23": {"pose_delay"},
     "warthog_wheels_gravel_2024_8_6_11h37s32": {"imu_sign", "bad_stretch", "held_poses", "pose_delay"},
     "warthog_wheels_ice_2024_7_30_16h30s21": {"imu_sign", "bad_stretch", "held_poses", "pose_delay"},
-    "warthog_wheels_sand_2024_9_25_14h32s32": {"bad_stretch", "held_poses", "pose_delay"},
+    "warthog_wheels_sand_2024_9_25_14h32s32": {"held_poses", "pose_delay"},
 }
 _STANDING = {"husky_wheels_avide2", "husky_wheels_plank_2024_10_24_11h24s5"}
 _DRIVEN = sorted(set(_FAULTS) - _STANDING)

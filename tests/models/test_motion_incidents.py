@@ -32,8 +32,8 @@ from pipeline.simulate import (
 )
 from pipeline.stages import Finding
 from pipeline.stages.align import align_tables
-from pipeline.stages.incidents import find_incidents
 from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.spans import find_spans
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "drive_lag": 0.3, "icr_offset": 0.1}
@@ -261,7 +261,7 @@ def test_a_pose_that_sways_while_the_wheels_turn_is_stuck_and_one_that_slides_on
     known = np.ones(times.size, dtype=bool)
     inputs = {"measured": Ideal(wheels, ~known, known)}
     velocities = pl.DataFrame(dict(zip(("t", "v_x", "v_y", "v_w"), (times, *moved.T), strict=True)))
-    tables = {"poses": pl.DataFrame({"t": times, "held": ~known})}
-    stuck = find_incidents(velocities, tables, inputs, HUSKY, 0.5).spans
-    assert [kind for kind, _, _ in stuck] == kinds
-    assert all(start == pytest.approx(50.0, abs=0.5) for _, start, _ in stuck)
+    poses = pl.DataFrame({"t": times, "held": ~known})
+    stuck = find_spans(velocities, poses, inputs, HUSKY, 0.5).incidents
+    assert [one.kind for one in stuck] == kinds
+    assert all(one.start == pytest.approx(50.0, abs=0.5) for one in stuck)

@@ -3,34 +3,47 @@
 from __future__ import annotations
 
 import numpy as np
+import polars as pl
+import pytest
 
-from pipeline.core.arrays import Floats
-from pipeline.stages.incidents import Rims, _find_stops
+from pipeline.core.arrays import Flags, Floats
+from pipeline.sources import find_preset
+from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.spans import find_spans
 
 STEP_S = 0.05
 
 
-def find(command: Floats, stopped: tuple[float, float]) -> list[tuple[float, float]]:
-    """Stops of a vehicle that follows its commands but for some seconds."""
+def find(command: Floats, is_stopped: Flags) -> list[tuple[str, float, float]]:
+    """Incidents of a vehicle that follows its commands, but for some time."""
+    vehicle = find_preset("husky_a200")
+    assert vehicle is not None
     times = np.arange(command.size) * STEP_S
-    follows = np.where((times >= stopped[0]) & (times < stopped[1]), 0.0, command)
-    zeros = np.zeros(command.size)
-    three, moved = (np.stack((one, zeros, zeros), axis=1) for one in (command, follows))
-    known = np.ones(command.size, dtype=bool)
-    rims = Rims(times, command, three, known, 0.0 * three, follows, moved, follows, moved, 1.0)
-    return [(start, end) for _, start, end in _find_stops(rims)]
+    follows = np.where(is_stopped, 0.0, command)
+    flags = np.zeros(command.size, dtype=bool)
+    asked, driven = (np.outer(one, [1.0, 0.0, 0.0]) for one in (command, follows))
+    inputs = {"command": Ideal(asked, flags, ~flags), "measured": Ideal(driven, flags, ~flags)}
+    velocities = pl.DataFrame(dict(zip(("t", "v_x", "v_y", "v_w"), (times, *driven.T), strict=True)))
+    poses = pl.DataFrame({"t": times, "held": flags})
+    spans = find_spans(velocities, poses, inputs, vehicle, 0.5).incidents
+    return [(one.kind, one.start, one.end) for one in spans]
 
 
-def test_a_driver_who_hesitates_under_a_stop_does_not_hide_it() -> None:
+# Live for 1.5 s, then a dip of 0.4 s; live for 0.6 s, then a pause of 1.8 s: never two seconds on end. All of
+# it moves this vehicle at other times.
+@pytest.mark.parametrize(("period_s", "live_s"), [(1.9, 1.5), (2.4, 0.6)])
+def test_a_driver_who_hesitates_under_a_stop_does_not_hide_it(period_s: float, live_s: float) -> None:
     times = np.arange(0.0, 100.0, STEP_S)
-    # Live for 1.5 s, then a dip of 0.4 s, again and again: never two seconds on end.
-    command = np.where(times % 1.9 < 1.5, 0.5, 0.15)
-    ((start, end),) = find(command, (50.0, 58.0))
+    ((kind, start, end),) = find(
+        np.where(times % period_s < live_s, 0.5, 0.15), (times >= 50.0) & (times < 58.0)
+    )
+    assert kind == "emergency_stop"
     assert abs(start - 50.0) < 1.0
     assert abs(end - 58.0) < 1.0
 
 
-def test_short_commands_with_long_pauses_do_not_add_up() -> None:
+def test_commands_that_never_move_it_show_no_stop() -> None:
+    """The slow ones do not overcome friction, at any time."""
     times = np.arange(0.0, 100.0, STEP_S)
-    command = np.where(times % 2.4 < 0.6, 0.5, 0.15)
-    assert find(command, (50.0, 58.0)) == []
+    command = np.where(times % 10.0 < 5.0, 0.5, 0.1)
+    assert find(command, command < 0.2) == []

@@ -25,6 +25,7 @@ from pipeline.simulate import (
 from pipeline.simulate.programs import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.spans import Spans
 from pipeline.stages.velocity import find_events
 
 STEP_S = 0.05
@@ -104,7 +105,10 @@ def test_a_body_that_slides_sideways_does_not_dig_in(
     wheels = np.column_stack((np.ones(times.size), np.zeros((times.size, 2))))
     flags = np.zeros(times.size, dtype=bool)
     inputs = {"measured": Ideal(wheels, flags, ~flags)}
-    assert find_events(pl.DataFrame(columns), inputs, vehicle, flags, ()).table["kind"].to_list() == said
+    assert (
+        find_events(pl.DataFrame(columns), inputs, vehicle, Spans(flags, flags)).table["kind"].to_list()
+        == said
+    )
 
 
 def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
@@ -116,7 +120,7 @@ def test_a_sensor_ahead_of_the_axles_is_not_seen_to_slide_in_turns() -> None:
     wheels = np.column_stack((1.0 - turns, 0.0 * turns, turns))
     flags = np.zeros(times.size, dtype=bool)
     inputs = {"measured": Ideal(wheels, flags, ~flags)}
-    assert find_events(pl.DataFrame(columns), inputs, vehicle, flags, ()).findings == ()
+    assert find_events(pl.DataFrame(columns), inputs, vehicle, Spans(flags, flags)).findings == ()
 
 
 def make_log(path: Path, kind: IncidentKind, *times: tuple[float, float]) -> Path:

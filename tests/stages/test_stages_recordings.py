@@ -68,7 +68,7 @@ KNOWN = {
     "warthog_wheels_ice_2024_7_30_16h30s21": Known(
         0.72, 1.79, 2.18, 12.1, HELD | ROTATED | LATE | READ | {"imu_sign"}, COMMON - {"imu_sign"}
     ),
-    "warthog_wheels_sand_2024_9_25_14h32s32": Known(0.75, 1.36, 2.12, 10.1, HELD | ROTATED | LATE | READ),
+    "warthog_wheels_sand_2024_9_25_14h32s32": Known(0.75, 1.36, 2.12, 10.1, HELD | LATE | READ),
 }
 
 

@@ -1,0 +1,528 @@
+"""Spans of a run in which the wheels do not follow the command, or the body does not follow its wheels.
+
+Each of the two pairs is fitted over the whole run, robustly: lags, gains, limits and slip that a large part
+of the drive has belong to the fit. A block of half a second follows, or it stands still, or it moves in
+another direction, or it moves in any way: one hypothesis holds until the gain in likelihood of another one
+is worth a change. The price of a change is the only threshold. Which pair disagrees, and what moves, says
+what it was.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, NamedTuple
+
+import numpy as np
+
+from pipeline.core import format_share
+from pipeline.core.arrays import Flags, Floats, number_stretches
+from pipeline.core.machine_code import compiled
+from pipeline.core.rigid import find_runs
+from pipeline.core.student import LOG_PEAK, find_scale, list_likelihoods, weigh
+from pipeline.run.signals import LIVE_SHARE, STILL_MPS
+from pipeline.stages import Finding
+
+if TYPE_CHECKING:
+    import polars as pl
+
+    from pipeline.sources import Vehicle
+    from pipeline.stages.slip_stage import Ideal
+
+Kind = Literal[
+    "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",
+    "rotated", "lost",
+]  # fmt: skip
+
+_MEANS: Mapping[str, str] = {
+    "emergency_stop": "the vehicle stood still under live commands: an emergency stop, or the drive was off",
+    "manual_driving": "the vehicle drove without a command: by joystick or another controller",
+    "pushed": "the body moved while its wheels stood still: it was pushed or carried, or slid",
+    "commands_silent": "commands stopped arriving and the vehicle stopped: a watchdog, or a lost connection",
+    "stuck": "the wheels turned and the body did not move: it was stuck, dug in, or was lifted",
+    "localization_frozen": "the localization repeated one pose while the wheels turned: it was lost",
+}
+_BAD_POSES = {"rotated": "a rotated heading", "lost": "a motion that is not that of the wheels"}
+
+BLOCK_S = 0.5
+"""Length of a block [s]: an end of a span is known to within one."""
+LEVEL = 0.001
+"""Probability that a run of normal driving has a span."""
+LIVE = 0.25
+"""Fraction of the usual largest speed above which a command is live: it overcomes friction."""
+_SAME = 0.03
+"""Fraction of the usual largest speed below which a difference is no contradiction."""
+_LASTS_NATS = 0.1
+"""Price of every block of a span [nats], so that it ends with the last block that shows it."""
+_FEWEST_BLOCKS = 40
+"""Least number of blocks for a fit of eighteen coefficients."""
+_ROUNDS = 8
+"""Reweighting iterations."""
+_FRICTIONS = (0.0, 0.1, 0.15, 0.2, 0.25, 0.3)
+"""Fractions of the usual largest speed up to which a command may not overcome friction: the likeliest."""
+_TINY = 1e-3
+"""Share of a column's power that is added to it: what a short run does not determine stays small."""
+_SLOW_S = 1.0
+"""Time constant of the slowest of the lags that a fit mixes [s]."""
+_COASTS_S = 3.0
+"""Time in which drive and body come to rest, including late poses [s]; also left out after an incident."""
+_MARGIN_S = 0.5
+"""Margin left out before an incident [s]: more than half of the 0.75 s over which poses are differentiated,
+by which it appears early in velocities."""
+USUAL_S = 300.0
+"""Driving time per event of a kind for it to be an incident [s]; more frequent ones are typical."""
+
+
+class Span(NamedTuple):
+    """Kind of a contradiction, its start and its end [s], and its gain in log-likelihood."""
+
+    kind: Kind
+    start: float
+    end: float
+    nats: float
+
+
+@dataclass(frozen=True)
+class Spans:
+    """Contradictions of a run.
+
+    Attributes:
+        wrong: samples of the grid with wrong poses, shape (n,).
+        excluded: samples with an incident, or about one, shape (n,).
+        findings: on all of them.
+        incidents: what happened to the vehicle, in order.
+    """
+
+    wrong: Flags
+    excluded: Flags
+    findings: tuple[Finding, ...] = field(default=())
+    incidents: tuple[Span, ...] = field(default=())
+
+
+@dataclass(frozen=True)
+class Rims:
+    """Speeds on the grid, as (x, y, w times half the track) [m/s], shape (n, 3) each.
+
+    Attributes:
+        times: [s], shape (n,).
+        asked: by the command, zero without a valid one.
+        is_known: whether a command is valid, or the topic is silent after its first one, shape (n,).
+        expired: by the last command where it is too old to be valid, else zero.
+        driven: by the measured wheels, NaN where unknown; None without encoders.
+        moved: by the poses.
+        top: usual largest speed of the fastest rim.
+    """
+
+    times: Floats
+    asked: Floats
+    is_known: Flags
+    expired: Floats
+    driven: Floats | None
+    moved: Floats
+    top: float
+
+
+def gather_rims(velocities: pl.DataFrame, inputs: Mapping[str, Ideal], vehicle: Vehicle) -> Rims | None:
+    """Speeds of the rims on the grid; None without commanded or measured motion."""
+    times = velocities["t"].to_numpy()
+    scale = np.array([1.0, 1.0, 0.5 * vehicle.kinematics.turning_width_m(vehicle)])
+    command, measured = inputs.get("command"), inputs.get("measured")
+    asked = expired = np.zeros((times.size, 3))
+    known = np.zeros(times.size, dtype=bool)
+    if command is not None:
+        counts = np.asarray(np.isfinite(command.velocity).all(axis=1), dtype=bool)
+        asked, expired = np.where(counts[:, None], command.velocity, 0.0) * scale, command.expired * scale
+        known = np.asarray((counts | command.stale) & command.active, dtype=bool)
+    driven = None if measured is None else measured.velocity * scale
+    sizes = [np.abs(one).sum(axis=1) for one in (asked, driven) if one is not None]
+    moving = [one[one > STILL_MPS] for one in sizes if (one > STILL_MPS).any()]
+    if not moving:
+        return None
+    top = max(float(np.quantile(one, 0.95)) for one in moving)
+    moved = velocities.select("v_x", "v_y", "v_w").to_numpy() * scale
+    return Rims(times, asked, known, expired, driven, moved, top)
+
+
+def mark_excluded(times: Floats, incidents: Sequence[Span]) -> Flags:
+    """Samples that incidents exclude, shape (n,)."""
+    excluded = np.zeros(times.size, dtype=bool)
+    for one in incidents:
+        excluded |= (times >= one.start - _MARGIN_S) & (times <= one.end + _COASTS_S)
+    return excluded
+
+
+def find_spans(
+    velocities: pl.DataFrame,
+    poses: pl.DataFrame,
+    inputs: Mapping[str, Ideal],
+    vehicle: Vehicle,
+    hold_s: float | None,
+) -> Spans:
+    """Contradictions of a run.
+
+    Args:
+        velocities: table `velocities`, of poses alone.
+        poses: table `poses` as extracted.
+        inputs: ideal velocities by input.
+        vehicle: its track converts yaw rates to rim speeds.
+        hold_s: how long a command is valid.
+    """
+    times = velocities["t"].to_numpy()
+    rims = gather_rims(velocities, inputs, vehicle)
+    if rims is None:
+        nothing = np.zeros(times.size, dtype=bool)
+        return Spans(nothing, nothing)
+    blocks = _Blocks(rims.times)
+    spans, findings = _compare_command(rims, blocks, hold_s)
+    if rims.driven is not None:
+        spans += _compare_wheels(rims, blocks, poses)
+    spans.sort(key=lambda one: one.start)
+    incidents = tuple(one for one in spans if one.kind in _MEANS)
+    bad = [one for one in spans if one.kind not in _MEANS]
+    wrong = np.zeros(times.size, dtype=bool)
+    for one in bad:
+        wrong |= (times >= one.start) & (times <= one.end)
+    if bad:
+        findings.append(_report_poses(bad, wrong, rims))
+    findings += [
+        Finding(
+            one.kind, "warning", f"{_MEANS[one.kind]}; left out of all fits",
+            where="command" if one.kind == "commands_silent"
+            else "pose" if one.kind == "localization_frozen" else "",
+            t_start=one.start, t_end=one.end, value=one.end - one.start,
+        )
+        for one in incidents
+    ]  # fmt: skip
+    return Spans(wrong, mark_excluded(times, incidents), tuple(findings), incidents)
+
+
+def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
+    driven = np.zeros(1) if rims.driven is None else np.abs(np.nan_to_num(rims.driven)).sum(axis=1)
+    share = float(wrong.sum() / max(int((driven > LIVE_SHARE * rims.top).sum()), 1))
+    seconds = {
+        words: sum(one.end - one.start for one in bad if one.kind == kind)
+        for kind, words in _BAD_POSES.items()
+    }
+    shown = [f"{words} ({of:.3g} s)" for words, of in seconds.items() if of > 0.0]
+    text = (
+        f"{sum(seconds.values()):.3g} s of the poses ({format_share(share)} of the driving) have "
+        f"{' or '.join(shown)}: left out of medians and fits"
+    )
+    return Finding(
+        "bad_stretch", "warning", text, where="pose", t_start=bad[0].start, value=share, count=len(bad)
+    )
+
+
+@compiled("void(float64[:, ::1], boolean[::1], float64)")
+def _follow(values: Floats, is_first: Flags, gain: float) -> None:
+    for k in range(1, values.shape[0]):
+        if not is_first[k]:
+            for i in range(values.shape[1]):
+                values[k, i] = values[k - 1, i] + gain * (values[k, i] - values[k - 1, i])
+
+
+class _Blocks:
+    """Blocks of the grid, none across a gap.
+
+    Attributes:
+        start, end: times of the first and the last sample [s], shape (m,).
+        is_first: whether the block follows a gap, shape (m,).
+        is_whole: whether the block is no small piece, shape (m,).
+    """
+
+    def __init__(self, times: Floats) -> None:
+        breaks = np.append(True, np.diff(times) > 1.5 * float(np.median(np.diff(times))))
+        number = number_stretches(times - times[0], BLOCK_S)
+        begins = np.flatnonzero(breaks | np.append(True, np.diff(number) != 0))
+        self._begins, self._sizes = begins, np.diff(np.append(begins, times.size))
+        self.start, self.end = times[begins], times[begins + self._sizes - 1]
+        self.is_first = breaks[begins]
+        self.is_whole = self._sizes > 0.5 * float(np.max(self._sizes))
+
+    def average(self, values: Floats) -> Floats:
+        """Means of some columns, shape (m, k)."""
+        return np.asarray(np.add.reduceat(values, self._begins) / self._sizes[:, None], dtype=np.float64)
+
+    def hold_all(self, flags: Flags) -> Flags:
+        """Whether all samples of a block have all of some flags, shape (m,)."""
+        return np.asarray(np.logical_and.reduceat(flags.all(axis=1), self._begins), dtype=bool)
+
+    def delay(self, values: Floats) -> Floats:
+        """Values of the block before, of the same one after a gap, shape (m, k)."""
+        before = np.roll(values, 1, axis=0)
+        before[self.is_first] = values[self.is_first]
+        return before
+
+    def follow(self, values: Floats) -> Floats:
+        """Values after a first-order lag, shape (m, k)."""
+        made = np.array(values, order="C")
+        _follow(made, self.is_first, 1.0 - float(np.exp(-BLOCK_S / _SLOW_S)))
+        return made
+
+    def list_columns(self, source: Floats, top: float, friction: float) -> Floats:
+        """What may follow from a source, shape (m, k).
+
+        Args:
+            source: shape (m, 3).
+            top: its usual largest size.
+            friction: speed of a side up to which it may differ, as a fraction of that.
+        """
+        sides = np.column_stack((source[:, 0] - source[:, 2], source[:, 0] + source[:, 2]))
+        now = np.hstack((source, np.where(np.abs(sides) > friction * top, sides, 0.0)))
+        before = self.delay(now)
+        ahead, turned = source[:, :1], source[:, 2:] / top
+        product = np.hstack((ahead * turned, ahead * np.abs(turned), np.abs(ahead) * turned))
+        return np.hstack((now, before, self.follow(before), product))
+
+    def list_spans(self, gains: Floats) -> list[slice]:
+        """Likeliest spans that do not follow (Viterbi).
+
+        Args:
+            gains: log-likelihood of other hypotheses less that of following, shape (m, k).
+        """
+        gains = np.column_stack((np.zeros(len(gains)), gains - _LASTS_NATS))
+        change = self.price * (1.0 - np.eye(gains.shape[1]))
+        # A recording may begin and end at any time.
+        score, origin = np.zeros(gains.shape[1]), np.zeros(gains.shape, dtype=np.int64)
+        for k, gain in enumerate(gains):
+            routes = score[:, None] - change
+            origin[k] = routes.argmax(axis=0)
+            score = routes.max(axis=0) + gain
+        states = np.zeros(len(gains), dtype=np.int64)
+        state = int(score.argmax())
+        for k in range(len(gains) - 1, -1, -1):
+            states[k], state = state, int(origin[k, state])
+        return [slice(*one) for which in range(1, gains.shape[1]) for one in find_runs(states == which)]
+
+    @property
+    def price(self) -> float:
+        """Log-likelihood that a change of the hypothesis costs: any block might have one."""
+        return float(np.log(self.start.size / LEVEL))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """How a target follows a source.
+
+    Attributes:
+        top: usual largest size of the source.
+        friction: speed of a side up to which its motion differs, as a fraction of that.
+        gains: coefficients of `_Blocks.list_columns`, shape (k, 3).
+        target, expected: shape (m, 3).
+        scale: of the noise, shape (3,).
+        spread: of the target itself, shape (3,).
+        is_judged: blocks in which both are known, shape (m,).
+    """
+
+    top: float
+    friction: float
+    gains: Floats
+    target: Floats
+    expected: Floats
+    scale: Floats
+    spread: Floats
+    is_judged: Flags
+
+    @property
+    def total(self) -> float:
+        """Log-likelihood of all that is judged."""
+        return float(self.likelihood(self.expected)[self.is_judged].sum())
+
+    def likelihood(self, expected: Floats) -> Floats:
+        """Log-likelihood of every block if something is expected, shape (m,)."""
+        return np.asarray(
+            sum(list_likelihoods(self.target[:, i] - expected[:, i], self.scale[i]) for i in range(3))
+        )
+
+    def compare(self) -> Floats:
+        """Log-likelihood of other hypotheses less that of following, shape (m, 4).
+
+        The target stands; it moves in any way; each of its parts does this or that; or its length follows,
+        and its direction does not.
+        """
+        still, broad = (
+            np.column_stack([list_likelihoods(self.target[:, i], one[i]) for i in range(3)])
+            for one in (self.scale, self.spread)
+        )
+        # Any direction is as likely, and the length is what follows.
+        length, usual = (np.hypot(one[:, 0], one[:, 1]) for one in (self.target, self.expected))
+        turned = (
+            list_likelihoods(length - usual, self.scale[0])
+            - np.log(2.0 * np.pi * np.maximum(usual, self.scale[0]))
+            - LOG_PEAK
+            + list_likelihoods(self.target[:, 2] - self.expected[:, 2], self.scale[2])
+        )
+        parts = (still, broad, np.maximum(still, broad))
+        made = np.column_stack((*(one.sum(axis=1) for one in parts), turned))
+        follows = self.likelihood(self.expected)[:, None]
+        return np.where(self.is_judged[:, None], made - follows, 0.0)
+
+
+def _fit(
+    blocks: _Blocks, source: Floats, target: Floats, is_known: Flags, *, is_command: bool
+) -> _Fit | None:
+    """Fit what a target usually does of a source; None with too little motion."""
+    is_judged = is_known & blocks.is_whole
+    if is_command:
+        # After a gap nobody knows what its state was.
+        is_judged &= ~blocks.is_first & np.append(False, is_known[:-1])
+    size = np.abs(source).sum(axis=1)
+    if not (size > STILL_MPS).any():
+        return None
+    top = float(np.quantile(size[size > STILL_MPS], 0.95))
+    moves = size + np.abs(target).sum(axis=1) > 2.0 * _SAME * top
+    rows = is_judged & (np.convolve(moves, np.ones(3), "same") > 0.0)
+    if rows.sum() < _FEWEST_BLOCKS:
+        return None
+    values, least = target[rows], _SAME * top
+    spread = np.array([np.hypot(find_scale(values[:, i]), least) for i in range(3)])
+    fits = []
+    for friction in _FRICTIONS if is_command else _FRICTIONS[:1]:
+        columns = blocks.list_columns(source, top, friction)
+        solved = [_solve(columns[rows], values[:, i]) for i in range(3)]
+        gains = np.column_stack([one[0] for one in solved])
+        scale = np.hypot([find_scale(one[1]) for one in solved], least)
+        fits.append(_Fit(top, friction, gains, target, columns @ gains, scale, spread, is_judged))
+    return max(fits, key=lambda one: one.total)
+
+
+def _solve(columns: Floats, values: Floats) -> tuple[Floats, Floats]:
+    """Coefficients and residuals of a robust regression."""
+    size = np.sqrt(np.mean(columns**2, axis=0)) + _TINY
+    design, weight = columns / size, np.ones(values.size)
+    ridge = _TINY * values.size * np.eye(size.size)
+    gains, rest = np.zeros(size.size), values
+    for _ in range(_ROUNDS):
+        weighted = design * weight[:, None]
+        gains = np.linalg.solve(weighted.T @ design + ridge, weighted.T @ values)
+        rest = values - design @ gains
+        weight = weigh(rest)
+    return gains / size, rest
+
+
+def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple[list[Span], list[Finding]]:
+    """Spans in which the wheels, or the body without encoders, do not follow the command."""
+    measured = rims.moved if rims.driven is None else rims.driven
+    known = blocks.hold_all(np.column_stack((rims.is_known, np.isfinite(measured))))
+    target = blocks.average(np.nan_to_num(measured))
+    asked, last = blocks.average(rims.asked), blocks.average(rims.expired)
+    fit = _fit(blocks, asked, target, known, is_command=True)
+    if fit is None:
+        return [], []
+    silent: Flags = np.asarray(rims.expired.any(axis=1), dtype=bool)
+    pauses = [(float(rims.times[a]), float(rims.times[b - 1])) for a, b in find_runs(silent)]
+    spans, findings = list[Span](), list[Finding]()
+    if pauses:
+        # Does the base keep its last command, or does it stop?
+        keeps = _fit(blocks, asked + last, target, known, is_command=True)
+        if keeps is not None and keeps.total - fit.total > blocks.price:
+            fit, asked = keeps, asked + last
+            longest = max(end - start for start, end in pauses)
+            text = (
+                f"in {len(pauses)} pauses the vehicle continues its last command until the next, for up to "
+                f"{longest:.1f} s beyond command.hold_s: the base holds its last command; set "
+                "command.hold_s to the longest pause to include these stretches"
+            )
+            findings.append(
+                Finding("kept_command", "warning", text, where="command", value=longest, count=len(pauses))
+            )
+        elif hold_s is not None:
+            spans += _list_silent(rims, blocks, fit, asked + last, pauses, hold_s)
+    for one in _list_contradictions(blocks, fit, asked):
+        if one.motion == "stands" and one.is_driven:
+            spans.append(Span("emergency_stop", one.start, one.end, one.nats))
+        elif not one.is_driven:
+            spans.append(Span("manual_driving", one.start, one.end, one.nats))
+    return spans, findings
+
+
+class _Contradiction(NamedTuple):
+    """A span in which a target does not follow its source.
+
+    Attributes:
+        start, end: [s].
+        nats: gain in log-likelihood.
+        is_driven: whether the source moves.
+        motion: ``stands``, ``turned`` (of the usual length), ``longer`` or ``shorter``: the likeliest.
+    """
+
+    start: float
+    end: float
+    nats: float
+    is_driven: bool
+    motion: str
+
+
+def _list_contradictions(blocks: _Blocks, fit: _Fit, source: Floats) -> list[_Contradiction]:
+    gains, made = fit.compare(), []
+    size = np.abs(source).sum(axis=1)
+    for part in blocks.list_spans(gains[:, 2:]):
+        stands, free, mixed, turned = gains[part].T
+        moved, usual = (np.hypot(one[part, 0], one[part, 1]).sum() for one in (fit.target, fit.expected))
+        free_as = "longer" if moved > usual else "shorter"
+        sums = {"stands": stands.sum(), free_as: free.sum(), "turned": turned.sum()}
+        # Where it shows, not where both stand.
+        shown = np.maximum(np.maximum(mixed, turned), 0.0)
+        made.append(
+            _Contradiction(
+                float(blocks.start[part.start]),
+                float(blocks.end[part.stop - 1]),
+                float(max(mixed.sum(), turned.sum())),
+                float(shown @ size[part]) > LIVE_SHARE * fit.top * float(shown.sum()),
+                max(sums, key=lambda one: sums[one]),
+            )
+        )
+    return made
+
+
+def _list_silent(
+    rims: Rims,
+    blocks: _Blocks,
+    fit: _Fit,
+    asked: Floats,
+    pauses: Sequence[tuple[float, float]],
+    hold_s: float,
+) -> list[Span]:
+    """Pauses of the commands in which the vehicle stopped; none if that is its usual end of a motion."""
+    goes_on = fit.likelihood(blocks.list_columns(asked, fit.top, fit.friction) @ fit.gains)
+    stops = np.where(fit.is_judged, fit.likelihood(np.zeros_like(asked)) - goes_on, 0.0)
+    total = np.append(0.0, np.cumsum(stops))
+    silent = []
+    for start, end in pauses:
+        first, last = np.searchsorted(blocks.start, (start, end))
+        nats = float(total[last] - total[first])
+        if nats > 2.0 * blocks.price:
+            silent.append(Span("commands_silent", start - hold_s, end, nats))
+    driven_s = BLOCK_S * float((np.abs(fit.target).sum(axis=1) > LIVE_SHARE * rims.top).sum())
+    return silent if len(silent) <= max(driven_s / USUAL_S, 1.0) else []
+
+
+def _compare_wheels(rims: Rims, blocks: _Blocks, poses: pl.DataFrame) -> list[Span]:
+    """Spans in which the body does not follow its wheels."""
+    driven = np.zeros((rims.times.size, 3)) if rims.driven is None else rims.driven
+    known = blocks.hold_all(np.isfinite(driven))
+    source, asked = blocks.average(np.nan_to_num(driven)), blocks.average(rims.asked)
+    fit = _fit(blocks, source, blocks.average(rims.moved), known, is_command=False)
+    spans = list[Span]()
+    for one in _list_contradictions(blocks, fit, source) if fit is not None else ():
+        kind: Kind | None = None
+        if not one.is_driven:
+            part = slice(*np.searchsorted(blocks.start, (one.start, one.end)))
+            # Wheels that are locked under a command slide.
+            kind = None if np.abs(asked[part]).sum(axis=1).mean() > LIVE_SHARE * rims.top else "pushed"
+        elif one.motion == "stands":
+            kind = "localization_frozen" if _is_frozen(poses, one.start, one.end) else "stuck"
+        elif one.motion != "shorter":
+            # Wheels that spin bring less, which is no fault of the poses.
+            kind = "rotated" if one.motion == "turned" else "lost"
+        if kind is not None:
+            spans.append(Span(kind, one.start, one.end, one.nats))
+    return spans
+
+
+def _is_frozen(poses: pl.DataFrame, start: float, end: float) -> bool:
+    """Whether most of a span has no pose but one."""
+    times = poses["t"].to_numpy()
+    fresh = np.concatenate(([start], times[~poses["held"].to_numpy()], [end]))
+    inside = fresh[(fresh >= start) & (fresh <= end)]
+    return bool(np.max(np.diff(np.sort(inside))) > 0.5 * (end - start))
