@@ -234,7 +234,7 @@ def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
         assert noise[1] == pytest.approx(0.03, rel=0.25)  # type: ignore[index, call-overload]
 
 
-def test_motion_that_lasts_is_no_noise_of_poses() -> None:
+def test_motion_that_lasts_is_reported_as_such() -> None:
     left = []
     for unseen in (Disturbance(), Disturbance(0.1, 0.1, correlation_s=4.0)):
         run = simulate({"effective_track": 1.8}, duration_s=300.0, disturbance=unseen)
@@ -245,8 +245,6 @@ def test_motion_that_lasts_is_no_noise_of_poses() -> None:
         assert quiet["lasting"][channel] < 0.1 * size  # type: ignore[index, call-overload, operator]
         # It stops while the wheels stand.
         assert 0.5 * size < pushed["lasting"][channel] < 1.2 * size  # type: ignore[index, call-overload, operator]
-        same = quiet["pose_noise"][channel]  # type: ignore[index, call-overload]
-        assert pushed["pose_noise"][channel] == pytest.approx(same, rel=0.3)  # type: ignore[index, call-overload]
 
 
 def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> None:
