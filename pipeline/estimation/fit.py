@@ -33,6 +33,8 @@ _NEWS = 0.02
 _MOST_STEPS = 20
 _ROUNDS = 3
 """Times that the noise is learned anew from the residuals of a fit."""
+_EXACT_ROUNDS = 24
+"""The same at most for a model that is written: six digits of a lag need more than six."""
 _SAME_NOISE = 0.03
 """Change of the noise's correlation, share and relative scale below which it counts as the same."""
 _GRID_ROUNDS = 4
@@ -212,7 +214,7 @@ def fit_part(
     fit = PartFit(part, start, free, residual, columns, known)
     if not free:
         return fit
-    for _ in range(_ROUNDS * (1 + exact)):
+    for _ in range(_EXACT_ROUNDS if exact else _ROUNDS):
         fit = _descend(fit, enough, most)
         for number in fit.free:
             if not number.is_smooth:
