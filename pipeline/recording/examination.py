@@ -12,6 +12,7 @@ import polars as pl
 from pipeline.core import SlipError, enumerate_texts
 from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
+from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
     WHEELS,
     Axis,
@@ -33,6 +34,7 @@ from pipeline.recording.geometry import (
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import SIDES, Bent, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
+from pipeline.run import Alignment
 from pipeline.sources import (
     CONFIGURED,
     Configuration,
@@ -44,6 +46,7 @@ from pipeline.sources import (
     Vehicle,
 )
 from pipeline.stages import Finding
+from pipeline.stages.drive_numbers import find_timeout, report_timeout
 from pipeline.stages.extract import Extraction
 from pipeline.stages.reading import find_sideways_share
 
@@ -82,6 +85,7 @@ class Recording:
         kind: kind of vehicle that the signals show; empty if they show none.
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
+        alignment: corrections of the command; None where nothing shows them.
     """
 
     sources: Sources
@@ -90,6 +94,7 @@ class Recording:
     kind: str = ""
     geometry: Geometry = field(default_factory=Geometry)
     evidence: tuple[Evidence, ...] = ()
+    alignment: Alignment | None = None
 
 
 _STILL = 0.1
@@ -220,6 +225,7 @@ class Examination:
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
             self._read_again(wheels, motion, kind or "differential")
         self._find_units(command, wheels)
+        alignment = self._measure_command(command, wheels, kind, motion)
         used = (("command", command), ("wheels", wheels))
         roles = {id(one.reading): role for role, one in used if one is not None}
         roles |= {id(gyro): "gyro"} if gyro is not None else {}
@@ -231,6 +237,7 @@ class Examination:
             # Lengths that are known are not measured again.
             Geometry() if self.is_known else self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
+            alignment,
         )
 
     # Signals.
@@ -655,6 +662,47 @@ class Examination:
 
     def _is_usable(self, drive: Candidate) -> bool:
         return drive.is_sure and not is_crossed(drive)
+
+    # Scale of the command, and how long it is valid.
+
+    def _measure_command(
+        self, command: Candidate | None, wheels: Candidate | None, kind: str, motion: Motion | None
+    ) -> Alignment | None:
+        """Corrections of the command as it is read with all others; its time-out goes into the configuration.
+
+        Args:
+            command: the candidate for it.
+            wheels: the candidate for them.
+            kind: of the vehicle, if its signals show it.
+            motion: of the poses; None where wheels stand in for them.
+        """
+        if command is None:
+            return None
+        vehicle, made = self.vehicle, self._complete()
+        if kind and not self.is_known:
+            vehicle = msgspec.structs.replace(vehicle, kind=kind)
+        self.extraction.vehicle = vehicle
+        try:
+            asked = self.extraction.read_drive(command.source, made.command, held=True)
+            got = pl.DataFrame()
+            if wheels is not None:
+                got = self.extraction.read_drive(wheels.source, made.wheels, held=False)
+        except SlipError:
+            return None
+        is_body = command.reading.form == "body"
+        alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
+        if self.is_known or not is_body:
+            alignment, findings = measure_command_scale(asked, got, vehicle, body_commanded=is_body)
+            self.findings += findings
+        rates = motion.rates if got.is_empty() and motion is not None else None
+        if rates is None and not got.is_empty():
+            rates = roll(got, vehicle)
+        timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
+        if timeout is not None:
+            hold_s = made.command.hold_s or timeout.seconds
+            self.changes.setdefault("command", {})["hold_s"] = hold_s
+            self.findings.append(report_timeout(timeout, hold_s))
+        return alignment
 
     # Geometry.
 

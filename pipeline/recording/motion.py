@@ -54,6 +54,13 @@ class Motion:
         """Changes of the heading [rad]."""
         return -self.turned if self.flip else self.turned
 
+    @property
+    def rates(self) -> tuple[Floats, Floats]:
+        """Times in the middle of the steps [s], shape (n,), and velocities of the body, shape (n, 3)."""
+        elapsed = self.steps.end - self.steps.start
+        moved = np.column_stack((self.body.real, self.body.imag, self.yaw))
+        return 0.5 * (self.steps.start + self.steps.end), moved / elapsed[:, None]
+
     def turn(self, *, flip: bool, offset_deg: float) -> Motion:
         """The same poses in another frame."""
         return replace(self, flip=flip, offset_deg=offset_deg)

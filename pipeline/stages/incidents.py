@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.sources import Vehicle
-    from pipeline.stages.slip_stage import Ideal
+    from pipeline.stages.inputs import Ideal
 
 # Three speeds of the fastest rim are compared: of the command, of the measured wheels, of the body. Each kind
 # of incident is a contradiction between them that lasts longer than a lag or a delay. Permanent behaviour of

@@ -33,7 +33,7 @@ from pipeline.simulate import (
 from pipeline.stages import Finding
 from pipeline.stages.align import align_tables
 from pipeline.stages.incidents import find_incidents
-from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.inputs import Ideal
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": 1.7, "drive_lag": 0.3, "icr_offset": 0.1}
