@@ -217,7 +217,7 @@ class Findings(Table):
 class Velocities(Table):
     """One row a step of the uniform grid inside a segment."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     t = schemas.seconds()
     stamp = schemas.stamp()
@@ -230,6 +230,10 @@ class Velocities(Table):
     v_y = schemas.body("m/s", "body velocity to the left")
     v_w = schemas.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
     v_w_imu = schemas.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
+    recorded_t = schemas.seconds("the stamp of these poses, before their latency was taken off")
+    recorded_x = schemas.body("m/s", "v_x by these stamps")
+    recorded_y = schemas.body("m/s", "v_y by these stamps")
+    recorded_w = schemas.body("rad/s", "yaw rate of the poses by these stamps")
     outlier = schemas.flag("the localization contradicts the wheels")
 
 
@@ -319,7 +323,9 @@ class Aggregates(Table):
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip modulus")
-    median_recorded_modulus = schemas.optional("m/s", "the same as recorded, before any correction")
+    median_recorded_modulus = schemas.optional(
+        "m/s", "the same as recorded, before any correction, nothing left out"
+    )
     median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")

@@ -32,7 +32,12 @@ _SAME = 0.05
 
 
 def measure_command_scale(
-    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, *, body_commanded: bool
+    commands: pl.DataFrame,
+    wheels: pl.DataFrame,
+    vehicle: Vehicle,
+    *,
+    body_commanded: bool,
+    gain: float | None = None,
 ) -> tuple[Alignment, tuple[Finding, ...]]:
     """Compare commanded motion with that of the measured wheels.
 
@@ -41,6 +46,8 @@ def measure_command_scale(
         wheels: table `wheels`; may be empty.
         vehicle: as configured.
         body_commanded: whether the command was a body command, which the controller converts to wheel speeds.
+        gain: motion of the poses over a body command; if it is nearer to one than to that of the wheels, the
+            wheels have another radius, and the command is right.
 
     Returns:
         The corrections of the command, neutral where nothing shows them, and findings on them.
@@ -50,7 +57,8 @@ def measure_command_scale(
     forward, turning = (find_ratio(*pair) for pair in zip(asked, got, strict=True))
     if forward is None:
         return neutral, ()
-    if abs(np.log(forward)) > _SCALED:
+    is_right = gain is not None and abs(np.log(gain)) < abs(np.log(gain / forward))
+    if abs(np.log(forward)) > _SCALED and not is_right:
         turning = _find_median(asked[1], got[1]) or forward
         return _explain_scale(neutral, (forward, turning), vehicle, body_commanded=body_commanded)
     if turning is None or not body_commanded or not _is_multiplied(turning / forward, vehicle):

@@ -14,6 +14,7 @@ from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
 from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
+    SPEEDS,
     WHEELS,
     Axis,
     Reversal,
@@ -692,7 +693,12 @@ class Examination:
         is_body = command.reading.form == "body"
         alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
         if self.is_known or not is_body:
-            alignment, findings = measure_command_scale(asked, got, vehicle, body_commanded=is_body)
+            gain, made_of = None, command.reading.explained
+            if is_body and made_of is not None and command.sign("ahead") > 0:
+                gain = float(made_of.ahead.gains[0]) / SPEEDS.get(made.command.unit or "m/s", 1.0)
+            alignment, findings = measure_command_scale(
+                asked, got, vehicle, body_commanded=is_body, gain=gain
+            )
             self.findings += findings
         rates = motion.rates if got.is_empty() and motion is not None else None
         if rates is None and not got.is_empty():

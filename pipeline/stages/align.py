@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import arrays
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Flags, Floats
 from pipeline.run import Alignment, GyroFit, tabulate_alignment
 from pipeline.run.signals import ANSWERS_S
 from pipeline.sources import Vehicle
@@ -30,8 +30,6 @@ from pipeline.stages.velocity import smooth_gyro
 
 _LEAST_S = 0.05
 """Least delay of encoders [s] that is corrected here; fits find shorter ones (six of twelve recordings)."""
-_GRID = VelocitySection()
-"""Grid on which that delay is measured, whatever the settings of the later stages."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +83,7 @@ def align_tables(
         {**tables, "commands": asked, "wheels": wheels},
         aligned_vehicle,
         replace(known, body_multiplier=multiplier),
-        outlier=np.zeros(tables["poses"].height, dtype=bool),
+        is_live=_find_live(tables["poses"], asked, known.hold_s),
         is_localization=not is_drive_alone,
         where=where,
     )
@@ -100,6 +98,17 @@ def align_tables(
     made = {"poses": poses, "commands": asked, "wheels": wheels, "alignments": tabulate_alignment(alignment)}
     findings = (*echo, *held, *late_starts, *_report(alignment))
     return Aligned({**tables, **made}, alignment, aligned_vehicle, findings)
+
+
+def _find_live(poses: pl.DataFrame, commands: pl.DataFrame, hold_s: float | None) -> Flags:
+    """Poses at which recorded commands drive the vehicle, shape (n,)."""
+    live = poses["active"].to_numpy()
+    if commands.is_empty() or hold_s is None:
+        return live
+    times, stamps = poses["t"].to_numpy(), commands["t"].to_numpy()
+    last = arrays.hold_indices(times, stamps)
+    live = live & (last >= 0) & (times - stamps[np.maximum(last, 0)] <= hold_s)
+    return np.asarray(live, dtype=bool)
 
 
 def measure_wheel_delay(
@@ -117,10 +126,9 @@ def measure_wheel_delay(
     """
     if gyro is None or wheels.is_empty():
         return 0.0
-    first, last = float(wheels["t"][0]), float(wheels["t"][-1])
-    times = arrays.make_grid(first, last, _GRID.rate_hz)
+    times = wheels["t"].to_numpy()
     turning = interpolate_wheels(times, wheels, vehicle).velocity[:, 2]
-    seen = smooth_gyro(times, imu, gyro, _GRID.window_s)
+    seen = smooth_gyro(times, imu, gyro, VelocitySection().window_s)
     known = np.isfinite(turning) & np.isfinite(seen)
     delay = estimate_delay(times[known], turning[known], times[known], seen[known])
     if delay is None or abs(delay.correlation) < LEAST_CORRELATION or delay.seconds < _LEAST_S:

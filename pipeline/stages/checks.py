@@ -262,9 +262,11 @@ def check_run(
     if is_drive_alone or "measured" not in slip.recorded:
         return findings
     recorded = {"measured": slip.recorded["measured"].leave_out(slip.suspect)}
-    samples = gather_samples(velocities, recorded, slip.cut, body_commanded=body_commanded)
+    names = {"recorded_t": "t", "recorded_x": "v_x", "recorded_y": "v_y", "recorded_w": "v_w"}
+    stamped = velocities.drop(*names.values()).rename(names)
+    samples = gather_samples(stamped, recorded, slip.cut, body_commanded=body_commanded)
     periods = [_find_period(tables[name]) for name in ("wheels", "poses")]
-    return check_independence(replace(samples, times=slip.stamps), vehicle, periods) + findings
+    return check_independence(samples, vehicle, periods) + findings
 
 
 def _find_period(table: pl.DataFrame) -> float:

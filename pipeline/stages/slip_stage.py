@@ -30,7 +30,6 @@ class SlipResult:
         inputs: all known inputs on the grid.
         recorded: the same as recorded, at the stamps of the poses; of measured wheels even if nothing uses
             them.
-        stamps: of the poses on the grid, before their latency was taken off [s], shape (n,).
         suspect: samples in an incident, or with wrong poses, shape (n,).
         cut: command steps.
         findings: findings of the stage.
@@ -41,7 +40,6 @@ class SlipResult:
     events: pl.DataFrame
     inputs: Mapping[str, Ideal]
     recorded: Mapping[str, Ideal]
-    stamps: Floats
     suspect: Flags
     cut: Steps
     findings: tuple[Finding, ...] = field(default=())
@@ -94,9 +92,9 @@ def compute_slip(
         raise StageError("no_command", what, where=where, hint=hint)
     length = configuration.slip.length_scale_m
     cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
-    base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
-        step=pl.Series(cut.step), transitory=pl.Series(cut.transitory)
-    )
+    base = velocities.select(
+        "t", "stamp", "segment", "v_x", "v_y", "v_w", "recorded_x", "recorded_y", "recorded_w"
+    ).with_columns(step=pl.Series(cut.step), transitory=pl.Series(cut.transitory))
     incidents = find_incidents(velocities, tables, known, vehicle, hold_s)
     findings = [*_report_stale(times, ideals), *incidents.findings]
     suspect, motion = incidents.excluded | velocities["outlier"].to_numpy(), MotionEvents()
@@ -106,7 +104,7 @@ def compute_slip(
         motion = find_events(velocities, known, vehicle, bad, incidents.spans)
         findings += [*contradictions, *motion.findings]
         suspect |= bad
-    stamps = _find_stamps(times, tables["poses"])
+    stamps = velocities["recorded_t"].to_numpy()
     # Readings that were repeated are no correction, unless nothing uses them.
     witness = wheels.drop(cs.ends_with("_aligned")) if "measured" not in known else wheels
     if not witness.is_empty():
@@ -115,30 +113,24 @@ def compute_slip(
     parts = [_tabulate(base, name, ideal, recorded[name], suspect, length) for name, ideal in ideals.items()]
     slip = pl.concat(parts)
     windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
-    return SlipResult(slip, windows, motion.table, known, recorded, stamps, suspect, cut, tuple(findings))
-
-
-def _find_stamps(times: Floats, poses: pl.DataFrame) -> Floats:
-    """Stamps of the poses at grid times, before their latency was taken off [s]."""
-    late = poses["latency"].to_numpy()
-    stamps: Floats = times + np.interp(times, np.maximum.accumulate(poses["t"].to_numpy() - late), late)
-    return stamps
+    return SlipResult(slip, windows, motion.table, known, recorded, suspect, cut, tuple(findings))
 
 
 def _tabulate(
     base: pl.DataFrame, name: str, ideal: Ideal, recorded: Ideal, suspect: Flags, length: float
 ) -> pl.DataFrame:
     """Table `slip` of one input: samples with a known input in live intervals."""
-    velocity, moved = ideal.velocity, base.select("v_x", "v_y", "v_w").to_numpy()
+    velocity = ideal.velocity
     mask = np.isfinite(velocity).all(axis=1) & ideal.active
-    slip, scale = velocity - moved, np.array([1.0, 1.0, length])
-    modulus, before = (np.linalg.norm(gap * scale, axis=1) for gap in (slip, recorded.velocity - moved))
+    slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
+    before = recorded.velocity - base.select("recorded_x", "recorded_y", "recorded_w").to_numpy()
+    modulus, raw = (np.linalg.norm(gap * np.array([1.0, 1.0, length]), axis=1) for gap in (slip, before))
     return base.with_columns(
         pl.lit(name, dtype=pl.Enum(["command", "measured"])).alias("input"),
         *(pl.Series(f"f_{axis}", velocity[:, i]) for i, axis in enumerate("xyw")),
         *(pl.Series(f"g_{axis}", slip[:, i]) for i, axis in enumerate("xyw")),
         pl.Series("modulus", modulus),
-        pl.Series("recorded_modulus", before).fill_nan(None),
+        pl.Series("recorded_modulus", raw).fill_nan(None),
         pl.Series("suspect", suspect),
         # Filled where a model is available; this stage only knows the ideal one.
         *(
@@ -237,6 +229,7 @@ def aggregate_run(
             chosen = [
                 frame.filter((pl.col("input") == name) & _in_subset(subset)) for frame in (clean, whole)
             ]
+            raw = slip.filter((pl.col("input") == name) & _in_subset(subset))
             energy = 0.5 * pl.lit(vehicle.mass_kg, dtype=pl.Float64) * find_fastest() ** 2
             split = _split_parts(clean.filter(_in_subset(subset)), length) if name == "command" else {}
             rows.append(
@@ -244,6 +237,7 @@ def aggregate_run(
                     "input": name,
                     "subset": subset,
                     **_summarize_slip(chosen[0], chosen[1]),
+                    "median_recorded_modulus": _number(raw["recorded_modulus"].median()),
                     **_measure_distance(chosen[0], period, moves=moves),
                     **split,
                     "height_rate": height_rate,
@@ -289,7 +283,6 @@ def _summarize_slip(slip: pl.DataFrame, windows: pl.DataFrame) -> dict[str, floa
         "samples": slip.height,
         "windows": windows.height,
         "median_modulus": _number(slip["modulus"].median()),
-        "median_recorded_modulus": _number(slip["recorded_modulus"].median()),
         "median_window_norm": _number(windows["window_norm"].median()),
         **{f"rms_{axis}": _root_mean_square(slip[f"g_{axis}"]) for axis in "xyw"},
         "mean_square": _number((slip["modulus"] ** 2).mean()),

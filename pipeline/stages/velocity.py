@@ -223,6 +223,13 @@ def _differentiate_segment(
     grid = arrays.make_grid(first, last, settings.rate_hz)
     inside = np.clip(grid, stamps[0], stamps[-1])
     velocity = arrays.differentiate_locally(inside, stamps, odometer, settings.window_s)
+    late, stamped = piece["latency"], np.interp(inside, stamps, times[fresh])
+    # A common delay moves a velocity in time, and does not change it.
+    before = (
+        arrays.differentiate_locally(stamped, times[fresh], odometer, settings.window_s)
+        if np.ptp(late) > 0.0
+        else velocity
+    )
     at, attitude = rigid.interpolate_poses(inside, stamps, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
     return {
@@ -234,6 +241,8 @@ def _differentiate_segment(
         "pitch": pitch,
         "yaw": rigid.unwrap_yaw(yaw),
         **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
+        "recorded_t": stamped,
+        **{f"recorded_{axis}": before[:, i] for i, axis in enumerate("xyw")},
         "outlier": piece["outlier"][arrays.nearest_indices(grid, aligned)],
     }
 
