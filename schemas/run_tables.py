@@ -323,9 +323,7 @@ class Aggregates(Table):
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip modulus")
-    median_recorded_modulus = schemas.optional(
-        "m/s", "the same as recorded, before any correction, nothing left out"
-    )
+    median_recorded_modulus = schemas.optional("m/s", "as recorded: nothing corrected or left out")
     median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")

@@ -131,13 +131,8 @@ def examine(
         is_known: whether its geometry is known.
         where: the log, for error messages.
     """
-    drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
-    sideways = any(find_sideways_share(data.topics, one) for one in drives)
-    if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
-        # A body that moves sideways has no course.
-        text = "the vehicle moves sideways: signs, units and the frame of its poses are not compared"
-        aside = (Finding("sideways_unexamined", "info", text, where="pose"),) if sources.pose else ()
-        return Recording(sources, configuration, aside)
+    if sources.pose is None:
+        return Recording(sources, configuration)
     try:
         examination = Examination(data, sources, configuration, vehicle, is_known=is_known, where=where)
     except SlipError:
@@ -190,6 +185,10 @@ class Examination:
         # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
         equal = replace(sources, others={**sources.others, "command": ()}, power=None)
         self.extraction = Extraction(data, equal, configuration, vehicle, where)
+        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
+        self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
+            find_sideways_share(data.topics, one) for one in drives
+        )
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
 
@@ -224,7 +223,7 @@ class Examination:
         if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
-            self._read_again(wheels, motion, kind or "differential")
+            self._read_again(wheels, motion, (kind if kind == "ackermann" else "") or "differential")
         self._find_units(command, wheels)
         alignment = self._measure_command(command, wheels, kind, motion)
         used = (("command", command), ("wheels", wheels))
@@ -234,9 +233,9 @@ class Examination:
             self._name_sources(command, wheels),
             self._complete(),
             tuple(self.findings),
-            kind,
+            "" if self.moves_sideways else kind,
             # Lengths that are known are not measured again.
-            Geometry() if self.is_known else self._measure(command, wheels),
+            Geometry() if self.is_known or self.moves_sideways else self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
             alignment,
         )
@@ -269,6 +268,8 @@ class Examination:
         section = section or self._find_section(source, is_measured=is_measured)
         if source.form is DriveForm.STEERING:
             kind = "ackermann"
+        elif self.moves_sideways:
+            kind = "omni" if source.form is DriveForm.BODY else "mecanum"
         self.extraction.vehicle = Vehicle(
             id="unit",
             name="unit",
@@ -283,14 +284,14 @@ class Examination:
         except SlipError:
             return None
         if source.form is DriveForm.BODY:
-            return Reading(
-                "body", str(source), *(Held(*_column(table, name)) for name in ("body_x", "body_w"))
-            )
+            names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
+            return Reading("body", str(source), *(Held(*_column(table, name)) for name in names))
         if kind == "ackermann":
             speed = Held(*_column(table, "speed"))
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
-        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
+        names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
+        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
 
     def _find_section(self, source: DriveSource, *, is_measured: bool) -> DriveSection:
         """What the user says of a source: of the topic that is named, or of any if none is."""
@@ -411,7 +412,8 @@ class Examination:
             return False
         scale = self.vehicle.wheel_radius_m if self.is_known and first.reading.form == "sides" else 1.0
         least = _STILL * scale if self.is_known or first.reading.form == "body" else _STILL * _SMALLEST_M
-        gains = max(abs(float(made.ahead.gains[0])), abs(float(made.turned.gains[0])))
+        fits = [made.ahead, made.turned, *([made.aside[0]] if made.aside is not None else [])]
+        gains = max(abs(float(one.gains[0])) for one in fits)
         return gains < least and max(made.shares) < _EXPLAINED
 
     def _find(self, drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
@@ -453,6 +455,8 @@ class Examination:
         """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
         given = self.configuration.vehicle.list_values().get("kind")
         kind = str(given or (self.vehicle.kind if self.is_known else "ackermann"))
+        if self.moves_sideways:
+            return "" if self.is_known else "omni"
         if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
         return "ackermann" if self._read_again(wheels, motion, kind) else ""
@@ -523,17 +527,18 @@ class Examination:
         signs: dict[tuple[str, Axis], int] = {}
         for name, drive in (("command", command), ("wheels", wheels)):
             if drive is not None:
-                signs |= {(name, "ahead"): drive.sign("ahead"), (name, "turned"): drive.sign("turned")}
+                axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
+                signs |= {(name, axis): drive.sign(axis) for axis in axes}
         if gyro is not None and gyro.explained is not None:
             signs["gyro", "turned"] = gyro.explained.sign("turned")
         up, offset = motion.up, motion.offset_deg
         if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
             # Neither way along another axis is usual.
             up, offset = f"-{up}", -offset
-            signs = {key: -sign if key[1] == "turned" else sign for key, sign in signs.items()}
+            signs = {key: sign if key[1] == "ahead" else -sign for key, sign in signs.items()}
         if offset and -1 in {sign for (_, axis), sign in signs.items() if axis == "ahead"}:
             offset += 180.0
-            signs = {key: -sign if key[1] == "ahead" else sign for key, sign in signs.items()}
+            signs = {key: sign if key[1] == "turned" else -sign for key, sign in signs.items()}
         made = find_reversed(signs)
         if made.rivals:
             self._report_either(made, signs)
@@ -588,7 +593,7 @@ class Examination:
     def _report_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
         """Two signals that contradict each other, with what mends the one and the other."""
         against = sorted({name for (name, _), sign in signs.items() if sign < 0})
-        verbs = {"ahead": "drive", "turned": "turn"}
+        verbs = {"ahead": "drive", "turned": "turn", "aside": "move sideways"}
         axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
         remedies = {fault: f"{text}{_REMEDIES.get(fault, '')}" for fault, text in _FAULTS.items()}
         options = "; or ".join(
@@ -805,6 +810,8 @@ _FAULTS = {
     "pose_mirrored": "the poses' frame is of the other hand, as north, east, down",
     "command_ahead": "the sign of linear.x is wrong where it is sent, or both motors are reversed",
     "command_turned": "the sign of angular.z or of the steering is inverted, or left and right are exchanged",
+    "command_aside": "the sign of linear.y is wrong where it is sent",
+    "command_mirrored": "left and right are exchanged where it is sent",
     "command_both": "its sign is wrong where it is sent, or both motors are wired backward",
     "wheels_both": "both encoders count backward",
     "wheels_exchanged": "left and right encoders are exchanged",
