@@ -38,6 +38,7 @@ def measure_command_scale(
     *,
     body_commanded: bool,
     gain: float | None = None,
+    late: tuple[float, float] | None = None,
 ) -> tuple[Alignment, tuple[Finding, ...]]:
     """Compare commanded motion with that of the measured wheels.
 
@@ -48,12 +49,13 @@ def measure_command_scale(
         body_commanded: whether the command was a body command, which the controller converts to wheel speeds.
         gain: motion of the poses over a body command; if it is nearer to one than to that of the wheels, the
             wheels have another radius, and the command is right.
+        late: lag and delay of the wheels [s], if they are known.
 
     Returns:
         The corrections of the command, neutral where nothing shows them, and findings on them.
     """
     neutral = Alignment(track_multiplier=vehicle.controller_track_multiplier)
-    asked, got = _compare_rates(commands, wheels, vehicle)
+    asked, got = _compare_rates(commands, wheels, vehicle, late)
     forward, turning = (find_ratio(*pair) for pair in zip(asked, got, strict=True))
     if forward is None:
         return neutral, ()
@@ -134,22 +136,27 @@ _Rates = tuple[Floats, Floats]
 """Speeds [m/s] and yaw rates [rad/s], shape (n,) each."""
 
 
-def _compare_rates(commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle) -> tuple[_Rates, _Rates]:
+def _compare_rates(
+    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, late: tuple[float, float] | None
+) -> tuple[_Rates, _Rates]:
     """Commanded and measured rates over steps of a tenth of a second; empty where nothing can be compared.
 
     Commands are lagged and delayed as the wheels follow them best.
     """
     asked, got = (_read(table, vehicle) for table in (commands, wheels))
-    motion = None if asked is None or got is None or not got.inputs else roll_wheels(got)
-    made = None if asked is None or motion is None else asked.explain(motion)
-    if asked is None or made is None:
-        nothing: Floats = np.zeros(0)
+    motion = roll_wheels(got) if asked is not None and got is not None and got.inputs else None
+    nothing: Floats = np.zeros(0)
+    if asked is None or motion is None or not asked.inputs:
         return (nothing, nothing), (nothing, nothing)
-    steps = made.motion.steps
-    elapsed = steps.end - steps.start
-    ahead, turned = asked.columns(steps, made.lag, made.delay, crossed=False)
-    moved = made.motion
-    return (ahead / elapsed, turned / elapsed), (moved.body.real / elapsed, moved.yaw / elapsed)
+    if late is None:
+        made = asked.explain(motion)
+        if made is None:
+            return (nothing, nothing), (nothing, nothing)
+        late = made.lag, made.delay
+    motion = motion.take(np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs]))
+    elapsed = motion.steps.end - motion.steps.start
+    ahead, turned = asked.columns(motion.steps, *late, crossed=False)
+    return (ahead / elapsed, turned / elapsed), (motion.body.real / elapsed, motion.yaw / elapsed)
 
 
 def roll(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats]:

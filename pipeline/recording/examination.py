@@ -33,7 +33,7 @@ from pipeline.recording.geometry import (
     measure_geometry,
 )
 from pipeline.recording.motion import Motion, measure_motion
-from pipeline.recording.readings import SIDES, Bent, Held, Reading
+from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.run import Alignment
 from pipeline.sources import (
@@ -189,6 +189,7 @@ class Examination:
         self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
             find_sideways_share(data.topics, one) for one in drives
         )
+        self.driven: Explained | None = None
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
 
@@ -645,7 +646,7 @@ class Examination:
         radius = self.vehicle.wheel_radius_m if self.is_known else None
         driven = None
         if radius is not None and command is not None:
-            driven = explain_wheels(command.reading, wheels.reading)
+            driven = self.driven = explain_wheels(command.reading, wheels.reading)
         if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
             # Wheels follow a command closely on any ground.
             gain = (radius if command.reading.form == "sides" else 1.0) / float(driven.ahead.gains[0])
@@ -701,8 +702,9 @@ class Examination:
             gain, made_of = None, command.reading.explained
             if is_body and made_of is not None and command.sign("ahead") > 0:
                 gain = float(made_of.ahead.gains[0]) / SPEEDS.get(made.command.unit or "m/s", 1.0)
+            late = None if self.driven is None else (self.driven.lag, self.driven.delay)
             alignment, findings = measure_command_scale(
-                asked, got, vehicle, body_commanded=is_body, gain=gain
+                asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
             )
             self.findings += findings
         rates = motion.rates if got.is_empty() and motion is not None else None

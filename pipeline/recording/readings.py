@@ -263,7 +263,8 @@ class Reading:
         if keep.sum() < FEWEST_STEPS:
             return None
         motion = whole.take(keep)
-        may_cross = self.form in {"body", "sides"} and len(self.inputs) == len(SIDES) and self.third is None
+        may_cross = self.form == "sides" or (self.form == "body" and self.third is None)
+        may_cross = may_cross and len(self.inputs) == len(SIDES)
         patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
