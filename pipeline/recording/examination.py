@@ -576,7 +576,7 @@ class Examination:
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
     def _report_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
-        """Correct or report a fault; the sign of a gyro is fitted by the stage `align`."""
+        """Correct or report a fault; the sign of a gyro is fitted by `stages.align`."""
         drive = wheels if fault.startswith("wheels") else command
         if fault == "gyro" or drive is None:
             return
