@@ -274,8 +274,8 @@ class Work:
             "unchecked": data.unchecked or None,
             **aligned.context,
         }
-        found = (*setup.choice.findings, *made.findings, *excluded, *notes, *aligned.findings)
-        return StageOutcome(found, context)
+        findings = (*setup.choice.findings, *made.findings, *excluded, *notes, *aligned.findings)
+        return StageOutcome(findings, context)
 
     def _align(self, extracted: Mapping[str, CheckedTable]) -> StageOutcome:
         """Correct the extracted tables, and write them."""

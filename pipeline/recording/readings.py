@@ -309,10 +309,10 @@ class Reading:
         )
         aside = self.columns_aside(motion.steps, lag, delay)
         if aside.size:
-            left = motion.body.imag
+            across = motion.body.imag
             made.aside = (
-                fit(left, np.column_stack([aside, beside]), motion.steps),
-                fit(left, beside, motion.steps).blocks,
+                fit(across, np.column_stack([aside, beside]), motion.steps),
+                fit(across, beside, motion.steps).blocks,
             )
         made.shares = (
             measure_share(ahead, float(made.ahead.gains[0]) * first),
