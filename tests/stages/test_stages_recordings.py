@@ -131,7 +131,7 @@ def test_snow_commands_are_off_by_the_ratio_of_two_radii(recorded_results: Path)
     # Made with the Warthog's wheels, the stored command is too small: the wheels turn faster than it says.
     assert found["value"] == pytest.approx(0.30 / 0.165, rel=1e-6)
     # In turns the wheels differ by half of what it says: its track, too, is the Warthog's.
-    assert "their difference is 0.53 times the commanded one" in found["text"]
+    assert "their difference is 0.54 times the commanded one" in found["text"]
     assert "a wheel radius of 0.3 m and a track of 1.08 m, as of Clearpath Warthog" in found["text"]
 
 
