@@ -18,7 +18,7 @@ from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_part
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.model_fit import Fitted
-from pipeline.estimation.state import State
+from pipeline.estimation.state import State, combine_columns
 from pipeline.estimation.verdict import SEARCH_CUT
 from pipeline.estimation.window_residuals import count_seconds
 from pipeline.models.catalogue import find_effect, list_effects
@@ -38,6 +38,9 @@ from pipeline.run import MotionRun
 if TYPE_CHECKING:
     from pipeline.core.compute import Budget
     from pipeline.estimation.context import Context
+
+_PASSES = 2
+"""Steps of the estimate of an effect that a model lacks, the noise learned anew after each."""
 
 
 def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]:
@@ -239,8 +242,14 @@ def _estimate_added(fit: PartFit, effect: Effect) -> list[Estimate]:
     grown = replace(
         fit, state=added, free=(*fit.free, *new), columns=np.concatenate((fit.columns, columns), axis=2)
     )
-    step = invert(grown.normal) @ (grown.white.columns.T @ grown.white.residual)
-    moved = {number: float(change) for number, change in zip(grown.free, step, strict=True)}
+    total = np.zeros(len(grown.free))
+    for _ in range(_PASSES):
+        step = invert(grown.normal) @ (grown.white.columns.T @ grown.white.residual)
+        rest = grown.residual - combine_columns(grown.columns, step)
+        # The noise of residuals that still hold an effect would hide it.
+        grown = replace(grown, residual=rest, noise=part.learn(rest, grown.noise))
+        total += step
+    moved = dict(zip(grown.free, total.tolist(), strict=True))
     made = {item.free: item for item in estimate_part(grown).items}
     if not all(made[number].observable for number in new):
         return []

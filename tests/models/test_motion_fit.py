@@ -243,7 +243,8 @@ def test_motion_that_lasts_is_no_noise_of_poses() -> None:
     quiet, pushed = left
     for channel, size in enumerate((0.1, 0.1, 0.1)):
         assert quiet["lasting"][channel] < 0.1 * size  # type: ignore[index, call-overload, operator]
-        assert pushed["lasting"][channel] == pytest.approx(size, rel=0.3)  # type: ignore[index, call-overload]
+        # It stops while the wheels stand.
+        assert 0.5 * size < pushed["lasting"][channel] < 1.2 * size  # type: ignore[index, call-overload, operator]
         same = quiet["pose_noise"][channel]  # type: ignore[index, call-overload]
         assert pushed["pose_noise"][channel] == pytest.approx(same, rel=0.3)  # type: ignore[index, call-overload]
 
