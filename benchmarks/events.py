@@ -89,7 +89,7 @@ def find_event(scenario: Scenario, scratch: Path) -> dict[str, object] | None:
         return None
     log = scratch / "run.mcap"
     write_log(made, log)
-    options = Options(out=scratch / "out", through="align", diagnosis=False, report=False, force=True)
+    options = Options(out=scratch / "out", through="slip", diagnosis=False, report=False, force=True)
     outcome = analyze_log(log, options)
     events = outcome.manifest.read("events")
     near = events.filter(

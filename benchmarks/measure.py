@@ -155,9 +155,7 @@ def measure_paper(asked: Asked) -> dict[str, object]:
         {"name": name, "paper": paper, **divide(named[above], named[below])}
         for name, above, below, paper in _RATIOS
     ]
-    stages = {
-        name: version for name, version in list_versions().items() if name in {"extract", "align", "slip"}
-    }
+    stages = {name: version for name, version in list_versions().items() if name in {"extract", "slip"}}
     return {"command": "make measure ARGS=paper", "versions": stages, "rows": rows, "ratios": ratios}
 
 

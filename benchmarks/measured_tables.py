@@ -63,7 +63,7 @@ def find_outdated(data: Data, present: Mapping[str, int]) -> list[str]:
     return [
         f"{name}: measured at version {version}, the program has {present[name]}"
         for name, version in data["versions"].items()
-        if present[name] - version > ALLOWED_VERSIONS
+        if name in present and present[name] - version > ALLOWED_VERSIONS
     ]
 
 

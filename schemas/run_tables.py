@@ -97,7 +97,7 @@ class Poses(Table):
     latency = schemas.number(
         "s", "delay of this pose against the gyro: it belongs to t - latency", frame="log clock"
     )
-    outlier = schemas.flag("in an incident, or the localization is at fault: left out of medians and fits")
+    outlier = schemas.flag("the localization contradicts the wheels: left out of medians and fits")
     held = schemas.flag("repeats the pose before it: an old estimate sampled again")
     corrected = schemas.flag("the localization corrected the odometry since the pose before it")
     active = schemas.flag("inside an interval in which commands are live")
@@ -140,7 +140,7 @@ class Power(Table):
 class Alignments(Table):
     """One row a run."""
 
-    VERSION: ClassVar[int] = 5
+    VERSION: ClassVar[int] = 6
 
     hold_time = schemas.optional("s", "the controller stops this long after its last command")
     command_scale = schemas.number(
@@ -169,10 +169,6 @@ class Alignments(Table):
     )
     latency_spread = schemas.number("s", "standard deviation of the latencies that were taken off the poses")
     outlier_time = schemas.number("s", "time in which the localization contradicts the wheels")
-    recorded_modulus_command = schemas.optional(
-        "m/s", "median slip modulus (L = 1 m) from commands as recorded, before any correction"
-    )
-    recorded_modulus_measured = schemas.optional("m/s", "the same from wheel encoders")
 
 
 EVENT_KINDS = (
@@ -221,7 +217,7 @@ class Findings(Table):
 class Velocities(Table):
     """One row a step of the uniform grid inside a segment."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     t = schemas.seconds()
     stamp = schemas.stamp()
@@ -234,13 +230,17 @@ class Velocities(Table):
     v_y = schemas.body("m/s", "body velocity to the left")
     v_w = schemas.body("rad/s", "yaw rate: of the pose, or of the gyro with `--yaw imu`")
     v_w_imu = schemas.body("rad/s", "yaw rate of the gyro, sign, scale and bias corrected", nullable=True)
-    outlier = schemas.flag("in an incident, or the localization is at fault")
+    recorded_t = schemas.seconds("the stamp of these poses, before their latency was taken off")
+    recorded_x = schemas.body("m/s", "v_x by these stamps")
+    recorded_y = schemas.body("m/s", "v_y by these stamps")
+    recorded_w = schemas.body("rad/s", "yaw rate of the poses by these stamps")
+    outlier = schemas.flag("the localization contradicts the wheels")
 
 
 class Slip(Table):
     """One row a time step and input: g = f(u) - v."""
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
     FACTS: ClassVar[Mapping[str, str]] = {
         "length_scale_m": "L, which turns yaw rate into speed in the moduli",
         "wheel_radius_m": "r, radius of the wheels",
@@ -268,7 +268,9 @@ class Slip(Table):
         check=lambda value: value.is_finite(),
         metadata={"unit": "m/s", "frame": "base_link", "description": "norm of (g_x, g_y, L g_w)"},
     )
-
+    recorded_modulus = schemas.body(
+        "m/s", "modulus with stamps, scales and commands as recorded, before any correction", nullable=True
+    )
     model_x = schemas.body(
         "m/s",
         "velocity forward of the model: that of --model, else that of the diagnosis; null without one",
@@ -314,13 +316,14 @@ SUBSETS = ("all", "transitory", "steady")
 class Aggregates(Table):
     """One row an input and subset of the samples."""
 
-    VERSION: ClassVar[int] = 2
+    VERSION: ClassVar[int] = 3
 
     input = schemas.source()
     subset = schemas.choice(SUBSETS, "all samples, or only transitory or steady ones")
     samples = schemas.count("time steps counted")
     windows = schemas.count("2 s windows counted")
     median_modulus = schemas.optional("m/s", "median slip modulus")
+    median_recorded_modulus = schemas.optional("m/s", "as recorded: nothing corrected or left out")
     median_residual_modulus = schemas.optional("m/s", "median residual modulus of the model, see table slip")
     median_window_norm = schemas.optional("m/s", "median 2 s window norm")
     rms_x = schemas.optional("m/s", "root mean square of g_x")

@@ -331,7 +331,7 @@ def _format_topic(topic: TopicHealth, width: int) -> str:
 
 
 def stage(  # noqa: D417 - the shared choices document themselves
-    name: Literal["extract", "align", "velocity", "slip", "aggregate"],
+    name: Literal["extract", "velocity", "slip", "aggregate"],
     log: Annotated[str, Parameter(help="a log, or the name of a run that has results")],
     /,
     *,

@@ -395,15 +395,14 @@ def _format_alignment(manifest: Manifest) -> list[str]:
         "aligned        (table alignments; latency, outlier, *_aligned: columns of poses, wheels, commands)"
     ]
     for name, value in row.items():
-        if isinstance(value, float) and not name.startswith("recorded_modulus"):
+        if isinstance(value, float):
             unit = _list_column(f"alignments.{name}").get("unit", "1").removesuffix("1")
             lines.append(f"  {name:<25}{value:.6g} {unit}".rstrip())
-    aggregates = manifest.read("aggregates")
-    for name in ("command", "measured"):
-        before = row[f"recorded_modulus_{name}"]
-        after = aggregates.filter((aggregates["input"] == name) & (aggregates["subset"] == "all"))
-        if before is not None and not after.is_empty():
-            now = after["median_modulus"][0]
+    aggregates = manifest.read("aggregates").filter(pl.col("subset") == "all")
+    for name, before, now in aggregates.select(
+        "input", "median_recorded_modulus", "median_modulus"
+    ).iter_rows():
+        if before is not None:
             lines.append(
                 f"  slip {INPUT_WORDS[name]:<20}{before:.4g} m/s as recorded, {now:.4g} m/s aligned (medians)"
             )

@@ -43,7 +43,6 @@ INPUTS = ("command", "measured")
 STAGE_WORDS = {
     "read": "reading the log",
     "extract": "extracting commands and poses",
-    "align": "aligning clocks and scales",
     "velocity": "differentiating poses",
     "slip": "computing slip",
     "aggregate": "aggregating",
@@ -51,7 +50,7 @@ STAGE_WORDS = {
 }
 """Descriptions of the stages for users."""
 
-STAGES = ("extract", "align", "velocity", "slip", "aggregate")
+STAGES = ("extract", "velocity", "slip", "aggregate")
 FigureFormat = Literal["svg", "pdf", "png"]
 FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)
 

@@ -36,7 +36,7 @@ from pipeline.fleet.pairs import (
 from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
 from pipeline.report import Picture
-from pipeline.stages.slip_stage import WINDOW_S
+from pipeline.stages.inputs import WINDOW_S
 from pipeline.store import Store
 from schemas import Features
 

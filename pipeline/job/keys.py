@@ -34,6 +34,7 @@ from pipeline.logs import (
     stem_of,
     to_location,
 )
+from pipeline.run import Alignment
 from pipeline.sources import (
     Configuration,
     DriveForm,
@@ -70,6 +71,13 @@ class LogSetup:
         """Whether the command is a body command, which the controller turns into wheel speeds."""
         source = self.sources.command
         return source is not None and source.form is DriveForm.BODY
+
+    @property
+    def alignment(self) -> Alignment:
+        """What the examination of the log found, and how long a command is valid, of what corrects it."""
+        known = None if self.choice.recording is None else self.choice.recording.alignment
+        known = known or Alignment(track_multiplier=self.vehicle.controller_track_multiplier)
+        return replace(known, hold_s=self.configuration.command.hold_s)
 
     @property
     def is_drive_alone(self) -> bool:
@@ -544,13 +552,12 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 13, "align": 21, "velocity": 6, "slip": 14, "aggregate": 3}
+VERSIONS: Mapping[str, int] = {"extract": 14, "velocity": 7, "slip": 15, "aggregate": 4}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
-    "extract": EXTRACTED,
-    "align": (*EXTRACTED, "alignments", "events"),
+    "extract": (*EXTRACTED, "alignments"),
     "velocity": ("velocities",),
-    "slip": ("slip", "windows"),
+    "slip": ("slip", "windows", "events"),
     "aggregate": ("aggregates",),
 }
 _DIGITS = 16
@@ -576,7 +583,6 @@ def key_stages(
             "limits": pose_limits,
             "message_types": describe_types(one.type_name for one in setup.index.channels),
         },
-        "align": {},
         "velocity": plain["velocity"],
         "slip": {"slip": plain["slip"], "inputs": inputs, "model": model},
         "aggregate": {},

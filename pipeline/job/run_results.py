@@ -353,7 +353,7 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "held_poses": work.contexts["extract"].get("held_poses"),
         "timing": {
             "clocks": work.contexts["extract"].get("clocks"),
-            "gyro": work.contexts["align"].get("gyro"),
+            "gyro": work.contexts["extract"].get("gyro"),
         },
         "quarantined": work.contexts["extract"].get("quarantined"),
         "topics": _summarize_topics(work),

@@ -305,27 +305,28 @@ class Watch:
                 if not frame.is_empty()
             },
             setup.vehicle,
-            hold_s=setup.configuration.command.hold_s,
+            setup.alignment,
             body_commanded=setup.is_body_commanded,
             where=where,
             is_drive_alone=setup.is_drive_alone,
         )
         tables, alignment = aligned.tables, aligned.alignment
         speeds = velocity.compute_velocities(
-            tables["poses"], tables.get("imu", made.tables["imu"]), alignment.gyro,
+            tables["poses"], tables.get("imu", made.tables["imu"]), alignment,
             setup.configuration.velocity, where=where,
             wheels=read_drive(tables.get("wheels"), aligned.vehicle),
         ).table  # fmt: skip
-        slip = slip_stage.compute_slip(
+        outcome = slip_stage.compute_slip(
             speeds,
-            tables.get("commands", made.tables["commands"]),
-            tables.get("wheels", made.tables["wheels"]),
+            tables,
             vehicle=aligned.vehicle,
             configuration=setup.configuration,
             hold_s=alignment.hold_s,
             inputs=self._options.inputs,
             where=where,
-        ).slip
+            is_drive_alone=setup.is_drive_alone,
+        )
+        slip = outcome.slip
         if self._model is not None:
             with suppress(SlipError):
                 length = setup.configuration.slip.length_scale_m
@@ -336,7 +337,7 @@ class Watch:
         # The last message of the tables is the end of the log, whatever clock its stamps are of.
         offset = end_s - max(float(frame["t"][-1]) for frame in made.tables.values() if not frame.is_empty())
         self._take(speeds, slip, offset)
-        self._note_events(aligned.findings, offset)
+        self._note_events((*aligned.findings, *outcome.findings), offset)
 
     def _take(self, speeds: pl.DataFrame, slip: pl.DataFrame, offset: float) -> None:
         """Update slip, error and distance from the tables of a light update."""

@@ -16,7 +16,7 @@ from pipeline.core import SlipError, naming_os_errors, pick
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_bounded
 from pipeline.job import STAGES, JobError, Options
-from pipeline.job.keys import EXTRACTED, TABLES, LogSetup
+from pipeline.job.keys import TABLES, LogSetup
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.run import Alignment, read_alignment, read_drive
 from pipeline.sources import Vehicle
@@ -24,7 +24,6 @@ from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velo
 from pipeline.stages.align import align_tables
 from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
-from pipeline.stages.trust import gather_samples
 from pipeline.store import JSON, Generation, Manifest, TableReport
 from pipeline.store.parquet_tables import CheckedTable, check_table
 from schemas import contract_of
@@ -155,16 +154,15 @@ class Work:
     contexts: dict[str, Mapping[str, JSON]] = field(default_factory=dict)
     findings: list[pl.DataFrame] = field(default_factory=list)
     computed: list[str] = field(default_factory=list)
-    _extracted: dict[str, CheckedTable] = field(default_factory=dict)
 
     @property
     def alignment(self) -> Alignment:
-        """Corrections of the run, available after the stage `align`."""
+        """Corrections of the run, available after the stage `extract`."""
         return read_alignment(self.generation.read_table("alignments"))
 
     @property
     def vehicle(self) -> Vehicle:
-        """The vehicle; after the stage `align` with the track multiplier estimated from the run."""
+        """The vehicle; after the stage `extract` with the track multiplier estimated from the run."""
         if "alignments" not in self.generation.table_names:
             return self.setup.vehicle
         multiplier = self.alignment.track_multiplier
@@ -174,7 +172,6 @@ class Work:
         """Run every stage up to the last requested one, reusing results that have not changed."""
         stages: Mapping[str, Callable[[], StageOutcome]] = {
             "extract": self._extract,
-            "align": self._align,
             "velocity": self._velocity,
             "slip": self._slip,
             "aggregate": self._aggregate,
@@ -191,14 +188,11 @@ class Work:
             self.computed.append(stage)
             self._keep_findings(stage, outcome.findings)
             return_freed_memory()
-        for table in self._extracted.values():
-            self.generation.write_checked(table)
         self.write("findings", pl.concat(self.findings))
 
     def _take_over(self, stage: str, before: Manifest) -> None:
         for table in TABLES[stage]:
-            # Extracted tables are reused in their aligned form, or are aligned again.
-            if table in before.tables and (stage != "extract" or self.options.through == "extract"):
+            if table in before.tables:
                 self.generation.reuse_table(table)
         self.contexts[stage] = stored_contexts(before).get(stage, {})
         self.findings.append(before.read("findings").filter(pl.col("stage") == stage))
@@ -234,12 +228,13 @@ class Work:
         # Columns and tables are large: drop the references as early as possible.
         self.data, data = None, replace(data, topics=())
         self.setup = replace(setup, choice=replace(setup.choice, data=None, extracted=None))
-        self._extracted = {
+        extracted = {
             name: check_table(name, self._identify(name, as_recorded(name, frame)))
             for name, frame in made.tables.items()
             if not frame.is_empty()
         }
-        reports = {name: checked.report for name, checked in self._extracted.items()}
+        aligned = self._align(extracted)
+        reports = {name: checked.report for name, checked in extracted.items()}
         broken = {name: report for name, report in reports.items() if report.quarantined}
         excluded = [
             Finding(
@@ -277,31 +272,25 @@ class Work:
             "fetched_bytes": data.fetched_bytes or None,
             "losses": [summarize_loss(loss, data.index.start_ns) for loss in data.losses],
             "unchecked": data.unchecked or None,
+            **aligned.context,
         }
-        return StageOutcome((*setup.choice.findings, *made.findings, *excluded, *notes), context)
+        findings = (*setup.choice.findings, *made.findings, *excluded, *notes, *aligned.findings)
+        return StageOutcome(findings, context)
 
-    def _align(self) -> StageOutcome:
-        previous = self.generation.previous
-        if not self._extracted and previous is not None:
-            self._extracted = {
-                name: check_table(name, as_recorded(name, previous.read(name)))
-                for name in EXTRACTED
-                if name in previous.tables
-            }
+    def _align(self, extracted: Mapping[str, CheckedTable]) -> StageOutcome:
+        """Correct the extracted tables, and write them."""
         made = align_tables(
-            {name: checked.valid for name, checked in self._extracted.items()},
+            {name: checked.valid for name, checked in extracted.items()},
             self.setup.vehicle,
-            hold_s=self.setup.configuration.command.hold_s,
+            self.setup.alignment,
             body_commanded=self.setup.is_body_commanded,
             where=str(self.setup.path),
             is_drive_alone=self.setup.is_drive_alone,
         )
-        for name, checked in self._extracted.items():
+        for name, checked in extracted.items():
             aligned = self._identify(name, made.tables.get(name, checked.valid))
             self.generation.write_checked(replace(checked, valid=aligned))
-        self._extracted = {}
         self.write("alignments", made.tables["alignments"])
-        self.write("events", made.tables["events"])
         fit = made.alignment.gyro
         gyro = None if fit is None else {
             "usable": True,
@@ -317,7 +306,7 @@ class Work:
         made = velocity.compute_velocities(
             self._read("poses"),
             self._read("imu"),
-            self.alignment.gyro,
+            self.alignment,
             self.setup.configuration.velocity,
             where=str(self.setup.path),
             wheels=read_drive(self._read("wheels"), self.vehicle),
@@ -326,32 +315,32 @@ class Work:
         return StageOutcome(made.findings)
 
     def _slip(self) -> StageOutcome:
-        setup, vehicle = self.setup, self.vehicle
-        velocities, commands = self._read("velocities"), self._read("commands")
+        setup, vehicle, velocities = self.setup, self.vehicle, self._read("velocities")
+        tables = {name: self._read(name) for name in ("poses", "commands", "wheels", "imu")}
         made = slip_stage.compute_slip(
             velocities,
-            commands,
-            self._read("wheels"),
+            tables,
             vehicle=vehicle,
             configuration=setup.configuration,
             hold_s=self.alignment.hold_s,
             inputs=self.options.inputs,
             where=str(setup.path),
+            is_drive_alone=setup.is_drive_alone,
         )
         table, findings = self._set_against_model(made.slip)
         self.write("slip", table)
         self.write("windows", made.windows)
-        outlier = velocities["outlier"].to_numpy()
-        inputs = {name: ideal.leave_out(outlier) for name, ideal in made.inputs.items()}
-        samples = replace(
-            gather_samples(velocities, inputs, made.cut, body_commanded=self.setup.is_body_commanded),
-            is_drive_alone=self.setup.is_drive_alone,
+        self.write("events", made.events)
+        checked = checks.check_run(
+            velocities,
+            tables,
+            made,
+            vehicle,
+            command=setup.sources.command,
+            is_drive_alone=setup.is_drive_alone,
         )
-        findings = (*findings, *checks.check_turn(samples, commands, vehicle, setup.sources.command))
         model = None if self.options.model is None else self.options.model.name
-        return StageOutcome(
-            (*made.findings, *findings, *checks.run_checks(samples, vehicle)), {"model": model}
-        )
+        return StageOutcome((*made.findings, *findings, *checked), {"model": model})
 
     def _set_against_model(self, table: pl.DataFrame) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
         """Add the velocity of the given model to table `slip`; without a model it stays unchanged."""
@@ -360,7 +349,7 @@ class Work:
             return table, ()
         from pipeline.models import read_model  # noqa: PLC0415 - heavy
 
-        read = {name: self._read(name) for name in TABLES["align"]}
+        read = {name: self._read(name) for name in TABLES["extract"]}
         return add_model(
             table,
             {name: frame for name, frame in read.items() if not frame.is_empty()},

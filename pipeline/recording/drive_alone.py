@@ -105,6 +105,7 @@ class _DriveExamination(Examination):
         if not self.findings or self.findings[-1].severity != "error":
             self._report_opposite(command, wheels)
         sources = replace(self.sources, command=command.source)
+        alignment = self._measure_command(command, wheels, "ackermann" if steered else "", None)
         return Recording(
             _replace_pose(sources, wheels.source),
             self._complete(),
@@ -112,6 +113,7 @@ class _DriveExamination(Examination):
             "ackermann" if steered else "",
             self._measure_lengths(command, wheels),
             tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
+            alignment,
         )
 
     # Signals.

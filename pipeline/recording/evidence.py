@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core.arrays import Floats, join_parts
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Reading
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
@@ -52,10 +52,13 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     assert explained is not None  # noqa: S101 - chosen for it
     course, concentration = motion.find_course_deg()
     angles = {0.0, 90.0}
-    if concentration > _CONCENTRATED and abs(course - 90.0 * round(course / 90.0)) > _USUAL_DEG:
-        angles.add(course)
     part = explained.motion
     ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
+    aside = best.columns_aside(part.steps, explained.lag, explained.delay)
+    if aside.size:
+        course, concentration = _find_offset_deg(part, ahead, aside[:, 0]), 1.0
+    if concentration > _CONCENTRATED and abs(course - 90.0 * round(course / 90.0)) > _USUAL_DEG:
+        angles.add(course)
     scores: dict[tuple[bool, float], Floats] = {}
     for flip in (False, True):
         for angle in angles:
@@ -63,7 +66,7 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
             body, yaw = turned.body, turned.yaw
             scores[flip, angle] = (
                 fit(body.real, np.column_stack([ahead, yaw]), part.steps).blocks
-                + fit(body.imag, yaw[:, None], part.steps).blocks
+                + fit(body.imag, np.column_stack([aside, yaw]), part.steps).blocks
             )
     usual = (False, 0.0)
     likeliest = max(scores, key=lambda key: float(scores[key].sum()))
@@ -74,17 +77,30 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     return motion.turn(flip=likeliest[0], offset_deg=likeliest[1]), margin
 
 
+def _find_offset_deg(motion: Motion, ahead: Floats, aside: Floats) -> float:
+    """Angle from the heading to the course that is asked of a base that moves sideways, within half a turn.
+
+    Of both hands of the frame that one counts which explains more of the course.
+    """
+    asked = join_parts(ahead, aside)
+    gains = [np.vdot(one, motion.body) for one in (asked, asked.conj())]
+    angle = float(np.degrees(np.angle(max(gains, key=abs))))
+    return (angle + 90.0) % 180.0 - 90.0
+
+
 # Signs: the fewest faults that explain which signals go the other way.
 
-Axis = Literal["ahead", "turned"]
+Axis = Literal["ahead", "turned", "aside"]
 _FAULTS: Mapping[str, tuple[frozenset[tuple[str, Axis]], float]] = {
-    "pose_backward": (frozenset({("pose", "ahead")}), 2.0),
-    "pose_mirrored": (frozenset({("pose", "turned")}), 2.0),
+    "pose_backward": (frozenset({("pose", "ahead"), ("pose", "aside")}), 2.0),
+    "pose_mirrored": (frozenset({("pose", "turned"), ("pose", "aside")}), 2.0),
     "command_ahead": (frozenset({("command", "ahead")}), 2.0),
     "command_turned": (frozenset({("command", "turned")}), 2.0),
-    "command_both": (frozenset({("command", "ahead"), ("command", "turned")}), 2.0),
-    "wheels_both": (frozenset({("wheels", "ahead"), ("wheels", "turned")}), 2.0),
-    "wheels_exchanged": (frozenset({("wheels", "turned")}), 2.0),
+    "command_aside": (frozenset({("command", "aside")}), 2.0),
+    "command_mirrored": (frozenset({("command", "turned"), ("command", "aside")}), 2.0),
+    "command_both": (frozenset({("command", "ahead"), ("command", "turned"), ("command", "aside")}), 2.0),
+    "wheels_both": (frozenset({("wheels", "ahead"), ("wheels", "turned"), ("wheels", "aside")}), 2.0),
+    "wheels_exchanged": (frozenset({("wheels", "turned"), ("wheels", "aside")}), 2.0),
     "wheels_exchanged_both": (frozenset({("wheels", "ahead")}), 3.0),
     "gyro": (frozenset({("gyro", "turned")}), 1.0),
 }

@@ -12,7 +12,9 @@ import polars as pl
 from pipeline.core import SlipError, enumerate_texts
 from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
+from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
+    SPEEDS,
     WHEELS,
     Axis,
     Reversal,
@@ -31,8 +33,9 @@ from pipeline.recording.geometry import (
     measure_geometry,
 )
 from pipeline.recording.motion import Motion, measure_motion
-from pipeline.recording.readings import SIDES, Bent, Held, Reading
+from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
+from pipeline.run import Alignment
 from pipeline.sources import (
     CONFIGURED,
     Configuration,
@@ -44,6 +47,7 @@ from pipeline.sources import (
     Vehicle,
 )
 from pipeline.stages import Finding
+from pipeline.stages.drive_numbers import find_timeout, report_timeout
 from pipeline.stages.extract import Extraction
 from pipeline.stages.reading import find_sideways_share
 
@@ -82,6 +86,7 @@ class Recording:
         kind: kind of vehicle that the signals show; empty if they show none.
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
+        alignment: corrections of the command; None where nothing shows them.
     """
 
     sources: Sources
@@ -90,6 +95,7 @@ class Recording:
     kind: str = ""
     geometry: Geometry = field(default_factory=Geometry)
     evidence: tuple[Evidence, ...] = ()
+    alignment: Alignment | None = None
 
 
 _STILL = 0.1
@@ -125,13 +131,8 @@ def examine(
         is_known: whether its geometry is known.
         where: the log, for error messages.
     """
-    drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
-    sideways = any(find_sideways_share(data.topics, one) for one in drives)
-    if sources.pose is None or vehicle.kinematics.has_inputs("sideways") or sideways:
-        # A body that moves sideways has no course.
-        text = "the vehicle moves sideways: signs, units and the frame of its poses are not compared"
-        aside = (Finding("sideways_unexamined", "info", text, where="pose"),) if sources.pose else ()
-        return Recording(sources, configuration, aside)
+    if sources.pose is None:
+        return Recording(sources, configuration)
     try:
         examination = Examination(data, sources, configuration, vehicle, is_known=is_known, where=where)
     except SlipError:
@@ -184,6 +185,11 @@ class Examination:
         # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
         equal = replace(sources, others={**sources.others, "command": ()}, power=None)
         self.extraction = Extraction(data, equal, configuration, vehicle, where)
+        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
+        self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
+            find_sideways_share(data.topics, one) for one in drives
+        )
+        self.driven: Explained | None = None
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
 
@@ -218,8 +224,9 @@ class Examination:
         if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
-            self._read_again(wheels, motion, kind or "differential")
+            self._read_again(wheels, motion, (kind if kind == "ackermann" else "") or "differential")
         self._find_units(command, wheels)
+        alignment = self._measure_command(command, wheels, kind, motion)
         used = (("command", command), ("wheels", wheels))
         roles = {id(one.reading): role for role, one in used if one is not None}
         roles |= {id(gyro): "gyro"} if gyro is not None else {}
@@ -227,10 +234,11 @@ class Examination:
             self._name_sources(command, wheels),
             self._complete(),
             tuple(self.findings),
-            kind,
+            "" if self.moves_sideways else kind,
             # Lengths that are known are not measured again.
-            Geometry() if self.is_known else self._measure(command, wheels),
+            Geometry() if self.is_known or self.moves_sideways else self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
+            alignment,
         )
 
     # Signals.
@@ -261,6 +269,8 @@ class Examination:
         section = section or self._find_section(source, is_measured=is_measured)
         if source.form is DriveForm.STEERING:
             kind = "ackermann"
+        elif self.moves_sideways:
+            kind = "omni" if source.form is DriveForm.BODY else "mecanum"
         self.extraction.vehicle = Vehicle(
             id="unit",
             name="unit",
@@ -275,14 +285,14 @@ class Examination:
         except SlipError:
             return None
         if source.form is DriveForm.BODY:
-            return Reading(
-                "body", str(source), *(Held(*_column(table, name)) for name in ("body_x", "body_w"))
-            )
+            names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
+            return Reading("body", str(source), *(Held(*_column(table, name)) for name in names))
         if kind == "ackermann":
             speed = Held(*_column(table, "speed"))
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
-        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in ("left", "right")))
+        names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
+        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
 
     def _find_section(self, source: DriveSource, *, is_measured: bool) -> DriveSection:
         """What the user says of a source: of the topic that is named, or of any if none is."""
@@ -403,7 +413,8 @@ class Examination:
             return False
         scale = self.vehicle.wheel_radius_m if self.is_known and first.reading.form == "sides" else 1.0
         least = _STILL * scale if self.is_known or first.reading.form == "body" else _STILL * _SMALLEST_M
-        gains = max(abs(float(made.ahead.gains[0])), abs(float(made.turned.gains[0])))
+        fits = [made.ahead, made.turned, *([made.aside[0]] if made.aside is not None else [])]
+        gains = max(abs(float(one.gains[0])) for one in fits)
         return gains < least and max(made.shares) < _EXPLAINED
 
     def _find(self, drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
@@ -445,6 +456,8 @@ class Examination:
         """A car, if joints of the wheels' topic steer and the body turns by them; else nothing."""
         given = self.configuration.vehicle.list_values().get("kind")
         kind = str(given or (self.vehicle.kind if self.is_known else "ackermann"))
+        if self.moves_sideways:
+            return "" if self.is_known else "omni"
         if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
         return "ackermann" if self._read_again(wheels, motion, kind) else ""
@@ -515,17 +528,18 @@ class Examination:
         signs: dict[tuple[str, Axis], int] = {}
         for name, drive in (("command", command), ("wheels", wheels)):
             if drive is not None:
-                signs |= {(name, "ahead"): drive.sign("ahead"), (name, "turned"): drive.sign("turned")}
+                axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
+                signs |= {(name, axis): drive.sign(axis) for axis in axes}
         if gyro is not None and gyro.explained is not None:
             signs["gyro", "turned"] = gyro.explained.sign("turned")
         up, offset = motion.up, motion.offset_deg
         if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
             # Neither way along another axis is usual.
             up, offset = f"-{up}", -offset
-            signs = {key: -sign if key[1] == "turned" else sign for key, sign in signs.items()}
+            signs = {key: sign if key[1] == "ahead" else -sign for key, sign in signs.items()}
         if offset and -1 in {sign for (_, axis), sign in signs.items() if axis == "ahead"}:
             offset += 180.0
-            signs = {key: -sign if key[1] == "ahead" else sign for key, sign in signs.items()}
+            signs = {key: sign if key[1] == "turned" else -sign for key, sign in signs.items()}
         made = find_reversed(signs)
         if made.rivals:
             self._report_either(made, signs)
@@ -562,7 +576,7 @@ class Examination:
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
     def _report_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
-        """Correct or report a fault; the sign of a gyro is fitted by the stage `align`."""
+        """Correct or report a fault; the sign of a gyro is fitted by `stages.align`."""
         drive = wheels if fault.startswith("wheels") else command
         if fault == "gyro" or drive is None:
             return
@@ -580,7 +594,7 @@ class Examination:
     def _report_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
         """Two signals that contradict each other, with what mends the one and the other."""
         against = sorted({name for (name, _), sign in signs.items() if sign < 0})
-        verbs = {"ahead": "drive", "turned": "turn"}
+        verbs = {"ahead": "drive", "turned": "turn", "aside": "move sideways"}
         axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
         remedies = {fault: f"{text}{_REMEDIES.get(fault, '')}" for fault, text in _FAULTS.items()}
         options = "; or ".join(
@@ -632,7 +646,7 @@ class Examination:
         radius = self.vehicle.wheel_radius_m if self.is_known else None
         driven = None
         if radius is not None and command is not None:
-            driven = explain_wheels(command.reading, wheels.reading)
+            driven = self.driven = explain_wheels(command.reading, wheels.reading)
         if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
             # Wheels follow a command closely on any ground.
             gain = (radius if command.reading.form == "sides" else 1.0) / float(driven.ahead.gains[0])
@@ -655,6 +669,53 @@ class Examination:
 
     def _is_usable(self, drive: Candidate) -> bool:
         return drive.is_sure and not is_crossed(drive)
+
+    # Scale of the command, and how long it is valid.
+
+    def _measure_command(
+        self, command: Candidate | None, wheels: Candidate | None, kind: str, motion: Motion | None
+    ) -> Alignment | None:
+        """Corrections of the command as it is read with all others; its time-out goes into the configuration.
+
+        Args:
+            command: the candidate for it.
+            wheels: the candidate for them.
+            kind: of the vehicle, if its signals show it.
+            motion: of the poses; None where wheels stand in for them.
+        """
+        if command is None:
+            return None
+        vehicle, made = self.vehicle, self._complete()
+        if kind and not self.is_known:
+            vehicle = msgspec.structs.replace(vehicle, kind=kind)
+        self.extraction.vehicle = vehicle
+        try:
+            asked = self.extraction.read_drive(command.source, made.command, held=True)
+            got = pl.DataFrame()
+            if wheels is not None:
+                got = self.extraction.read_drive(wheels.source, made.wheels, held=False)
+        except SlipError:
+            return None
+        is_body = command.reading.form == "body"
+        alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
+        if self.is_known or not is_body:
+            gain, made_of = None, command.reading.explained
+            if is_body and made_of is not None and command.sign("ahead") > 0:
+                gain = float(made_of.ahead.gains[0]) / SPEEDS.get(made.command.unit or "m/s", 1.0)
+            late = None if self.driven is None else (self.driven.lag, self.driven.delay)
+            alignment, findings = measure_command_scale(
+                asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
+            )
+            self.findings += findings
+        rates = motion.rates if got.is_empty() and motion is not None else None
+        if rates is None and not got.is_empty():
+            rates = roll(got, vehicle)
+        timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
+        if timeout is not None:
+            hold_s = made.command.hold_s or timeout.seconds
+            self.changes.setdefault("command", {})["hold_s"] = hold_s
+            self.findings.append(report_timeout(timeout, hold_s))
+        return alignment
 
     # Geometry.
 
@@ -751,6 +812,8 @@ _FAULTS = {
     "pose_mirrored": "the poses' frame is of the other hand, as north, east, down",
     "command_ahead": "the sign of linear.x is wrong where it is sent, or both motors are reversed",
     "command_turned": "the sign of angular.z or of the steering is inverted, or left and right are exchanged",
+    "command_aside": "the sign of linear.y is wrong where it is sent",
+    "command_mirrored": "left and right are exchanged where it is sent",
     "command_both": "its sign is wrong where it is sent, or both motors are wired backward",
     "wheels_both": "both encoders count backward",
     "wheels_exchanged": "left and right encoders are exchanged",

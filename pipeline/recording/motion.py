@@ -54,6 +54,17 @@ class Motion:
         """Changes of the heading [rad]."""
         return -self.turned if self.flip else self.turned
 
+    @property
+    def rates(self) -> tuple[Floats, Floats]:
+        """Times in the middle of the steps [s], shape (n,), and velocities of the body, shape (n, 3).
+
+        Each is the mean over three steps: that of one is mostly noise of the poses.
+        """
+        elapsed = self.steps.end - self.steps.start
+        moved = (part / elapsed for part in (self.body.real, self.body.imag, self.yaw))
+        velocity = [np.convolve(rate, np.full(3, 1.0 / 3.0), "same") for rate in moved]
+        return 0.5 * (self.steps.start + self.steps.end), np.column_stack(velocity)
+
     def turn(self, *, flip: bool, offset_deg: float) -> Motion:
         """The same poses in another frame."""
         return replace(self, flip=flip, offset_deg=offset_deg)

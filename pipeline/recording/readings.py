@@ -152,6 +152,7 @@ class Explained:
         none: likelihoods of both channels without the reading.
         other: likelihood with (or without) one side reversed; None where it was not tried.
         shares: of both channels, the part of their size that is explained, from 0 to 1.
+        aside: fit of the motion to the left, and its likelihood without the reading; None if not asked.
     """
 
     motion: Motion
@@ -163,6 +164,7 @@ class Explained:
     none: tuple[Floats, Floats]
     other: Floats | None
     shares: tuple[float, float] = (0.0, 0.0)
+    aside: tuple[Fit, Floats] | None = None
 
     @property
     def blocks(self) -> Floats:
@@ -190,8 +192,11 @@ class Explained:
         return np.inf if self.other is None else compare(self.blocks, self.other)
 
     def sign(self, channel: str) -> int:
-        """Sign of the gain of ``ahead`` or ``turned`` where it is clear, else zero."""
-        one, none = (self.ahead, self.none[0]) if channel == "ahead" else (self.turned, self.none[1])
+        """Sign of the gain of ``ahead``, ``turned`` or ``aside`` where it is clear, else zero."""
+        fits = {"ahead": (self.ahead, self.none[0]), "turned": (self.turned, self.none[1])}
+        if channel == "aside" and self.aside is None:
+            return 0
+        one, none = self.aside if channel == "aside" and self.aside is not None else fits[channel]
         if not self.is_sure or abs(one.t[0]) < CLEAR or compare(one.blocks, none) < CLEAR:
             return 0
         return int(np.sign(one.gains[0]))
@@ -206,12 +211,14 @@ class Reading:
             tangent of the angle) or ``gyro`` (nothing, yaw rate).
         name: for people.
         first, second: the inputs.
+        third: of a base that moves sideways, what moves it to the left, in the unit of the first.
     """
 
     form: str
     name: str
     first: Held | None
     second: Held | None
+    third: Held | None = None
     explained: Explained | None = field(default=None, init=False)
 
     @property
@@ -238,6 +245,12 @@ class Reading:
             return (0.5 * (one - two), -one - two) if crossed else (0.5 * (one + two), two - one)
         return (two, one) if crossed and self.form == "body" else (one, two)
 
+    def columns_aside(self, steps: Steps, lag: float, delay: float) -> Floats:
+        """Increments to the left, in the reading's own units; none, or one, of shape (n, 1)."""
+        if self.third is None or not self.third.moves:
+            return np.zeros((steps.start.size, 0))
+        return self.third.integrate(steps, lag, delay)[:, None]
+
     def explain(self, whole: Motion) -> Explained | None:
         """Fit the motion; also kept as ``explained``."""
         self.explained = None
@@ -250,7 +263,8 @@ class Reading:
         if keep.sum() < FEWEST_STEPS:
             return None
         motion = whole.take(keep)
-        may_cross = self.form in {"body", "sides"} and len(self.inputs) == len(SIDES)
+        may_cross = self.form == "sides" or (self.form == "body" and self.third is None)
+        may_cross = may_cross and len(self.inputs) == len(SIDES)
         patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
@@ -293,6 +307,13 @@ class Reading:
             (fit(ahead, beside, motion.steps).blocks, fit(yaw, empty, motion.steps).blocks),
             None,
         )
+        aside = self.columns_aside(motion.steps, lag, delay)
+        if aside.size:
+            across = motion.body.imag
+            made.aside = (
+                fit(across, np.column_stack([aside, beside]), motion.steps),
+                fit(across, beside, motion.steps).blocks,
+            )
         made.shares = (
             measure_share(ahead, float(made.ahead.gains[0]) * first),
             measure_share(yaw, float(made.turned.gains[0]) * second),

@@ -35,7 +35,6 @@ COLUMNS: Mapping[str, tuple[str, ...]] = {
         *("hold_time", "command_scale", "command_turn_scale", "track_multiplier", "body_multiplier"),
         *("gyro_scale", "gyro_bias", "heading_delay"),
         *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
-        *("recorded_modulus_command", "recorded_modulus_measured"),
     ),
     "commands": ("t", *_ALIGNED, "steering", "followed"),
     "wheels": ("t", *_ALIGNED, "steering_aligned", "latency"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any
 
 import msgspec
@@ -27,7 +27,7 @@ class MotionError(SlipError):
 
 # Conversion of stored tables to a run.
 #
-# Only this module converts stored tables to a run. The stage `align` has corrected the errors of a recording;
+# Only this module converts stored tables to a run. The errors of a recording have been corrected before;
 # nothing is corrected here.
 
 _FAR_S = 2.5
@@ -36,7 +36,6 @@ _DEAD = 1e-9
 """Wheel speed [rad/s] below which the wheels of a log never move: rounding."""
 _ROLLS = 0.3
 """Wheel speed [rad/s] above which wheels turn: 5 cm/s of a Husky, 9 cm/s of a Warthog."""
-_INPUTS = ("command", "measured")
 
 
 @dataclass(frozen=True)
@@ -102,7 +101,6 @@ class Alignment:
         outlier_s: duration of contradictions of localization and wheels, except bad stretches.
         gyro: fit of the gyro to the poses; None without a good one.
         heading_delay_s: delay of the reported heading relative to the gyro, removed from the poses.
-        recorded_moduli: median slip modulus with L = 1 m by input before the corrections [m/s].
         body_multiplier: yaw rate of the commanded wheels at the nominal track over that of the body command;
             None without a body command that the wheels obey.
     """
@@ -116,7 +114,6 @@ class Alignment:
     outlier_s: float = 0.0
     gyro: GyroFit | None = None
     heading_delay_s: float = 0.0
-    recorded_moduli: Mapping[str, float | None] = field(default_factory=dict)
     body_multiplier: float | None = None
 
 
@@ -358,13 +355,11 @@ def read_alignment(table: pl.DataFrame) -> Alignment:
         )
     # Tables of before have no scale of the difference: it was that of the whole.
     row = {"command_turn_scale": row["command_scale"], **row}
-    moduli = {name: row[f"recorded_modulus_{name}"] for name in _INPUTS}
     first = Alignment(*(row[name] for name in _ALIGNED))
     return replace(
         first,
         gyro=gyro,
         heading_delay_s=row["heading_delay"] or 0.0,
-        recorded_moduli=moduli,
         body_multiplier=row.get("body_multiplier"),
     )
 
@@ -376,7 +371,6 @@ def tabulate_alignment(alignment: Alignment) -> pl.DataFrame:
     firsts = fields(alignment)[: len(_ALIGNED)]
     row = {
         **{name: getattr(alignment, one.name) for name, one in zip(_ALIGNED, firsts, strict=True)},
-        **{f"recorded_modulus_{name}": alignment.recorded_moduli.get(name) for name in _INPUTS},
         "body_multiplier": alignment.body_multiplier,
     }
     fit = alignment.gyro

@@ -1,6 +1,7 @@
 """Checks of a whole run: scale, and consistency of encoders, command and pose."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -11,16 +12,19 @@ from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_sprea
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
 from pipeline.run.signals import LIVE_SHARE, MOVING_MPS, STILL_MPS
-from pipeline.sources import DriveSource, Vehicle, list_factors
+from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages import SURE, Finding
+from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,
     LEAST_CORRELATION,
     ONE_SCALE,
     Samples,
+    check_independence,
     check_live_commands,
     check_map_shape,
     estimate_delay,
+    gather_samples,
 )
 
 _LIVE: Final = 0.05
@@ -228,6 +232,46 @@ _FEWEST_ASKED = 20
 that a larger number would report a short drive in a long log as no motion."""
 _SKEW = 0.05
 """Least skew that is reported [s]: it appears as a lateral skid of 0.05 s, and skids are 0.02 to 0.15 s."""
+
+
+def check_run(
+    velocities: pl.DataFrame,
+    tables: Mapping[str, pl.DataFrame],
+    slip: SlipResult,
+    vehicle: Vehicle,
+    *,
+    command: DriveSource | None,
+    is_drive_alone: bool = False,
+) -> list[Finding]:
+    """All checks of a run.
+
+    Args:
+        velocities: table `velocities`.
+        tables: `poses`, `commands`, `wheels`, aligned.
+        slip: of all inputs.
+        vehicle: its vehicle.
+        command: topics of the command.
+        is_drive_alone: whether the poses are the motion of the measured wheels.
+    """
+    body_commanded = command is not None and command.form is DriveForm.BODY
+    inputs = {name: ideal.leave_out(slip.suspect) for name, ideal in slip.inputs.items()}
+    samples = gather_samples(velocities, inputs, slip.cut, body_commanded=body_commanded)
+    samples = replace(samples, is_drive_alone=is_drive_alone)
+    findings = check_turn(samples, tables.get("commands", pl.DataFrame()), vehicle, command)
+    findings += run_checks(samples, vehicle)
+    if is_drive_alone or "measured" not in slip.recorded:
+        return findings
+    recorded = {"measured": slip.recorded["measured"].leave_out(slip.suspect)}
+    names = {"recorded_t": "t", "recorded_x": "v_x", "recorded_y": "v_y", "recorded_w": "v_w"}
+    stamped = velocities.drop(*names.values()).rename(names)
+    samples = gather_samples(stamped, recorded, slip.cut, body_commanded=body_commanded)
+    periods = [_find_period(tables[name]) for name in ("wheels", "poses")]
+    return check_independence(samples, vehicle, periods) + findings
+
+
+def _find_period(table: pl.DataFrame) -> float:
+    """Median time between two rows [s]; zero if there are none."""
+    return float(np.median(np.diff(table["t"].to_numpy()))) if table.height > 1 else 0.0
 
 
 def run_checks(samples: Samples, vehicle: Vehicle) -> list[Finding]:

@@ -31,14 +31,11 @@ from pipeline.run.signals import MOVING_MPS
 from pipeline.sources.candidates import PowerSource, Signal
 from pipeline.stages import Finding, reading
 from pipeline.stages.clocks import TopicClock
-from pipeline.stages.slip_stage import hold_commands, interpolate_wheels
+from pipeline.stages.inputs import hold_commands, interpolate_wheels
 from pipeline.stages.spans import LIVE
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from pipeline.sources import Vehicle
-    from pipeline.stages.slip_stage import Ideal
 
 _HALF_S: Final = 0.5
 """Half the span over which speed is measured [s]: a longer one would cut corners in turns."""
@@ -165,21 +162,19 @@ class CommandTimeout:
 
 
 def find_timeout(
-    times: Floats, inputs: Mapping[str, Ideal], moved: Floats, commands: pl.DataFrame, vehicle: Vehicle
+    times: Floats, velocity: Floats, commands: pl.DataFrame, vehicle: Vehicle
 ) -> CommandTimeout | None:
-    """Timeout of a run, from measured wheels if available.
+    """Timeout of a run.
 
     Args:
-        times: grid [s], shape (n,).
-        inputs: ideal velocities on it by input.
-        moved: body velocities by the poses on it, shape (n, 3).
+        times: increasing [s], shape (n,).
+        velocity: of the body at them, by measured wheels if available, else by poses, shape (n, 3).
         commands: table `commands`.
         vehicle: its track converts yaw rates to rim speeds.
     """
-    if "command" not in inputs:
+    if commands.is_empty():
         return None
     scale = _rims(vehicle)
-    velocity = inputs["measured"].velocity if "measured" in inputs else moved
     stamps = commands["t"].to_numpy()
     asked = hold_commands(stamps, commands, vehicle, math.inf)
     return measure_timeout(

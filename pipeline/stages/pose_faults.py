@@ -176,28 +176,29 @@ def align_poses(
     vehicle: Vehicle,
     alignment: Alignment,
     *,
-    outlier: Flags,
+    is_live: Flags,
     is_localization: bool,
     where: str,
 ) -> tuple[pl.DataFrame, Alignment]:
     """Table `poses` with latencies and outliers, and the alignment with the gyro's part.
 
     Args:
-        tables: of the run, with the steps of the table `slip`.
+        tables: of the run.
         vehicle: its vehicle.
         alignment: so far.
-        outlier: poses that are outliers whatever is found here, shape (m,).
+        is_live: poses at which recorded commands drive the vehicle, shape (m,): others are not compared.
         is_localization: whether the poses are more than integrated wheels, so that their delay is observable.
         where: the run, for error messages.
     """
     poses = tables["poses"]
     times = poses["t"].to_numpy()
-    latency = np.zeros(times.size)
+    latency, outlier = np.zeros(times.size), np.zeros(times.size, dtype=bool)
     try:
         run = make_run(tables, vehicle, alignment, name=where)
     except MotionError:
         # A log without enough data for a model still has slip.
         return _correct_poses(poses, latency, outlier), alignment
+    run = replace(run, excluded=times[~is_live])
     if not is_localization:
         # Integrated wheels have no clock of their own.
         return _correct_poses(poses, latency, outlier), _take_off_delay(_with_gyro(run).alignment, 0.0)

@@ -3,176 +3,76 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
+import polars.selectors as cs
 
-from pipeline.core import arrays
 from pipeline.core.arrays import Flags, Floats
-from pipeline.run import read_wheel_times
-from pipeline.run.signals import STILL_MPS
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError
+from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, read_inputs
+from pipeline.stages.spans import find_spans
+from pipeline.stages.velocity import MotionEvents, find_events
 
-_SHARE_OF_RANGE = 0.02
-"""Fraction of a command's range that counts as a change: joysticks and path followers vary by less."""
-_NOISES = 8.0
-"""Change of measured wheel speeds that counts [standard deviations of their noise]: eight exceed any
-noise."""
-_GROWTH = 0.6745 * 6.0**0.5
-"""Median magnitude of second differences of white noise over its standard deviation."""
-_SHORTEST_STEP = 1.0
-"""Shortest command step [s]: a shorter ramp is one change."""
-WINDOW_S = 2.0
-"""Length of a window [s]: that of the published medians, and the shortest hold of a command step."""
 PUBLISHED_SAMPLES = 40
 """Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
 
 
-def find_changes(times: Floats, ideal: Floats, length: float) -> Flags:
-    """Whether the command changes before each sample.
-
-    It changes if its ideal velocity has moved from its level by more than 2 % of its range (and eight times
-    the noise, if measured wheels replace a command), but no sooner than one second after the last change. The
-    level is the value of the command one second after a change, so that a short ramp is one change.
-
-    Args:
-        times: grid times [s], shape (n,).
-        ideal: ideal velocity of the command (f_x, f_y, f_w), NaN where there is none, shape (n, 3).
-        length: length scale L [m] that makes yaw rates comparable to speeds.
-
-    Returns:
-        Flags of shape (n,); the first is True, since the earlier command is unknown.
-    """
-    scaled = np.nan_to_num(ideal * np.array([1.0, 1.0, length]))
-    size = np.linalg.norm(scaled, axis=1)
-    jitter = np.linalg.norm(np.diff(scaled, axis=0), axis=1)
-    changes = np.zeros(times.size, dtype=bool)
-    changes[:1] = True
-    if times.size < 2:  # noqa: PLR2004 - one sample has nothing to change from
-        return changes
-    tolerance = max(
-        _SHARE_OF_RANGE * float(np.quantile(size, 0.99)),
-        _NOISES * _estimate_noise(scaled),
-        STILL_MPS,
-    )
-    begin, level = 0, scaled[0]
-    # Only samples at which the command changes can start a step, so this loop is short for held commands.
-    for index in (np.flatnonzero(jitter > 0.0) + 1).tolist():
-        late_enough = times[index] - times[begin] >= _SHORTEST_STEP
-        if late_enough and np.linalg.norm(scaled[index] - level) > tolerance:
-            changes[index] = True
-            begin = index
-        if times[index] - times[begin] < _SHORTEST_STEP:
-            level = scaled[index]
-    return changes
-
-
-def _estimate_noise(scaled: Floats) -> float:
-    """Level of the white noise in a series (n, 3) by its second differences, which cancel smooth motion."""
-    if scaled.shape[0] < 3:  # noqa: PLR2004 - a second difference needs three
-        return 0.0
-    return float(np.median(np.linalg.norm(np.diff(scaled, n=2, axis=0), axis=1))) / _GROWTH
-
-
-def number_steps(times: Floats, segment: NDArray[np.int32], changes: Flags) -> NDArray[np.int32]:
-    """Number the command steps of a run.
-
-    A step starts with a segment, and where the command changes to or from a value held for two seconds. A
-    command that varies continuously (a joystick, a path follower) is one long step: cut at each change, it
-    would have no window of two seconds at all.
-
-    Args:
-        times: grid times [s], shape (n,).
-        segment: number of the segment, shape (n,).
-        changes: whether the command changes before each sample, shape (n,).
-
-    Returns:
-        Step numbers, shape (n,), starting at zero.
-    """
-    places = np.flatnonzero(changes)
-    period = times[1] - times[0] if times.size > 1 else 0.0
-    lasts = np.diff(times[places], append=times[-1] + period)
-    held = lasts >= WINDOW_S - arrays.ROUNDING_S
-    starts = np.zeros(times.size, dtype=bool)
-    starts[places[held | np.concatenate(([True], held[:-1]))]] = True
-    starts[1:] |= np.diff(segment) != 0
-    return (np.cumsum(starts) - 1).astype(np.int32)
-
-
-def mark_transitory(times: Floats, changes: Flags, span: float) -> Flags:
-    """Whether each sample lies within ``span`` [s] of the last change of the command."""
-    last = np.maximum.accumulate(np.where(changes, np.arange(times.size), 0))
-    return times - times[last] < span - arrays.ROUNDING_S
-
-
 @dataclass(frozen=True)
 class SlipResult:
-    """Tables `slip` and `windows`, all inputs and steps on the grid, and findings."""
+    """Slip of a run.
+
+    Attributes:
+        slip, windows, events: tables.
+        inputs: all known inputs on the grid.
+        recorded: the same as recorded, at the stamps of the poses; of measured wheels even if nothing uses
+            them.
+        suspect: samples in an incident, or with wrong poses, shape (n,).
+        cut: command steps.
+        findings: findings of the stage.
+    """
 
     slip: pl.DataFrame
     windows: pl.DataFrame
+    events: pl.DataFrame
     inputs: Mapping[str, Ideal]
+    recorded: Mapping[str, Ideal]
+    suspect: Flags
     cut: Steps
     findings: tuple[Finding, ...] = field(default=())
 
 
-@dataclass(frozen=True)
-class Ideal:
-    """Ideal velocities of one input on the grid.
-
-    Attributes:
-        velocity: (f_x, f_y, f_w), NaN if the input is unknown, shape (n, 3).
-        stale: samples whose last command is too old to be valid, shape (n,).
-        active: samples in an interval with live commands.
-    """
-
-    velocity: Floats
-    stale: Flags
-    active: Flags
-
-    def leave_out(self, samples: Flags) -> Ideal:
-        """The same with some samples unknown."""
-        return replace(self, velocity=np.where(samples[:, None], np.nan, self.velocity))
-
-    @property
-    def expired(self) -> Floats:
-        """Velocities of the last valid input where it is stale; zero elsewhere, shape (n, 3)."""
-        known = np.isfinite(self.velocity).all(axis=1)
-        last = np.maximum.accumulate(np.where(known, np.arange(known.size), -1))
-        taken = self.stale & (last >= 0)
-        return np.where(taken[:, None], self.velocity[np.maximum(last, 0)], 0.0)
-
-
 def compute_slip(
     velocities: pl.DataFrame,
-    commands: pl.DataFrame,
-    wheels: pl.DataFrame,
+    tables: Mapping[str, pl.DataFrame],
     *,
     vehicle: Vehicle,
     configuration: Configuration,
     hold_s: float | None,
     inputs: Sequence[str],
     where: str,
+    is_drive_alone: bool = False,
 ) -> SlipResult:
-    """Slip of every requested input.
+    """Slip of every requested input, and where a run does not show a vehicle that follows its commands.
 
     Args:
         velocities: table `velocities`.
-        commands: table `commands`, aligned; may be empty.
-        wheels: table `wheels`; may be empty.
+        tables: `poses`, `commands`, `wheels`, `imu`, aligned; those that the log lacks may be missing.
         vehicle: for the ideal model.
         configuration: length scale, transitory span.
         hold_s: how long a command is valid; None without commands.
         inputs: `command`, `measured`, or both.
         where: the run, for error messages.
+        is_drive_alone: whether the poses are the motion of the measured wheels: a localization has faults,
+            and they have none.
 
     Raises:
         StageError: none of the requested inputs has a single sample.
     """
     times = velocities["t"].to_numpy()
+    commands, wheels = (tables.get(name, pl.DataFrame()) for name in ("commands", "wheels"))
     whole = read_inputs(times, commands, wheels, vehicle, hold_s)
     known = keep_known(whole)
     ideals = {name: ideal for name, ideal in known.items() if name in inputs}
@@ -191,129 +91,42 @@ def compute_slip(
         raise StageError("no_command", what, where=where, hint=hint)
     length = configuration.slip.length_scale_m
     cut = cut_steps(velocities, known, length, configuration.slip.transitory_s)
-    base = velocities.select("t", "stamp", "segment", "v_x", "v_y", "v_w").with_columns(
-        step=pl.Series(cut.step), transitory=pl.Series(cut.transitory)
-    )
-    suspect = velocities["outlier"].to_numpy()
-    findings = _report_stale(times, ideals)
-    parts = [_tabulate(base, name, ideal, suspect, length) for name, ideal in ideals.items()]
+    base = velocities.select(
+        "t", "stamp", "segment", "v_x", "v_y", "v_w", "recorded_x", "recorded_y", "recorded_w"
+    ).with_columns(step=pl.Series(cut.step), transitory=pl.Series(cut.transitory))
+    spans = find_spans(velocities, tables["poses"], known, vehicle, hold_s)
+    findings = [*_report_stale(times, ideals), *spans.findings]
+    suspect, motion = spans.excluded | spans.wrong | velocities["outlier"].to_numpy(), MotionEvents()
+    if not is_drive_alone:
+        motion = find_events(velocities, known, vehicle, spans)
+        findings += motion.findings
+    stamps = velocities["recorded_t"].to_numpy()
+    # Readings that were repeated are no correction, unless nothing uses them.
+    witness = wheels.drop(cs.ends_with("_aligned")) if "measured" not in known else wheels
+    if not witness.is_empty():
+        witness = witness.with_columns(pl.lit(0.0).alias("latency"))
+    recorded = read_inputs(stamps, commands.drop(cs.ends_with("_aligned")), witness, vehicle, hold_s)
+    parts = [_tabulate(base, name, ideal, recorded[name], suspect, length) for name, ideal in ideals.items()]
     slip = pl.concat(parts)
     windows = pl.concat([cut_windows(part, configuration.velocity.rate_hz) for part in parts])
-    return SlipResult(slip, windows, known, cut, tuple(findings))
+    return SlipResult(slip, windows, motion.table, known, recorded, suspect, cut, tuple(findings))
 
 
-@dataclass(frozen=True)
-class Steps:
-    """Command steps of a run on its grid.
-
-    Attributes:
-        step: number of the step of each sample, shape (n,).
-        transitory: within the transitory span after a change of the command, shape (n,).
-    """
-
-    step: NDArray[np.int32]
-    transitory: Flags
-
-
-def read_inputs(
-    times: Floats, commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, hold_s: float | None
-) -> dict[str, Ideal]:
-    """Ideal velocities of every available input, by name."""
-    known: dict[str, Ideal] = {}
-    if not commands.is_empty() and hold_s is not None:
-        known["command"] = hold_commands(times, commands, vehicle, hold_s)
-    if not wheels.is_empty():
-        known["measured"] = interpolate_wheels(times, wheels, vehicle)
-    return known
-
-
-def keep_known(inputs: Mapping[str, Ideal]) -> dict[str, Ideal]:
-    """The inputs that are known in some live interval."""
-    return {n: one for n, one in inputs.items() if np.isfinite(one.velocity[one.active]).all(axis=1).any()}
-
-
-def cut_steps(
-    velocities: pl.DataFrame, known: Mapping[str, Ideal], length: float, transitory_s: float
-) -> Steps:
-    """Command steps; those of the measured wheels only without a command, regardless of the requested inputs.
-
-    Args:
-        velocities: table `velocities`.
-        known: at least one input.
-        length: length scale L [m].
-        transitory_s: span after a change [s].
-    """
-    times = velocities["t"].to_numpy()
-    leading = known.get("command") or known["measured"]
-    changes = find_changes(times, leading.velocity, length)
-    return Steps(
-        number_steps(times, velocities["segment"].to_numpy(), changes),
-        mark_transitory(times, changes, transitory_s),
-    )
-
-
-def hold_commands(times: Floats, commands: pl.DataFrame, vehicle: Vehicle, hold: float) -> Ideal:
-    """Ideal velocities of the last command at each time, while it is valid.
-
-    Args:
-        times: grid [s].
-        commands: table `commands`, sorted by time.
-        vehicle: for the ideal model.
-        hold: how long a command is valid [s].
-    """
-    stamps = commands["t"].to_numpy()
-    index = arrays.hold_indices(times, stamps)
-    known = index >= 0
-    last = np.maximum(index, 0)
-    stale = known & (times - stamps[last] > hold)
-    velocity = _predict(commands, vehicle)[last]
-    velocity[~known | stale] = np.nan
-    active = commands["active"].to_numpy()[last] & known
-    return Ideal(velocity, stale & active, active)
-
-
-def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) -> Ideal:
-    """Ideal velocities of the measured wheels, interpolated; unknown in gaps of the encoders."""
-    stamps = read_wheel_times(wheels)
-    values = arrays.interpolate_linearly(times, stamps, _predict(wheels, vehicle))
-    before = arrays.hold_indices(times, stamps)
-    after = np.minimum(before + 1, stamps.size - 1)
-    longest = max(arrays.SILENT_S, arrays.PERIODS * _usual_period(stamps))
-    on_sample = np.abs(times - stamps[np.maximum(before, 0)]) < arrays.ROUNDING_S
-    known = (before >= 0) & (on_sample | ((after > before) & (stamps[after] - stamps[before] <= longest)))
-    values[~known] = np.nan
-    active = wheels["active"].to_numpy()[np.maximum(before, 0)] & (before >= 0)
-    return Ideal(values, np.zeros(times.size, dtype=bool), active)
-
-
-def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
-    kinematics = vehicle.kinematics
-    inputs = {quantity.name: _read_aligned(drive, quantity.name) for quantity in kinematics.inputs}
-    return np.stack(kinematics.forward(inputs, vehicle), axis=-1)
-
-
-def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
-    """A signal of the drive, corrected if a correction exists."""
-    aligned = f"{name}_aligned"
-    return drive[aligned if aligned in drive.columns else name].to_numpy()
-
-
-def _usual_period(stamps: Floats) -> float:
-    # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
-    return float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
-
-
-def _tabulate(base: pl.DataFrame, name: str, ideal: Ideal, suspect: Flags, length: float) -> pl.DataFrame:
+def _tabulate(
+    base: pl.DataFrame, name: str, ideal: Ideal, recorded: Ideal, suspect: Flags, length: float
+) -> pl.DataFrame:
     """Table `slip` of one input: samples with a known input in live intervals."""
     velocity = ideal.velocity
     mask = np.isfinite(velocity).all(axis=1) & ideal.active
     slip = velocity - base.select("v_x", "v_y", "v_w").to_numpy()
-    modulus = np.sqrt(slip[:, 0] ** 2 + slip[:, 1] ** 2 + (length * slip[:, 2]) ** 2)
+    before = recorded.velocity - base.select("recorded_x", "recorded_y", "recorded_w").to_numpy()
+    modulus, raw = (np.linalg.norm(gap * np.array([1.0, 1.0, length]), axis=1) for gap in (slip, before))
     return base.with_columns(
         pl.lit(name, dtype=pl.Enum(["command", "measured"])).alias("input"),
         *(pl.Series(f"f_{axis}", velocity[:, i]) for i, axis in enumerate("xyw")),
         *(pl.Series(f"g_{axis}", slip[:, i]) for i, axis in enumerate("xyw")),
         pl.Series("modulus", modulus),
+        pl.Series("recorded_modulus", raw).fill_nan(None),
         pl.Series("suspect", suspect),
         # Filled where a model is available; this stage only knows the ideal one.
         *(
@@ -412,6 +225,7 @@ def aggregate_run(
             chosen = [
                 frame.filter((pl.col("input") == name) & _in_subset(subset)) for frame in (clean, whole)
             ]
+            raw = slip.filter((pl.col("input") == name) & _in_subset(subset))
             energy = 0.5 * pl.lit(vehicle.mass_kg, dtype=pl.Float64) * find_fastest() ** 2
             split = _split_parts(clean.filter(_in_subset(subset)), length) if name == "command" else {}
             rows.append(
@@ -419,6 +233,7 @@ def aggregate_run(
                     "input": name,
                     "subset": subset,
                     **_summarize_slip(chosen[0], chosen[1]),
+                    "median_recorded_modulus": _number(raw["recorded_modulus"].median()),
                     **_measure_distance(chosen[0], period, moves=moves),
                     **split,
                     "height_rate": height_rate,

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.sources import Vehicle
-    from pipeline.stages.slip_stage import Ideal
+    from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
     "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",

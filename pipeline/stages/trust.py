@@ -19,7 +19,7 @@ from pipeline.run.signals import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.run.windows import WINDOW_S
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding
-from pipeline.stages.slip_stage import Ideal, Steps
+from pipeline.stages.inputs import Ideal, Steps
 
 _STEP = 0.02
 """Step of the lags that are tried [s]: a parabola through three of them interpolates."""

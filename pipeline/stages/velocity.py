@@ -28,7 +28,7 @@ from schemas import tabulate
 
 if TYPE_CHECKING:
     from pipeline.sources import Vehicle
-    from pipeline.stages.slip_stage import Ideal
+    from pipeline.stages.inputs import Ideal
 
 _LEAST_TURNING_RADPS = 0.03
 """Standard deviation of the yaw rate below which an unused gyro cannot be judged, so that no disagreement is
@@ -125,7 +125,7 @@ class VelocityResult:
 def compute_velocities(
     poses: pl.DataFrame,
     imu: pl.DataFrame,
-    gyro: GyroFit | None,
+    alignment: Alignment,
     settings: VelocitySection,
     *,
     where: str,
@@ -136,7 +136,7 @@ def compute_velocities(
     Args:
         poses: table `poses`, aligned.
         imu: table `imu`; may be empty.
-        gyro: fit of the gyro to the poses; None without a good one.
+        alignment: with the fit of the gyro to the poses, if it is good.
         settings: grid rate [Hz], width of the fit [s], source of the yaw rate.
         where: the run, for error messages.
         wheels: measured wheels, which tell a localization that waits from a vehicle at rest.
@@ -145,11 +145,14 @@ def compute_velocities(
         StageError: no segment is long enough, or the gyro is requested and none is usable.
     """
     table, skipped = differentiate_poses(poses, settings, wheels, where=where)
-    findings = []
+    findings: list[Finding] = []
     if skipped:
         are, hold = ("segment is", "holds") if skipped == 1 else ("segments are", "hold")
         text = f"{skipped} {are} shorter than {SPAN_S} s or {hold} one pose: left out"
         findings.append(Finding("short_segments", "info", text, count=skipped))
+    gyro = alignment.gyro
+    if not imu.is_empty():
+        findings += report_gyro(alignment, table["v_w"].to_numpy())
     rate = None if gyro is None else smooth_gyro(table["t"].to_numpy(), imu, gyro, settings.window_s)
     column = (
         pl.Series("v_w_imu", rate, dtype=pl.Float64).fill_nan(None)
@@ -175,7 +178,7 @@ def differentiate_poses(
     """Body velocities on the uniform grid of every segment, without those of a gyro.
 
     Args:
-        poses: table `poses`; if it is not aligned yet, its stamps are used unchanged.
+        poses: table `poses`, aligned.
         settings: grid rate [Hz] and width of the fit [s].
         wheels: see `compute_velocities`.
         where: the run, for error messages.
@@ -202,9 +205,7 @@ def _differentiate_segment(
     """Velocities of one segment, by column; None if it is too short."""
     times = piece["t"]
     fresh = select_fresh(piece, wheels)
-    aligned = times
-    if "latency" in piece:
-        aligned = np.maximum.accumulate(times - piece["latency"])
+    aligned = np.maximum.accumulate(times - piece["latency"])
     # Latencies do not change the order, up to rounding.
     fresh = fresh[np.diff(aligned[fresh], prepend=-np.inf) > 0.0]
     if fresh.size < 2:  # noqa: PLR2004 - one pose has no velocity
@@ -222,9 +223,15 @@ def _differentiate_segment(
     grid = arrays.make_grid(first, last, settings.rate_hz)
     inside = np.clip(grid, stamps[0], stamps[-1])
     velocity = arrays.differentiate_locally(inside, stamps, odometer, settings.window_s)
+    late, stamped = piece["latency"], np.interp(inside, stamps, times[fresh])
+    # A common delay moves a velocity in time, and does not change it.
+    before = (
+        arrays.differentiate_locally(stamped, times[fresh], odometer, settings.window_s)
+        if np.ptp(late) > 0.0
+        else velocity
+    )
     at, attitude = rigid.interpolate_poses(inside, stamps, position, quaternion)
     roll, pitch, yaw = rigid.euler_from_quaternions(attitude)
-    outlier = piece.get("outlier", np.zeros(times.size, dtype=bool))
     return {
         "t": grid,
         "stamp": piece["stamp"][0] + np.round((grid - times[0]) * 1e9).astype(np.int64),
@@ -234,7 +241,9 @@ def _differentiate_segment(
         "pitch": pitch,
         "yaw": rigid.unwrap_yaw(yaw),
         **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
-        "outlier": outlier[arrays.nearest_indices(grid, aligned)],
+        "recorded_t": stamped,
+        **{f"recorded_{axis}": before[:, i] for i, axis in enumerate("xyw")},
+        "outlier": piece["outlier"][arrays.nearest_indices(grid, aligned)],
     }
 
 

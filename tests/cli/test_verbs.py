@@ -64,7 +64,7 @@ def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
     assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
 
     by_run = run_verb("results", "stage", "slip", "good", "--out", tmp_path, "--json")
-    assert json.loads(by_run.stdout)["computed"] == ["align", "velocity", "slip"]
+    assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]
 
 
 def test_simulate_writes_a_log_with_the_effect_asked_for(tmp_path: Path) -> None:

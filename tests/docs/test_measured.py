@@ -49,7 +49,7 @@ def test_a_table_that_is_older_says_so(path: Path) -> None:
 
 def test_a_table_may_be_one_version_older_and_no_more() -> None:
     data = {"versions": {"diagnosis": 7, "slip": 3}}
-    assert tables.find_outdated(data, {"diagnosis": 8, "slip": 3, "align": 9}) == []
+    assert tables.find_outdated(data, {"diagnosis": 8, "slip": 3, "extract": 9}) == []
     (told,) = tables.find_outdated(data, {"diagnosis": 9, "slip": 3})
     assert told == "diagnosis: measured at version 7, the program has 9"
 

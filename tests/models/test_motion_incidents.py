@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
-from motion_runs import as_run, extract, make_scenario, tables_of, vehicle_of
+from motion_runs import as_run, extract, make_scenario, pass_stages, tables_of, vehicle_of
 
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import find_runs
@@ -31,8 +31,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.stages import Finding
-from pipeline.stages.align import align_tables
-from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import find_spans
 
 HUSKY = vehicle_of("husky_a200")
@@ -109,8 +108,7 @@ def watch(made: SimulatedRun, incident: Incident) -> Case:
 
 def find(made: SimulatedRun) -> list[Finding]:
     tables = extract(made, HUSKY)
-    aligned = align_tables(tables, HUSKY, hold_s=None, body_commanded=False, where="simulated")
-    return [found for found in aligned.findings if found.id in INCIDENTS]
+    return [found for found in pass_stages(tables, HUSKY)[1].findings if found.id in INCIDENTS]
 
 
 def is_found(case: Case, findings: list[Finding]) -> bool:
@@ -137,7 +135,7 @@ def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:
     asked = tables["commands"]
     is_new = (pl.col("left").diff().abs() + pl.col("right").diff().abs()).fill_null(1.0) > 1e-6
     sparse = {**tables, "commands": asked.filter(is_new)}
-    findings = align_tables(sparse, HUSKY, hold_s=0.5, body_commanded=False, where="simulated").findings
+    findings = pass_stages(sparse, HUSKY, hold_s=0.5)[1].findings
     (kept,) = (one for one in findings if one.id == "kept_command")
     pauses = sparse["commands"]["t"].diff().drop_nulls().to_numpy()
     assert kept.value == pytest.approx(np.max(pauses) - 0.5, abs=1.0)

@@ -199,7 +199,7 @@ import sys
 from pathlib import Path
 import numpy as np
 import polars as pl
-from pipeline.stages.slip_stage import hold_commands
+from pipeline.stages.inputs import hold_commands
 from pipeline.sources import ConfigurationError, load_configuration, resolve_vehicle
 text = '[vehicle]\\nname = "crab"\\nkind = "crab"\\nwheel_radius_m = 0.1\\ntrack_width_m = 0.5\\n'
 for more in ("", "wheelbase_m = 0.3\\n"):

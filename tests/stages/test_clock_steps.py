@@ -21,7 +21,7 @@ from stage_logs import FIELD, TakeThrough, keep_good_rows, record
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.fleet.confidence import integrated_time
 from pipeline.job.work import as_recorded
-from pipeline.run import read_drive
+from pipeline.run import Alignment, read_drive
 from pipeline.simulate import Clock
 from pipeline.stages.align import align_tables
 from pipeline.stages.clocks import Recorded, align_clocks
@@ -116,20 +116,19 @@ def find_effects(taken: Taken, tables: dict[str, pl.DataFrame]) -> tuple[set[str
     """Effects that are found, and the most memory of the stages and of the diagnosis [bytes]."""
     peaks = {}
     tracemalloc.start()
-    aligned = align_tables(tables, taken.aligned.vehicle, hold_s=None, body_commanded=False, where="test")
+    aligned = align_tables(tables, taken.aligned.vehicle, Alignment(), body_commanded=False, where="test")
     tables, vehicle = dict(aligned.tables), aligned.vehicle
     motion = compute_velocities(
         tables["poses"],
         tables["imu"],
-        aligned.alignment.gyro,
+        aligned.alignment,
         taken.configuration.velocity,
         where="test",
         wheels=read_drive(tables["wheels"], vehicle),
     )
     tables["slip"] = compute_slip(
         motion.table,
-        tables["commands"],
-        tables["wheels"],
+        tables,
         vehicle=vehicle,
         configuration=taken.configuration,
         hold_s=aligned.alignment.hold_s,

@@ -8,7 +8,7 @@ import pytest
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.sources import find_preset
-from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import find_spans
 
 STEP_S = 0.05

@@ -24,7 +24,7 @@ from pipeline.simulate import (
 )
 from pipeline.simulate.programs import Commands
 from pipeline.sources import find_preset
-from pipeline.stages.slip_stage import Ideal
+from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import Spans
 from pipeline.stages.velocity import find_events
 

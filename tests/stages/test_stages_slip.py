@@ -13,7 +13,8 @@ from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 
 from pipeline.simulate import VEHICLES, Program
 from pipeline.sources import Vehicle, find_preset
-from pipeline.stages.slip_stage import cut_windows, hold_commands, interpolate_wheels
+from pipeline.stages.inputs import hold_commands, interpolate_wheels
+from pipeline.stages.slip_stage import cut_windows
 
 
 def preset(name: str, **changes: float) -> Vehicle:

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.stages.slip_stage import find_changes, mark_transitory, number_steps
+from pipeline.stages.inputs import find_changes, mark_transitory, number_steps
 
 RATE = 20.0
 

@@ -11,7 +11,7 @@ import pytest
 from stage_logs import EXACT, FIELD, ICP, PLAIN, TakeThrough, rms, slope
 
 from pipeline.core import rigid
-from pipeline.run import Track
+from pipeline.run import Alignment, Track
 from pipeline.run.signals import DriveSeries
 from pipeline.simulate import VEHICLES, Ground, Program, Recording
 from pipeline.sources import Configuration
@@ -179,6 +179,8 @@ def tabulate_poses(
             **{name: position[:, i] for i, name in enumerate("xyz")},
             **{f"q_{name}": quaternion[:, i] for i, name in enumerate("xyzw")},
             "held": held,
+            "latency": 0.0 * times,
+            "outlier": np.zeros(times.size, dtype=bool),
         }
     )
 
@@ -210,7 +212,7 @@ def test_repeats_of_a_localization_that_waits_are_no_rest_while_the_wheels_turn(
     wheels = DriveSeries(times, turns, turns, 0.0 * turns, None)
 
     def find_fastest(measured: DriveSeries | None) -> float:
-        made = compute_velocities(poses, pl.DataFrame(), None, SETTINGS, where="x", wheels=measured)
+        made = compute_velocities(poses, pl.DataFrame(), Alignment(), SETTINGS, where="x", wheels=measured)
         inner = made.table.filter(pl.col("t").is_between(1.0, 18.0))
         return float(inner["v_x"].abs().max() or 0.0)  # type: ignore[arg-type]
 
@@ -243,7 +245,7 @@ def test_corrected_stamps_keep_the_time_of_the_way_between_poses() -> None:
 
 
 def test_trap_20_steps_with_holes_between_are_segments_of_their_own() -> None:
-    made = compute_velocities(make_windowed_poses(), pl.DataFrame(), None, SETTINGS, where="x").table
+    made = compute_velocities(make_windowed_poses(), pl.DataFrame(), Alignment(), SETTINGS, where="x").table
     assert made["segment"].n_unique() == 5
     assert made.group_by("segment").len()["len"].to_list() == [120] * 5
     # Across a hole the vehicle did not move: a line drawn there would slow it down.

@@ -1,0 +1,208 @@
+"""Corrections of the recorded commands by what the drive does of them: scale, multiplier, and time-out.
+
+Commands and wheels are ideal velocities of the body. The wheels follow the command with a lag and a delay
+that are fitted; what remains is a factor, which is that of slow driving: there the drive does not saturate.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import polars as pl
+
+from pipeline.core.arrays import Flags, Floats, fit_robustly, robust_spread
+from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.readings import Held, Reading
+from pipeline.recording.score import FEWEST_STEPS
+from pipeline.run import Alignment
+from pipeline.run.signals import STILL_MPS
+from pipeline.sources import Vehicle, list_presets
+from pipeline.stages import Finding
+from pipeline.stages.trust import ONE_SCALE
+
+_LEAST_RATIO = 0.02
+"""Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
+_SCALED = 0.18
+"""Absolute logarithm of a ratio above which a scale is wrong: a ratio of 1.2, or of 0.84. The ratio is 1.79
+on `husky_snow_boreal` and 0.96 to 1.04 on the other recordings."""
+_SAME = 0.05
+"""Absolute logarithm of a ratio below which it is that of two radii: on recordings with the right scale it is
+0.04 at most."""
+
+
+def measure_command_scale(
+    commands: pl.DataFrame,
+    wheels: pl.DataFrame,
+    vehicle: Vehicle,
+    *,
+    body_commanded: bool,
+    gain: float | None = None,
+    late: tuple[float, float] | None = None,
+) -> tuple[Alignment, tuple[Finding, ...]]:
+    """Compare commanded motion with that of the measured wheels.
+
+    Args:
+        commands: table `commands` as extracted for this vehicle; may be empty.
+        wheels: table `wheels`; may be empty.
+        vehicle: as configured.
+        body_commanded: whether the command was a body command, which the controller converts to wheel speeds.
+        gain: motion of the poses over a body command; if it is nearer to one than to that of the wheels, the
+            wheels have another radius, and the command is right.
+        late: lag and delay of the wheels [s], if they are known.
+
+    Returns:
+        The corrections of the command, neutral where nothing shows them, and findings on them.
+    """
+    neutral = Alignment(track_multiplier=vehicle.controller_track_multiplier)
+    asked, got = _compare_rates(commands, wheels, vehicle, late)
+    forward, turning = (find_ratio(*pair) for pair in zip(asked, got, strict=True))
+    if forward is None:
+        return neutral, ()
+    is_right = gain is not None and abs(np.log(gain)) < abs(np.log(gain / forward))
+    if abs(np.log(forward)) > _SCALED and not is_right:
+        turning = _find_median(asked[1], got[1]) or forward
+        return _explain_scale(neutral, (forward, turning), vehicle, body_commanded=body_commanded)
+    if turning is None or not body_commanded or not _is_multiplied(turning / forward, vehicle):
+        return neutral, ()
+    used = vehicle.controller_track_multiplier
+    multiplier = turning / forward * used
+    track = "the nominal track width" if used == 1.0 else f"{used:g} times the nominal track width"
+    text = (
+        f"in turns the difference of the wheels is {turning / forward:.2f} times the one commanded "
+        f"with {track}: vehicle.controller_track_multiplier = {multiplier:.3g} was used"
+    )
+    finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
+    return replace(neutral, track_multiplier=multiplier), (finding,)
+
+
+def _explain_scale(
+    neutral: Alignment, ratios: tuple[float, float], vehicle: Vehicle, *, body_commanded: bool
+) -> tuple[Alignment, tuple[Finding, ...]]:
+    """One factor on the whole command, or the geometry of another vehicle where that contradicts turns."""
+    forward, turning = ratios
+    scales, other = (forward, forward), None
+    text = f"in slow driving the wheels turn {forward:.2f} times as fast as commanded"
+    if turning <= 0.0 or abs(np.log(turning / forward)) >= _SCALED:
+        text += f", and in turns their difference is {turning:.2f} times the commanded one (median)"
+        if not body_commanded and turning > 0.0:
+            scales, other = _find_geometry(scales, turning, vehicle)
+        if other is None:
+            text += ": no single scale fits, and slip from commands in turns depends on the scale"
+    if other is None:
+        text += (
+            ": the recorded command is in another scale (another vehicle's wheel radius, a unit, or a gain "
+            f"of the drive); commands are multiplied by {forward:.2f}"
+        )
+    else:
+        text += (
+            f": the recorded command was made for a wheel radius of {other.wheel_radius_m:g} m and a track "
+            f"of {other.track_width_m:g} m, as of {other.name}; the mean of the sides is multiplied by "
+            f"{scales[0]:.2f} and their difference by {scales[1]:.2f}"
+        )
+    text += " before all other steps, also for models and exports"
+    finding = Finding("command_scale", "warning", text, where="command", value=scales[0])
+    return replace(neutral, command_scale=scales[0], command_turn_scale=scales[1]), (finding,)
+
+
+def _find_geometry(
+    scales: tuple[float, float], turning: float, vehicle: Vehicle
+) -> tuple[tuple[float, float], Vehicle | None]:
+    """Scales of mean and difference of the sides by a preset's geometry, if nearer to the ratio in turns."""
+    forward, nearest = scales[0], None
+    for other in list_presets():
+        is_alike = other.kind == vehicle.kind == "differential"
+        if not (is_alike and other.wheel_radius_m and other.track_width_m):
+            continue
+        radii = other.wheel_radius_m / (vehicle.wheel_radius_m or np.nan)
+        tracks = radii * (vehicle.track_width_m or np.nan) / other.track_width_m
+        is_nearer = abs(np.log(turning / tracks)) < abs(np.log(turning / scales[1]))
+        # Wheels may differ less than they are asked to, not more.
+        if abs(np.log(forward / radii)) < _SAME and np.log(turning / tracks) < _SCALED and is_nearer:
+            scales, nearest = (radii, tracks), other
+    return scales, nearest
+
+
+def _is_multiplied(ratio: float, vehicle: Vehicle) -> bool:
+    """Whether turns show another multiplier than the configured one.
+
+    A controller widens the track or leaves it unchanged: a smaller wheel difference is due to the drive.
+    """
+    multiplier = ratio * vehicle.controller_track_multiplier
+    return bool(abs(np.log(ratio)) >= _SCALED and np.log(multiplier) > -_SCALED)
+
+
+_Rates = tuple[Floats, Floats]
+"""Speeds [m/s] and yaw rates [rad/s], shape (n,) each."""
+
+
+def _compare_rates(
+    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, late: tuple[float, float] | None
+) -> tuple[_Rates, _Rates]:
+    """Commanded and measured rates over steps of a tenth of a second; empty where nothing can be compared.
+
+    Commands are lagged and delayed as the wheels follow them best.
+    """
+    asked, got = (_read(table, vehicle) for table in (commands, wheels))
+    motion = roll_wheels(got) if asked is not None and got is not None and got.inputs else None
+    nothing: Floats = np.zeros(0)
+    if asked is None or motion is None or not asked.inputs:
+        return (nothing, nothing), (nothing, nothing)
+    if late is None:
+        made = asked.explain(motion)
+        if made is None:
+            return (nothing, nothing), (nothing, nothing)
+        late = made.lag, made.delay
+    motion = motion.take(np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs]))
+    elapsed = motion.steps.end - motion.steps.start
+    ahead, turned = asked.columns(motion.steps, *late, crossed=False)
+    return (ahead / elapsed, turned / elapsed), (motion.body.real / elapsed, motion.yaw / elapsed)
+
+
+def roll(table: pl.DataFrame, vehicle: Vehicle) -> tuple[Floats, Floats]:
+    """Times [s], shape (n,), and ideal velocities of a drive where it is active, else NaN, shape (n, 3)."""
+    inputs = {
+        one.name: table[one.name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+        for one in vehicle.kinematics.inputs
+    }
+    velocity = np.stack(vehicle.kinematics.forward(inputs, vehicle), axis=-1)
+    velocity[~table["active"].to_numpy()] = np.nan
+    return table["t"].to_numpy(), velocity
+
+
+def _read(table: pl.DataFrame, vehicle: Vehicle) -> Reading | None:
+    """The ideal motion of a drive; None without one."""
+    if table.is_empty():
+        return None
+    times, velocity = roll(table, vehicle)
+    return Reading("body", "", *(Held(times, velocity[:, axis]) for axis in (0, 2)))
+
+
+def find_ratio(asked: Floats, got: Floats) -> float | None:
+    """Median ratio of measured to commanded speed in the slower half of the driving; None if it varies."""
+    slow = _find_slow(asked)
+    if slow.sum() < FEWEST_STEPS:
+        return None
+    ratio, inverse = got[slow] / asked[slow], 1.0 / np.abs(asked[slow])
+    middle = float(np.median(ratio))
+    spread = robust_spread(ratio - middle)
+    # A dead band takes more of a slower step; a scale is that of the fastest ones, too.
+    apart = inverse - inverse.mean()
+    (level, slope), rest = fit_robustly(np.column_stack((np.ones(apart.size), apart)), ratio)
+    is_sloped = float(rest.std()) < 0.5 * float(ratio.std())
+    changed = abs(level - slope * inverse.mean() - middle) if is_sloped else 0.0
+    return middle if middle > _LEAST_RATIO and max(spread, changed) < ONE_SCALE * middle else None
+
+
+def _find_slow(asked: Floats) -> Flags:
+    """The slower half of the driving, without what is near a standstill."""
+    size = np.abs(asked)
+    most = float(np.quantile(size, 0.99)) if size.size else 0.0
+    slow: Flags = (size > max(0.1 * most, STILL_MPS)) & (size < 0.5 * most)
+    return slow
+
+
+def _find_median(asked: Floats, got: Floats) -> float | None:
+    """Median ratio of measured to commanded speed in the slower half of the driving, however it varies."""
+    slow = _find_slow(asked)
+    return float(np.median(got[slow] / asked[slow])) if slow.sum() >= FEWEST_STEPS else None
