@@ -390,6 +390,8 @@ def _format_alignment(manifest: Manifest) -> list[str]:
     """Lines of the alignment values, and the slip before and after alignment."""
     if not {"alignments", "aggregates"} <= set(manifest.tables):
         return []
+    import polars as pl  # noqa: PLC0415 - takes a fifth of a second
+
     row = manifest.read("alignments").row(0, named=True)
     lines = [
         "aligned        (table alignments; latency, outlier, *_aligned: columns of poses, wheels, commands)"

@@ -164,7 +164,7 @@ def _explore(
     candidates = context.list_candidates(path)
     search = Search(problem.parts[0], candidates, context.conditions, frozenset(e.id for e in usable), budget)
     body = _explore_part(context, search, path.value, problem.start_state(usable))
-    paths, state = [body], body.found.final.state
+    paths, state = [body], body.outcome.final.state
     if path is not source:
         driven = [e for e in known if e.place <= Place.DRIVE]
         candidates, given = context.list_drivetrain(), frozenset(e.id for e in driven)
@@ -174,14 +174,14 @@ def _explore(
 
 
 def _explore_part(context: Context, search: Search, path: str, start: State) -> Explored:
-    found = search.run(start)
+    outcome = search.run(start)
     formula = None
     if path != "wheels" and not context.is_drive_alone:
         sideways = context.vehicle.kinematics.has_inputs("sideways")
-        found, formula = search_formula(search, found, sideways=sideways)
-    unobservable, detectable = find_unobservable(search, found)
-    undecided = tuple(find_undecided(search, found))
-    return Explored(path, search, found, formula, undecided, tuple(unobservable), tuple(detectable))
+        outcome, formula = search_formula(search, outcome, sideways=sideways)
+    unobservable, detectable = find_unobservable(search, outcome)
+    undecided = tuple(find_undecided(search, outcome))
+    return Explored(path, search, outcome, formula, undecided, tuple(unobservable), tuple(detectable))
 
 
 def _conclude(

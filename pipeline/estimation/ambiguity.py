@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.decision import LEAST_T, STABLE_T, Found, Search
+from pipeline.estimation.decision import LEAST_T, STABLE_T, Search, SearchResult
 from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import PartFit, whiten_columns
@@ -50,26 +50,26 @@ class Undecided:
     numbers: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
 
 
-def find_undecided(search: Search, found: Found) -> Iterator[Undecided]:
+def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]:
     """For every identified effect, the alternatives among which the data do not decide."""
     candidates = {candidate.id: candidate for candidate in search.candidates}
-    for name in found.new:
-        effect = found.final.state.find(name)
+    for name in outcome.new:
+        effect = outcome.final.state.find(name)
         if effect is None:
             continue
         rivals = {
             one.judged.added[0]: one.judged.fit
-            for one in found.rivals
+            for one in outcome.rivals
             if one.effect == name and len(one.judged.added) == 1 and not one.judged.refusal
         }
         largest = search.conditions.largest
         same = effect.same_in_one_motion if largest.is_one_motion else ()
         # Whichever fits the transients better: what a drive does at another speed is not known.
         same += effect.same_at_one_speed if largest.is_one_speed else ()
-        alike = [one for one in dict.fromkeys(same) if one in candidates and one not in found.final.ids]
+        alike = [one for one in dict.fromkeys(same) if one in candidates and one not in outcome.final.ids]
         names = [*dict.fromkeys([*rivals, *alike])]
         if names:
-            numbers = {name: _read_numbers(found.final, name)}
+            numbers = {name: _read_numbers(outcome.final, name)}
             numbers |= {other: _read_numbers(fit, other) for other, fit in rivals.items()}
             rest = [candidates[one]() for one in names]
             yield Undecided((name, *names), suggest_manoeuvre(effect, *rest), numbers)
@@ -214,13 +214,13 @@ class Detectable:
     size: float
 
 
-def find_unobservable(search: Search, found: Found) -> tuple[list[Unobservable], list[Detectable]]:
+def find_unobservable(search: Search, outcome: SearchResult) -> tuple[list[Unobservable], list[Detectable]]:
     """Candidates that would not be named in this log at their typical size, nor if they show only once.
 
     Returns:
         These, and the detection thresholds of the other effects that are linear in one parameter.
     """
-    fit, part = found.screen.saturated, search.part
+    fit, part = outcome.screen.saturated, search.part
     own = fit.white.columns
     basis = np.linalg.qr(own / (np.linalg.norm(own, axis=0) + 1e-12))[0] if own.size else own
     unit = part.unit[fit.white.rows]

@@ -218,7 +218,7 @@ class Screen:
             gain = float(step @ pull[at])
             if trial.effect.id not in best or gain > best[trial.effect.id][0]:
                 best[trial.effect.id] = gain, places
-        return [place for _, places in best.values() for place in places]
+        return [position for _, places in best.values() for position in places]
 
     @cached_property
     def _projected(self) -> tuple[Floats, Floats, Floats, float]:
@@ -267,7 +267,7 @@ class Screen:
     def _form(self, trials: tuple[Trial, ...], places: tuple[range, ...]) -> Extension | None:
         """An extension with its expected gain; None where it is not possible or not independent."""
         normal, pull, sizes, variance = self._projected
-        at = np.array([place - self._own for each in places for place in each])
+        at = np.array([position - self._own for each in places for position in each])
         inner = normal[np.ix_(at, at)]
         if np.any(np.diag(inner) < _INDEPENDENT * sizes[at]):
             return None

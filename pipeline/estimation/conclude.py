@@ -57,7 +57,8 @@ if TYPE_CHECKING:
 
     from pipeline.estimation import Recording
     from pipeline.estimation.context import Context
-    from pipeline.estimation.decision import Found, Judged, Search
+    from pipeline.estimation.decision import Judged, Search, SearchResult
+    from pipeline.estimation.error_regions import Region
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.problem import Problem
     from pipeline.models.formula import FormulaEffect
@@ -81,7 +82,7 @@ class Explored:
 
     path: str
     search: Search
-    found: Found
+    outcome: SearchResult
     formula: FormulaEffect | None
     undecided: tuple[Undecided, ...]
     unobservable: tuple[Unobservable, ...]
@@ -89,7 +90,7 @@ class Explored:
 
     def judge(self, effect: Effect) -> Judged | None:
         """How an effect, or one of its parts, was judged; None where it was not searched for here."""
-        return next((one for name, one in self.found.judged.items() if name in effect.searched_as), None)
+        return next((one for name, one in self.outcome.judged.items() if name in effect.searched_as), None)
 
 
 def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -> RunDiagnosis:
@@ -121,9 +122,10 @@ def summarize(
     # What the wheels leave is a matter of the ground, wherever the model starts.
     ground = judgements.get(body.path, judgement)
     learned = None if ground is None else learn_beyond(ground)
-    unexplained = _find_unexplained(paths, ground, learned)
-    lead = _find_lead(context, judgement)
-    windows, start = context.problem.whole, body.found.start.state
+    region = _find_region(context, judgement)
+    lead = "" if region is None else f"the remaining error is not spread evenly: {region.sentence}"
+    unexplained = _find_unexplained(paths, ground, learned, region)
+    windows, start = context.problem.whole, body.outcome.start.state
     residual = windows.find_residuals(start)
     regions = map_errors(windows, residual, windows.find_places())
     hidden = {name for item in undecided for name in item.candidates}.union(
@@ -156,7 +158,7 @@ def summarize(
         timing={"runs": cast("Json", clocks.list_runs(judgement.fitted if judgement else None))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(
-            body.found.final, _describe_rest(unexplained, lead, _find_room(judgement))
+            body.outcome.final, _describe_rest(unexplained, lead, _find_room(judgement))
         ),
         lead=lead,
         proposal=None if judgement is None else note_fit(_begin(judgement, undecided), judgement),
@@ -170,9 +172,9 @@ def summarize(
 
 
 def _find_unexplained(
-    paths: Sequence[Explored], ground: Judgement | None, learned: LearnedStep | None
+    paths: Sequence[Explored], ground: Judgement | None, learned: LearnedStep | None, region: Region | None
 ) -> Unexplained | None:
-    """What no effect explains: a formula before a learned term, and that before what only lasts."""
+    """What no effect explains: a formula, else a learned term, what lasts, or where nearly all of it is."""
     formula = paths[0].formula
     if ground is not None and formula is not None:
         suggested = residual_structure.suggest(ground, formula)
@@ -182,18 +184,22 @@ def _find_unexplained(
         described = residual_structure.describe_learned(learned, paths[0].path)
         if described is not None:
             return described
-    lasting = (residual_structure.find_lasting(path.found.final, path.path) for path in paths)
-    return next(filter(None, lasting), None)
+    lasting = (residual_structure.find_lasting(path.outcome.final, path.path) for path in paths)
+    outcome = next(filter(None, lasting), None)
+    if outcome is None and region is not None and region.is_narrow:
+        return Unexplained(
+            region.share, region.channel, (region.channel,), region.sentence, None, {}, paths[0].path
+        )
+    return outcome
 
 
-def _find_lead(context: Context, judgement: Judgement | None) -> str:
-    """Sentence stating in which region most of the remaining error is; empty where it is spread evenly."""
+def _find_region(context: Context, judgement: Judgement | None) -> Region | None:
+    """The region with most of the remaining error; None where it is spread evenly."""
     if judgement is None:
-        return ""
+        return None
     windows, residual = context.problem.whole, judgement.whole.held_out.residuals
     known = np.where(np.isfinite(residual), residual, 0.0)
-    region = find_main_region(windows, known, windows.find_places())
-    return "" if region is None else f"the remaining error is not spread evenly: {region.sentence}"
+    return find_main_region(windows, known, windows.find_places())
 
 
 def _find_room(judgement: Judgement | None) -> float:
@@ -249,8 +255,8 @@ def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list
     effects = {
         effect.id: effect
         for path in paths
-        for effect in path.found.final.state.effects
-        if effect.late is not Late.POSES and effect.id in (*path.found.new, *path.found.start.ids)
+        for effect in path.outcome.final.state.effects
+        if effect.late is not Late.POSES and effect.id in (*path.outcome.new, *path.outcome.start.ids)
     }
     effects |= {effect.id: effect for effect in clocks.effects}
     joined = join_classes(list(effects.values()), context.vehicle)
@@ -355,7 +361,7 @@ def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgeme
     if len(paths) == 1:
         return {}
     described: dict[str, Json] = {}
-    wheels = paths[1].found
+    wheels = paths[1].outcome
     if source is Input.COMMAND and measured is not None:
         described["measured"] = {
             "effects": list(measured.fitted.model.ids),

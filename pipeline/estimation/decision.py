@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import FOLDS
+from pipeline.core import FOLDS, format_share
 from pipeline.core.compute import Budget
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
 from pipeline.estimation.fit import PartFit, fit_part, hold_out
@@ -120,7 +120,7 @@ class Rival:
 
 
 @dataclass(frozen=True)
-class Found:
+class SearchResult:
     """The result of a search on one part of the path.
 
     Attributes:
@@ -163,7 +163,7 @@ class Search:
     shapes: int = 1
     _fits: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
 
-    def run(self, start: State) -> Found:
+    def run(self, start: State) -> SearchResult:
         """Search from a model."""
         first = current = self._fit(start)
         refused = list[Judged]()
@@ -188,7 +188,7 @@ class Search:
             current = better
         return self._conclude(first, self._refuse(current), refused)
 
-    def _conclude(self, first: PartFit, current: PartFit, refused: Iterable[Judged]) -> Found:
+    def _conclude(self, first: PartFit, current: PartFit, refused: Iterable[Judged]) -> SearchResult:
         judged, rivals = dict[str, Judged](), list[Rival]()
         for name in (name for name in current.ids if name not in self.given):
             without = self._drop(current, [name])
@@ -198,7 +198,7 @@ class Search:
                 if behind < EQUAL and not set(other.added) & set(current.ids):
                     rivals.append(Rival(name, other, behind))
         new = tuple(judged)
-        return Found(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
+        return SearchResult(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
 
     @property
     def _least_t(self) -> float:
@@ -393,6 +393,10 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
     new = [effect for effect in fit.state.effects if effect.id in added]
     for effect in new:
         acting = fit.state.list_as_it_acts(effect)
+        if len(acting) > 1 and effect.late is not None:
+            # Clocks of several runs are told by their differences: what they have in common may be a delay.
+            delays = [one.delay for one in acting]
+            acting.append(effect.of_delay(min(delays) - max(delays)))
         if not any(is_nameable(one, conditions) for one in acting):
             return Judged(base, fit, added, f"{effect.id}: its values are not possible")
         t = measure_t(fit, effect, base)
@@ -416,7 +420,7 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
     elif rise > most:
         refusal = f"the error {risen} rises"
     elif most < SHOWN:
-        refusal = f"no error falls by more than {most:.1%}"
+        refusal = f"no error falls by more than {format_share(most)}"
     elif not _is_material(part, base.residual - fit.residual):
         refusal = "nobody would notice it"
     sums = [np.bincount(part.block, cost) for cost in costs]

@@ -37,6 +37,8 @@ _CHANGE = 0.05
 """Smallest change of a command, as a share of its largest value: the jitter of joysticks is smaller."""
 _LARGE_SHARE = 0.5
 """Share of a channel's squared error in the main region: as much as in all other windows."""
+_NARROW_SHARE, _NARROW_TIME = 0.75, 1.0 / 3.0
+"""Share of the error, and at most of the time, from which on it is an event of its own."""
 _CONCENTRATED = 1.5
 """Factor over its share of the time: a region that covers most of the run has most of any error."""
 _BEYOND = 1.5
@@ -78,6 +80,11 @@ class Region:
         """Whether its share of the error exceeds the expected share."""
         least = _BEYOND if self.kind in _CIRCUMSTANCES else _EXCESS
         return self.share > max(least * self.expected, _EXCESS * self.time_share)
+
+    @property
+    def is_narrow(self) -> bool:
+        """Whether it has nearly all of the error in little of the time."""
+        return self.share >= _NARROW_SHARE and self.time_share <= _NARROW_TIME
 
     @property
     def sentence(self) -> str:

@@ -56,7 +56,7 @@ def make_folds(windows: WindowResiduals) -> tuple[Fold, ...]:
     return tuple(Fold(~find_near(windows, windows, test), test) for test in tests)
 
 
-def find_near(rows: _Rows, tested: _Rows, test: Flags) -> Flags:
+def find_near(rows: _Rows, held: _Rows, test: Flags) -> Flags:
     """Mask of rows within the gap of test rows of the same runs, shape (n,).
 
     Args:
@@ -66,8 +66,8 @@ def find_near(rows: _Rows, tested: _Rows, test: Flags) -> Flags:
     """
     near = np.zeros(rows.run.size, dtype=bool)
     for run in np.unique(rows.run).tolist():
-        mine, judged = rows.run == run, (tested.run == run) & test
-        starts, ends = np.sort(tested.times[judged, 0]), np.sort(tested.times[judged, 1])
+        mine, judged = rows.run == run, (held.run == run) & test
+        starts, ends = np.sort(held.times[judged, 0]), np.sort(held.times[judged, 1])
         # A row is near if more test rows begin before its end than end before its start.
         later = np.searchsorted(starts, rows.times[mine, 1] + GAP_S)
         earlier = np.searchsorted(ends, rows.times[mine, 0] - GAP_S)

@@ -212,8 +212,8 @@ def carry_clocks(fit: PartFit, covariance: Floats) -> Floats:
         # What the residuals say of the clock beside the numbers: its error after them.
         shared = fit.white.columns.T @ white
         alone = float(white @ white) - float(shared @ influence)
-        left = 1.0 / (1.0 + max(alone, 0.0) / fit.overdispersion)
-        carried += influence**2 * max(left, _ALWAYS_CARRIED**2)
+        rest = 1.0 / (1.0 + max(alone, 0.0) / fit.overdispersion)
+        carried += influence**2 * max(rest, _ALWAYS_CARRIED**2)
     return carried
 
 

@@ -1,4 +1,4 @@
-"""A model fitted to runs, part by part of the way from command to motion."""
+"""A model fitted to runs, part by part from the commands to the motion."""
 
 from __future__ import annotations
 

@@ -32,6 +32,8 @@ CLIP = 3.0
 """Innovation [standard deviations] above which its cost grows linearly (Huber)."""
 _LONGEST_S = 2.0
 """Longest correlation time of a disturbance [s]: what lasts longer is an effect, or the ground, not noise."""
+_JUMP = 100.0
+"""Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
 _SCALE_ROUNDS = 30
@@ -140,13 +142,14 @@ def learn_noise(residual: Floats, steps: Steps, channels: Sequence[int], start: 
         if not (rough > _LEAST).any():
             continue
         known = None if start is None else (start.correlation[channel], start.share[channel])
-        scaled = values / np.where(rough > _LEAST, rough, np.inf)[steps.run][:, None]
+        scaled = np.clip(values / np.where(rough > _LEAST, rough, np.inf)[steps.run][:, None], -_JUMP, _JUMP)
         phi, part = _maximize(scaled, steps, step_s, known)
-        made, deviations = _filter(values, steps, step_s, phi, part)
+        made, deviations = _filter(scaled, steps, step_s, phi, part)
         correlation[channel], share[channel] = phi, part
         for run, mine in enumerate(rows):
             if rough[run] > _LEAST:
-                scale[run, channel] = max(_measure_scale(made[mine, 0] / deviations[mine]), _LEAST)
+                outcome = rough[run] * _measure_scale(made[mine, 0] / deviations[mine])
+                scale[run, channel] = max(outcome, _LEAST)
     return Noise(step_s, correlation, share, scale)
 
 
@@ -154,7 +157,8 @@ def _measure_rough(values: Floats) -> float:
     """Spread of residuals as if they were independent."""
     if not values.size:
         return 0.0
-    return max(_GAUSSIAN * float(np.median(np.abs(values))), 0.1 * float(values.std()))
+    size = np.abs(values)
+    return max(_GAUSSIAN * float(np.median(size)), 0.1 * float(size.mean()))
 
 
 def _measure_scale(innovations: Floats) -> float:
@@ -190,7 +194,7 @@ def _maximize(
         inside = np.clip((known[0] / most, known[1]), 1e-4, 1.0 - 1e-4)
         first, second = np.log(inside / (1.0 - inside)).tolist()
         starts = [(first, second)]
-    found = [
+    outcome = [
         minimize(
             cost,
             np.array(start),
@@ -204,7 +208,7 @@ def _maximize(
         )
         for start in starts
     ]
-    return read(min(found, key=lambda one: float(one.fun)).x)
+    return read(min(outcome, key=lambda one: float(one.fun)).x)
 
 
 def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: float) -> tuple[Floats, Floats]:

@@ -1,4 +1,4 @@
-"""Parts of the way from command to motion: measured less predicted increments, as a function of a model."""
+"""Parts from the commands to the motion: measured less predicted increments, as a function of a model."""
 
 from __future__ import annotations
 

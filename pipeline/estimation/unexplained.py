@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.core import enumerate_texts, format_share
 from pipeline.estimation.candidates import PRICE
-from pipeline.estimation.decision import EQUAL, Found, Search, find_cost
+from pipeline.estimation.decision import EQUAL, Search, SearchResult, find_cost
 from pipeline.estimation.diagnosis import Json, Unexplained
 from pipeline.estimation.error_regions import ERROR_WORDS
 from pipeline.estimation.folds import errors_as_json
@@ -45,7 +45,9 @@ _LEAST_OF_MOTION = 0.05
 """Share of the motion below which what lasts is not reported."""
 
 
-def search_formula(search: Search, found: Found, *, sideways: bool) -> tuple[Found, FormulaEffect | None]:
+def search_formula(
+    search: Search, outcome: SearchResult, *, sideways: bool
+) -> tuple[SearchResult, FormulaEffect | None]:
     """A formula of up to three terms for what the accepted effects leave, or for one that only imitates it.
 
     Terms pass the same acceptance as effects, at the price of the shapes that they are the best of. What an
@@ -55,26 +57,26 @@ def search_formula(search: Search, found: Found, *, sideways: bool) -> tuple[Fou
         The effects that stay, and the formula; None where none is accepted.
     """
     terms = list_terms(sideways=sideways)
-    best, least = found, find_cost(found.final)
-    starts = [found.final, *(found.judged[name].base for name in found.new)]
+    best, least = outcome, find_cost(outcome.final)
+    starts = [outcome.final, *(outcome.judged[name].base for name in outcome.new)]
     added: list[FormulaEffect] = []
     for start in starts:
         wide = replace(search, candidates=terms, given=frozenset(start.ids), shapes=_SHAPES)
         promised = wide.screen(start).list_singles()
-        gained = start.score - found.final.score
+        gained = start.score - outcome.final.score
         if not promised or promised[0].net <= gained:
             continue
         beyond = wide.run(start.state)
         new = [cast("FormulaEffect", one) for one in beyond.final.state.effects if is_term(one.id)]
         cost = find_cost(beyond.final) + 2.0 * math.log(_SHAPES) * len(new)
         # It displaces an effect only where it is far better than beside it.
-        if new and cost < least - (EQUAL if start is found.final else 2.0 * PRICE):
-            best, least, added = replace(found, final=start), cost, new
+        if new and cost < least - (EQUAL if start is outcome.final else 2.0 * PRICE):
+            best, least, added = replace(outcome, final=start), cost, new
     if not added:
-        return found, None
+        return outcome, None
     gained = best.final.score - least
-    if best is found and any(one.gain > _SAME * gained for one in found.screen.list_singles()):
-        return found, None
+    if best is outcome and any(one.gain > _SAME * gained for one in outcome.screen.list_singles()):
+        return outcome, None
     return best, join_formula(added)
 
 

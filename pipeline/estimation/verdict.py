@@ -191,7 +191,7 @@ def _format_nothing(diagnosis: Content) -> list[str]:
         return [*sentences, "The budget ended the search for effects early"]
     if not _list_excess(diagnosis):
         return [*sentences, "The noise floor of this run is not known"]
-    if measure_excess(diagnosis) < ABOVE_FLOOR:
+    if measure_excess(diagnosis) < ABOVE_FLOOR and not diagnosis.get("unexplained"):
         return sentences or [NOTHING_MISSING]
     open_groups = [
         name_group(cast("Sequence[str]", one["candidates"])) for one in objects_in(diagnosis, "undecided")

@@ -61,7 +61,14 @@ def test_json_is_all_that_stdout_holds_and_has_the_promised_keys(field: Path, tm
 def test_a_stage_alone(field: Path, tmp_path: Path) -> None:
     done = run_program("results", "stage", "extract", field / "good.mcap", "--out", tmp_path, "--json")
     assert done.returncode == 0
-    assert set(json.loads(done.stdout)["rows"]) == {"commands", "wheels", "poses", "imu", "findings"}
+    assert set(json.loads(done.stdout)["rows"]) == {
+        "alignments",
+        "commands",
+        "wheels",
+        "poses",
+        "imu",
+        "findings",
+    }
 
     by_run = run_verb("results", "stage", "slip", "good", "--out", tmp_path, "--json")
     assert json.loads(by_run.stdout)["computed"] == ["velocity", "slip"]

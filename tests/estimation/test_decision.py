@@ -26,7 +26,7 @@ from pipeline.simulate.programs import Commands
 if TYPE_CHECKING:
     from collections.abc import Collection
 
-    from pipeline.estimation.decision import Found
+    from pipeline.estimation.decision import SearchResult
     from pipeline.estimation.fit import PartFit
     from pipeline.models import Effect
     from pipeline.run import MotionRun
@@ -43,7 +43,7 @@ def drive(effects: object, **more: object) -> MotionRun:
     return simulate(effects, **{**usual, **more})  # type: ignore[arg-type]
 
 
-def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, Found, State]:
+def search(*runs: MotionRun, names: Collection[str] = ()) -> tuple[Search, SearchResult, State]:
     """The ground searched from the wheels, with candidates of these names or with all; and its start."""
     context = prepare(runs, HUSKY, Input.MEASURED)
     candidates = [one for one in context.list_candidates(Input.MEASURED) if not names or one.id in names]

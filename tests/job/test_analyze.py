@@ -103,7 +103,7 @@ def test_two_folders_hold_the_same_bytes(log: Path, tmp_path: Path) -> None:
 
 def test_a_stage_alone_writes_its_tables_and_no_later_ones(log: Path, out: Path) -> None:
     extracted = analyze(log, out, through="extract")
-    assert set(extracted.manifest.tables) == {"commands", "wheels", "poses", "imu", "findings"}
+    assert set(extracted.manifest.tables) == {"alignments", "commands", "wheels", "poses", "imu", "findings"}
 
     velocity = analyze(log, out, through="velocity")
     assert velocity.computed == ("velocity",)

@@ -5,7 +5,7 @@ from constants import choose_numbers, compare, replace_number
 
 from pipeline.estimation import decision
 from pipeline.run import signals
-from pipeline.stages import align, pose_faults, timing, trust
+from pipeline.stages import inputs, pose_faults, timing, trust
 
 
 def test_what_a_number_changes_is_told_in_words() -> None:
@@ -17,8 +17,8 @@ def test_what_a_number_changes_is_told_in_words() -> None:
 
 def test_a_shared_number_is_replaced_wherever_it_was_imported_and_put_back() -> None:
     with replace_number("pipeline.run.signals", "STILL_MPS", 2.0):
-        assert signals.STILL_MPS == align.STILL_MPS == trust.STILL_MPS == pytest.approx(0.04)
-    assert signals.STILL_MPS == align.STILL_MPS == trust.STILL_MPS == pytest.approx(0.02)
+        assert signals.STILL_MPS == inputs.STILL_MPS == trust.STILL_MPS == pytest.approx(0.04)
+    assert signals.STILL_MPS == inputs.STILL_MPS == trust.STILL_MPS == pytest.approx(0.02)
 
 
 def test_a_private_number_of_another_file_is_another_number() -> None:
