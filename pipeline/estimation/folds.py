@@ -61,7 +61,7 @@ def find_near(rows: _Rows, held: _Rows, test: Flags) -> Flags:
 
     Args:
         rows: the rows.
-        tested: those with the test rows; may be the same.
+        held: those with the test rows; may be the same.
         test: mask of these, shape (m,).
     """
     near = np.zeros(rows.run.size, dtype=bool)
