@@ -11,6 +11,7 @@ from chrome import BROWSER, Browser, Chrome
 from deep_folders import dig  # noqa: F401
 from golden import check_golden  # noqa: F401
 from hypothesis import settings
+from known_misses import MISSES
 from stored import diagnosed_results, place, recorded_results, stored_run  # noqa: F401
 
 if TYPE_CHECKING:
@@ -25,6 +26,14 @@ os.environ.pop("COLUMNS", None)
 
 ROOT = Path(__file__).parents[1]
 SHARED = ROOT.parent / "shared"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is known to be missed; a test that passes again fails until it leaves the list."""
+    for item in items:
+        reason = MISSES.get(item.nodeid)
+        if reason is not None:
+            item.add_marker(pytest.mark.xfail(reason=reason, strict=True))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -43,7 +43,8 @@ def read_values(model: Model) -> dict[str, float]:
 def test_an_exact_fit_ends_at_the_same_values_from_every_start(problem: Problem) -> None:
     ends = [read_values(fit_model(problem, Model(HUSKY, start), exact=True).model) for start in STARTS]
     for other in ends[1:]:
-        assert other == pytest.approx(ends[0], rel=2e-6, abs=2e-6)
+        # One unit in the last of the six digits that a file keeps.
+        assert other == pytest.approx(ends[0], rel=1e-5, abs=2e-6)
     assert ends[0]["drive_lag.tau"] == pytest.approx(0.3, abs=0.01)
 
 
