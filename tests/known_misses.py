@@ -1,4 +1,4 @@
-"""Promises that are not kept today, each with what happens instead: a test that passes again leaves the list."""
+"""Promises that are not kept today, each with what happens instead: what passes again leaves the list."""
 
 MISSES = {
     "tests/models/test_motion_budget.py::test_effects_that_were_not_named_have_numbers_that_hold_the_truth":
@@ -48,6 +48,7 @@ MISSES = {
         "the accuracy of pose faults was measured before spans were one test: make measure",
     "tests/docs/test_measured.py::test_no_headline_is_older_than_the_program_by_more_than_a_version[paper]":
         "the figures of the paper were measured before the stages became four: make measure ARGS=paper",
-    "tests/hostile/test_hostile_inputs.py::test_words[simulate ideal_husky --effect effective_trak=1 --out x.mcap]":
+    "tests/hostile/test_hostile_inputs.py::"
+    "test_words[simulate ideal_husky --effect effective_trak=1 --out x.mcap]":
         "the line lists every effect of a catalogue that has grown: 1,010 characters",
 }  # fmt: skip
