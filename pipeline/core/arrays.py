@@ -295,38 +295,6 @@ def fit_robustly(design: Floats, values: Floats) -> tuple[Floats, Floats]:
     return estimates, rest
 
 
-def count_freedom(normals: Floats, without: Floats) -> Floats:
-    """Degrees of freedom of the jackknife variances for equally distributed residuals, shape (p,).
-
-    The jackknife variance is a quadratic form of the gradients of the blocks: its degrees of freedom are
-    twice the square of its mean over its variance (Satterthwaite).
-
-    Args:
-        normals: normal matrix of each block, shape (k, p, p).
-        without: normal matrix of all other blocks, shape (k, p, p).
-    """
-    count = normals.shape[0]
-    moved = np.linalg.inv(without)
-    pull = np.swapaxes(moved @ normals, 0, 1)
-    shared = pull @ np.linalg.pinv(normals[0] + without[0])
-    # The form is diagonal plus low rank, and centred: its traces need no (k, k) matrix.
-    own = np.einsum("pkq,kqp->pk", pull, moved)
-    joint = np.swapaxes(pull, 1, 2) @ shared
-    rows = own - np.einsum("pkq,pq->pk", shared, pull.sum(axis=1))
-    total = rows.sum(axis=1)
-    trace = own.sum(axis=1) - np.trace(joint, axis1=1, axis2=2) - total / count
-    power = (
-        np.sum(own**2, axis=1)
-        - 2.0 * np.einsum("pk,pkq,pkq->p", own, shared, pull)
-        + np.einsum("pij,pji->p", joint, joint)
-        - 2.0 * np.sum(rows**2, axis=1) / count
-        + (total / count) ** 2
-    )
-    # A single block has no variance.
-    freedom: Floats = np.maximum(trace**2 / np.where(power > 0.0, power, np.inf), 1.0)
-    return freedom
-
-
 @functools.lru_cache(maxsize=4096)
 def student_quantile(level: float, freedom: float) -> float:
     """Quantile of Student's t for a two-sided level; NaN without degrees of freedom.

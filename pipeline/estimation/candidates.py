@@ -283,17 +283,6 @@ class Screen:
             begin += len(each)
         return Extension(trials, tuple(step.tolist()), float(step @ pull[at]) / variance)
 
-    def measure_standard_errors(self) -> dict[str, tuple[float, float]]:
-        """Standard error of the number of each candidate with one column, beside the model and alone."""
-        normal, _, sizes, variance = self._projected
-        errors = {}
-        for trial, places in zip(self.trials, self._places, strict=True):
-            if len(places) == 1 and not trial.own:
-                at = places[0] - self._own
-                beside, alone = max(float(normal[at, at]), 1e-24), max(float(sizes[at]), 1e-24)
-                errors[trial.effect.id] = math.sqrt(variance / beside), math.sqrt(variance / alone)
-        return errors
-
 
 def _project(fit: PartFit, columns: Floats, own: int) -> tuple[Floats, Floats, Floats]:
     """Normal matrix and pull of candidates' columns, those of the model projected out, and squared sizes."""

@@ -186,14 +186,14 @@ class Search:
             if better is None or not find_cost(better) < find_cost(current):
                 break
             current = better
-        return self._conclude(first, self._refuse(current), refused)
+        return self._conclude(first, *self._refuse(current), refused)
 
-    def _conclude(self, first: PartFit, current: PartFit, refused: Iterable[Judged]) -> SearchResult:
-        judged, rivals = dict[str, Judged](), list[Rival]()
-        for name in (name for name in current.ids if name not in self.given):
-            without = self._drop(current, [name])
-            judged[name] = self._judge(without, current)
-            for other in self._list_rivals(current, without, [name]):
+    def _conclude(
+        self, first: PartFit, current: PartFit, judged: dict[str, Judged], refused: Iterable[Judged]
+    ) -> SearchResult:
+        rivals = list[Rival]()
+        for name, one in judged.items():
+            for other in self._list_rivals(current, one.base, [name]):
                 behind = other.cost - find_cost(current)
                 if behind < EQUAL and not set(other.added) & set(current.ids):
                     rivals.append(Rival(name, other, behind))
@@ -274,14 +274,15 @@ class Search:
                 return fit
             fit = self._drop(fit, [min(weak)[1]])
 
-    def _refuse(self, fit: PartFit) -> PartFit:
-        """The model without effects that are not accepted beside its others, the least gain first."""
+    def _refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
+        """The model without effects that are not accepted beside its others, and how each was judged."""
         while True:
             free = [name for name in fit.ids if name not in self.given]
-            judged = ((self._judge(self._drop(fit, [name]), fit), name) for name in free)
-            refused = [(float(np.nan_to_num(one.gain)), name) for one, name in judged if one.refusal]
+            judged = {name: self._judge(self._drop(fit, [name]), fit) for name in free}
+            refused = [(float(np.nan_to_num(one.gain)), name) for name, one in judged.items() if one.refusal]
             if not refused:
-                return fit
+                return fit, judged
+            # The least gain goes first.
             fit = self._drop(fit, [min(refused)[1]])
 
     def _exchange(self, current: PartFit) -> PartFit | None:

@@ -187,11 +187,6 @@ class Named:
         return self.parameters if self.corrected else split_determined(self.parameters)[0]
 
     @property
-    def tellings(self) -> tuple[Mapping[str, Value], ...]:
-        """Its values, once or for each run."""
-        return self.by_run or (self.parameters,)
-
-    @property
     def sentence(self) -> str:
         """The effect with its values, and its possible causes where one run cannot separate them."""
         texts = {reading.name: reading.text for reading in reversed(self.readings)}

@@ -423,30 +423,6 @@ def format_errors(errors: Mapping[str, object]) -> str:
     return " and ".join(sizes) or "by an unknown amount"
 
 
-_SIGNALS = {"v_x": "forward speed", "v_y": "lateral speed", "v_w": "yaw rate"}
-
-
-def format_dependence(error: str, unit: str, signal: str, table: Sequence[tuple[float, float]]) -> str:
-    """Sentence on the dependence of an error on a signal, with its largest and smallest mean.
-
-    Args:
-        error: name of the error.
-        unit: of the error.
-        signal: name of the feature, with its unit: ``roll [rad]``.
-        table: values of the signal, rising, and the mean error at each.
-    """
-    for symbol, words in _SIGNALS.items():
-        signal = signal.replace(symbol, words)
-    signal, _, of = signal.replace(" 0 s ago", "").replace(" s ago", " s earlier").partition(" [")
-    places = f" {of}".replace("]", "").rstrip()
-    low, high = min(table, key=lambda row: row[1]), max(table, key=lambda row: row[1])
-    verbs = {(table[0], table[-1]): "grows with", (table[-1], table[0]): "falls with"}
-    return (
-        f"{error} {verbs.get((low, high), 'depends on')} {signal}: "
-        f"{high[1]:+.3g} {unit} at {high[0]:.3g}{places}, {low[1]:+.3g} {unit} at {low[0]:.3g}{places}"
-    )
-
-
 @dataclass(frozen=True)
 class Curve:
     """Values by the seconds of driving, both of shape (k,)."""

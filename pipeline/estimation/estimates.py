@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
-from pipeline.estimation.additions import explain_interval
 from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value
 from pipeline.estimation.error_regions import BREVITY
 from pipeline.estimation.fit import PartFit, invert
@@ -62,12 +61,6 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
             is_spread_measured=parameter.between_runs is not None,
         )  # fmt: skip
     return values
-
-
-def explain_values(effect: str, values: Mapping[str, Value]) -> str | None:
-    """Clause stating that all intervals of an effect include the neutral value; None where one does not."""
-    intervals = {key: (one.low, one.high) for key, one in values.items()}
-    return explain_interval(restore(effect, values), intervals)
 
 
 def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Value]]:

@@ -113,18 +113,6 @@ def climb(problem: Problem, model: Model, *, per_run: Sequence[str] = ()) -> Lad
     return _climb_to(judge_whole(problem, model, per_run), per_run)
 
 
-def list_raising(judgement: Judgement) -> list[str]:
-    """Effects whose step raises the errors over 2 s, and without which the whole model has lower ones."""
-    raising: list[str] = []
-    for below, step in pairwise(judgement.ladder.steps):
-        if raises_errors(below.errors, step.errors):
-            (name,) = set(step.effects) - set(below.effects)
-            rest = judgement.fitted.model - name
-            without = judge_whole(judgement.problem, rest, judgement.per_run)
-            raising += [name] if raises_errors(without.errors, judgement.whole.errors) else []
-    return raising
-
-
 def _climb_to(whole: LadderStep, per_run: Sequence[str]) -> Ladder:
     """The ladder up to a judged model: each step is what the model with only these effects is elsewhere."""
     problem, model = whole.fitted.problem, whole.fitted.model

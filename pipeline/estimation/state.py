@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core.arrays import Floats
 from pipeline.models.effect import Effect, Search
 from pipeline.models.model import Timing
 
@@ -33,11 +33,6 @@ def pick_columns(columns: Floats, places: Sequence[int]) -> Floats:
     if list(places) == list(range(columns.shape[2])):
         return columns
     return columns.transpose(2, 0, 1)[list(places)].transpose(1, 2, 0)
-
-
-def pick_windows(columns: Floats, windows: Flags) -> Floats:
-    """The rows of some windows, flags of shape (n,)."""
-    return columns.transpose(2, 0, 1)[:, windows].transpose(1, 2, 0)
 
 
 def flatten(columns: Floats) -> Floats:

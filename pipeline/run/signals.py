@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -255,13 +254,6 @@ class RunContext:
     body: Resets
     attitude: Floats
     position: Floats
-
-    @cached_property
-    def from_start(self) -> Floats:
-        """x, y [m] and yaw [rad] in the frame of the first pose, independent of the map, shape (n, 3)."""
-        yaw = self.attitude[:, 2] - self.attitude[0, 2]
-        moved = (self.position - self.position[0]) @ np.array([1.0, 1.0j]) * np.exp(-1j * self.attitude[0, 2])
-        return round_off(np.column_stack((moved.real, moved.imag, yaw)))
 
     @property
     def downhill(self) -> tuple[Floats, Floats]:
