@@ -245,15 +245,10 @@ class Screen:
         """Pairs that explain more than each of the two alone pays for, by gain less price."""
         known = {id(trial): places for trial, places in zip(self.trials, self._places, strict=True)}
         alone = dict[str, Extension]()
-        normal, _, sizes, _ = self._projected
         for trial, places in zip(self.trials, self._places, strict=True):
-            at = np.array(places) - self._own
-            step = invert(normal[np.ix_(at, at)]) @ self._projected[1][at]
-            gain = float(step @ self._projected[1][at]) / self._projected[3]
-            one = Extension((trial,), tuple(step.tolist()), gain)
-            if np.all(np.diag(normal)[at] > _INDEPENDENT * sizes[at]) and (
-                trial.effect.id not in alone or one.net > alone[trial.effect.id].net
-            ):
+            # Beside another effect a value may be possible that is not alone.
+            one = self._measure((trial,), (places,))
+            if one is not None and (trial.effect.id not in alone or one.net > alone[trial.effect.id].net):
                 alone[trial.effect.id] = one
         leading = sorted(alone.values(), key=lambda one: -one.net)[:_PAIRED]
         pairs = []
@@ -266,6 +261,18 @@ class Screen:
 
     def _form(self, trials: tuple[Trial, ...], places: tuple[range, ...]) -> Extension | None:
         """An extension with its expected gain; None where it is not possible or not independent."""
+        extension = self._measure(trials, places)
+        if extension is None:
+            return None
+        begin = 0
+        for trial, each in zip(trials, places, strict=True):
+            if not trial.is_possible(list(extension.step[begin : begin + len(each)])):
+                return None
+            begin += len(each)
+        return extension
+
+    def _measure(self, trials: tuple[Trial, ...], places: tuple[range, ...]) -> Extension | None:
+        """An extension with its expected gain, possible or not; None where it is not independent."""
         normal, pull, sizes, variance = self._projected
         at = np.array([position - self._own for each in places for position in each])
         inner = normal[np.ix_(at, at)]
@@ -276,11 +283,6 @@ class Screen:
             if np.linalg.eigvalsh(inner / np.outer(size, size))[0] < _INDEPENDENT / 2.0:
                 return None
         step = invert(inner) @ pull[at]
-        begin = 0
-        for trial, each in zip(trials, places, strict=True):
-            if not trial.is_possible(step[begin : begin + len(each)].tolist()):
-                return None
-            begin += len(each)
         return Extension(trials, tuple(step.tolist()), float(step @ pull[at]) / variance)
 
 

@@ -14,10 +14,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import FOLDS, format_share
+from pipeline.core import format_share
 from pipeline.core.compute import Budget
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
-from pipeline.estimation.fit import PartFit, fit_part, hold_out
+from pipeline.estimation.fit import PartFit, fit_part
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.parts import HORIZONS_S
 from pipeline.estimation.plausibility import is_nameable, is_too_small
@@ -63,8 +63,6 @@ _NEAR = 0.2
 """Share of what those explain that it may lack after them to be fitted to the end."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
-_FEWEST_RUNS = 3
-"""Runs from which on whole runs are held out in place of blocks."""
 
 
 @dataclass(frozen=True)
@@ -404,14 +402,12 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
         if t < least_t:
             return Judged(base, fit, added, f"{effect.id}: t = {t:.1f}")
     part, noise = fit.part, fit.noise
-    folds = make_folds(part)
-    before, after = (hold_out(one, one.noise, folds) for one in (base, fit))
-    costs = [list_costs(part, noise, residual) for residual in (before, after)]
+    costs = [list_costs(part, noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
     own = list_costs(part, noise, base.residual) - list_costs(part, noise, fit.residual)
     by_unit = np.asarray(np.bincount(part.unit, own), dtype=np.float64)
     stable = math.sqrt(max(float(by_unit.sum() - by_unit.max()), 0.0))
-    falls, rise, risen = _compare_horizons(*map(part.list_horizon_errors, (before, after)))
+    falls, rise, risen = _compare_horizons(base.horizon_errors, fit.horizon_errors)
     most = float(np.nanmax(falls, initial=0.0))
     refusal = ""
     if not gain > 0.0:
@@ -438,13 +434,6 @@ def _is_material(part: Part, change: Floats) -> bool:
     x, y, turn = np.sqrt(np.mean((sums[length:] - sums[:-length]) ** 2, axis=0)).tolist()
     distance = _FELT_S * part.speed
     return math.hypot(x, y) >= LEAST_WAY_SHARE * distance or turn >= LEAST_TURN_RAD
-
-
-def make_folds(part: Part) -> Ints:
-    """Fold of each step: of runs where there are some, else of blocks, shape (n,)."""
-    label = part.run if int(part.run.max(initial=0)) + 1 >= _FEWEST_RUNS else part.block
-    number: Ints = np.unique(label, return_inverse=True)[1] % FOLDS
-    return number
 
 
 def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:

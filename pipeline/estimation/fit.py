@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import FOLDS
 from pipeline.estimation.noise import CLIP, huber_cost
 from pipeline.estimation.state import combine_columns, flatten, pick_columns
 
@@ -21,7 +22,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.arrays import Flags, Floats, Ints
     from pipeline.estimation.noise import Noise
-    from pipeline.estimation.parts import Part
+    from pipeline.estimation.parts import HorizonError, Part
     from pipeline.estimation.state import Free, State
 
 _ENOUGH = 0.01
@@ -41,6 +42,8 @@ _GRID_ROUNDS = 4
 """Rounds of a grid, each a third as wide as the one before."""
 _STIFFEST = 30.0
 """Damping relative to the diagonal above which no further step is tried."""
+_FEWEST_HELD = 3
+"""Runs from which on whole runs are held out in place of blocks."""
 RIDGE = 1e-9
 """Regularization of normal equations of columns of unit size."""
 
@@ -127,6 +130,16 @@ class PartFit:
     def covariance(self) -> Floats:
         """Covariance of its numbers, shape (p, p); see `join_covariance`."""
         return join_covariance(self, self.normal)
+
+    @cached_property
+    def held_out(self) -> Floats:
+        """Residuals of every step under numbers fitted without its fold, shape (n, 3)."""
+        return hold_out(self, self.noise, make_folds(self.part))
+
+    @cached_property
+    def horizon_errors(self) -> Sequence[HorizonError]:
+        """Held-out errors over each of `HORIZONS_S`."""
+        return self.part.list_horizon_errors(self.held_out)
 
 
 def whiten(part: Part, noise: Noise, residual: Floats, columns: Floats) -> White:
@@ -321,6 +334,13 @@ def _walk_grid(fit: PartFit, number: Free, enough: float) -> PartFit:
     beyond = _descend(moved, enough)
     costs = [measure_cost(part, noise, one.state, one.free, one.residual) for one in (beyond, fit)]
     return beyond if costs[0] < costs[1] else fit
+
+
+def make_folds(part: Part) -> Ints:
+    """Fold of each step: of runs where there are some, else of blocks, shape (n,)."""
+    label = part.run if int(part.run.max(initial=0)) + 1 >= _FEWEST_HELD else part.block
+    number: Ints = np.unique(label, return_inverse=True)[1] % FOLDS
+    return number
 
 
 def hold_out(fit: PartFit, noise: Noise, folds: Ints) -> Floats:

@@ -14,8 +14,8 @@ from motion_runs import as_run, make_scenario, simulate, vehicle_of
 from pipeline.estimation import Input
 from pipeline.estimation.ambiguity import find_undecided
 from pipeline.estimation.context import prepare
-from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, make_folds, measure_t
-from pipeline.estimation.fit import fit_part
+from pipeline.estimation.decision import LEAST_T, Judged, Search, judge, measure_t
+from pipeline.estimation.fit import fit_part, make_folds
 from pipeline.estimation.intervals import estimate_part
 from pipeline.estimation.state import State
 from pipeline.estimation.unexplained import search_formula

@@ -7,8 +7,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem, fit_model
-from pipeline.estimation.decision import make_folds
-from pipeline.estimation.fit import fit_part, hold_out
+from pipeline.estimation.fit import fit_part, hold_out, make_folds
 from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.model_file import parse_model
 from pipeline.simulate import Disturbance, Program
