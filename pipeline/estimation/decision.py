@@ -233,20 +233,42 @@ class Search:
         return [one for one in judged if not one.refusal], [one for one in judged if one.refusal]
 
     def _judge_extensions(
-        self, base: PartFit, screen: Screen, singles: int, pairs: int, wanted: float = 0.0
+        self,
+        base: PartFit,
+        screen: Screen,
+        singles: int,
+        pairs: int,
+        wanted: float = 0.0,
+        reached: float = math.inf,
     ) -> list[Judged]:
-        """The most promising extensions of a model, fitted and judged."""
+        """The most promising extensions of a model, fitted and judged.
+
+        Args:
+            base: the model.
+            screen: what they promise.
+            singles: most that are by one effect.
+            pairs: most that are by two.
+            wanted: expected gain, less price, that they must exceed.
+            reached: cost of the model that they would replace.
+        """
         extensions: list[Extension] = [one for one in screen.list_singles() if one.net > wanted][:singles]
         extensions += [one for one in screen.list_pairs() if one.net > wanted][:pairs]
-        judged = dict[tuple[str, ...], Judged]()
-        for extension in extensions:
-            fit = self._fit(extension.add_to(base.state), base.noise)
-            fit = self._reduce(fit, base)
+        # Some steps show which may come near the best.
+        rough = [
+            fit_part(self.part, one.add_to(base.state), noise=base.noise, most=_ROUGH) for one in extensions
+        ]
+        judged, before = dict[tuple[str, ...], Judged](), find_cost(base)
+        for start in sorted(rough, key=find_cost):
+            if find_cost(start) > reached + _NEAR * max(before - reached, 0.0):
+                break
+            fit = self._reduce(self._fit(start.state, start.noise), base)
             if set(fit.ids) == set(base.ids):
                 continue
             one = self._judge(base, fit)
             if fit.ids not in judged or one.cost < judged[fit.ids].cost:
                 judged[fit.ids] = one
+            if not one.refusal:
+                reached = min(reached, one.cost)
         return list(judged.values())
 
     def _reduce(self, fit: PartFit, base: PartFit) -> PartFit:
@@ -313,7 +335,8 @@ class Search:
         """Models with other effects in the place of some, judged against the one with neither."""
         screen = self.screen(without, names)
         own = without.score - current.score
-        return self._judge_extensions(without, screen, 2, 1, 0.3 * own - PRICE * len(names))
+        wanted = 0.3 * own - PRICE * len(names)
+        return self._judge_extensions(without, screen, 2, 1, wanted, find_cost(current))
 
     def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""

@@ -25,23 +25,17 @@ if TYPE_CHECKING:
     from pipeline.estimation.parts import HorizonError, Part
     from pipeline.estimation.state import Free, State
 
-_ENOUGH = 0.01
+_ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
 _SETTLED = 1e-7
-"""The same for a model that is written, and for its noise: it ends at the same values from every start."""
-_NEWS = 0.02
-"""Relative fall of the cost above which derivatives are computed anew."""
-_MOST_STEPS = 20
-_ROUNDS = 3
-"""Times that the noise is learned anew from the residuals of a fit."""
-_EXACT_ROUNDS = 24
-"""The same at most for a model that is written: six digits of a lag need more than six."""
-_SAME_NOISE = 0.03
-"""Change of the noise's correlation, share and relative scale below which it counts as the same."""
+"""The same for a model that is written: it ends at the same values from every start."""
+_NEWS = 1.0
+"""Fall above which derivatives, and the noise, are computed anew."""
+_MOST_STEPS = 30
 _GRID_ROUNDS = 4
 """Rounds of a grid, each a third as wide as the one before."""
-_STIFFEST = 30.0
-"""Damping relative to the diagonal above which no further step is tried."""
+_LOOSEST, _STIFFEST = 1e-6, 30.0
+"""Damping relative to the diagonal at first, and above which no further step is tried."""
 _FEWEST_HELD = 3
 """Runs from which on whole runs are held out in place of blocks."""
 RIDGE = 1e-9
@@ -217,33 +211,23 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        most: steps with one noise.
+        most: steps.
     """
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
-    known = part.learn(residual, noise)
-    enough = _SETTLED if exact else _ENOUGH
     columns = part.differentiate(start, residual, free, both_sides=exact)
-    fit = PartFit(part, start, free, residual, columns, known)
+    fit = PartFit(part, start, free, residual, columns, part.learn(residual, noise, exact=exact))
     if not free:
         return fit
-    for _ in range(_EXACT_ROUNDS if exact else _ROUNDS):
-        fit = _descend(fit, enough, most)
-        for number in fit.free:
+    fit = _descend(fit, most, exact=exact)
+    for _ in range(_GRID_ROUNDS if len(fit.smooth) < len(free) else 0):
+        before = fit.score
+        for number in free:
             if not number.is_smooth:
-                fit = _walk_grid(fit, number, enough)
-        learned = part.learn(fit.residual, None if exact else fit.noise)
-        if _is_same(learned, fit.noise, _SETTLED if exact else _SAME_NOISE):
+                fit = _walk_grid(fit, number, most, exact=exact)
+        if before - fit.score < _ENOUGH:
             break
-        fit = replace(fit, noise=learned)
     return fit
-
-
-def _is_same(one: Noise, other: Noise, tolerance: float) -> bool:
-    sizes = one.spread, other.spread
-    apart = [one.correlation - other.correlation, one.share - other.share]
-    apart.append((sizes[0] - sizes[1]) / np.maximum(sizes[1], 1e-300))
-    return bool(np.abs(apart)[:, other.known].max(initial=0.0) < tolerance)
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
@@ -252,50 +236,56 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
     return float(huber_cost(innovations).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, enough: float, most: int = _MOST_STEPS) -> PartFit:
-    """Levenberg-Marquardt steps with this noise, numbers held to their bounds."""
-    part, noise, free = fit.part, fit.noise, fit.free
-    cost, exact = measure_cost(part, noise, fit.state, free, fit.residual), enough < _ENOUGH
-    damping, is_fresh = 1e-6, True
+def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
+    """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way."""
+    part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
+    damping, is_fresh, is_learned = _LOOSEST, True, True
+    cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     for _ in range(most if fit.smooth else 0):
-        white = fit.white
-        pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
-        moving = [
-            index for index in fit.smooth if not _is_pushed_out(fit.state, free[index], float(pulls[index]))
-        ]
-        if not moving:
-            break
-        normal = fit.normal[np.ix_(moving, moving)]
-        size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
-        scaled = normal / np.outer(size, size) + (RIDGE + damping) * np.eye(size.size)
-        step = np.linalg.solve(scaled, pulls[moving] / size) / size
-        if float(step @ pulls[moving]) < enough:
-            break
-        state = fit.state.move([free[index] for index in moving], step.tolist())
-        residual = part.find_residuals(state)
-        reached = measure_cost(part, noise, state, free, residual)
-        if not reached < cost:
-            if not is_fresh:
-                fit = replace(
-                    fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact)
-                )
-                is_fresh = True
+        moving, step, promised = _solve(fit, damping)
+        fall = 0.0
+        if promised >= enough:
+            state = fit.state.move(moving, step)
+            residual = part.find_residuals(state)
+            fall = cost - measure_cost(part, fit.noise, state, free, residual)
+        if fall > 0.0:
+            fit, cost = replace(fit, state=state, residual=residual), cost - fall
+            damping, is_fresh, is_learned = max(damping / 30.0, 1e-9), False, False
+            if fall <= _NEWS and not exact:
                 continue
-            if damping > _STIFFEST:
-                break
+        elif is_fresh and promised >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
             continue
-        is_fresh = cost - reached > _NEWS * cost or cost - reached > 1.0 or exact
-        columns = fit.columns
-        if is_fresh:
-            columns = part.differentiate(state, residual, free, both_sides=exact)
-        fall, cost, damping = cost - reached, reached, max(damping / 30.0, 1e-9)
-        fit = replace(fit, state=state, residual=residual, columns=columns)
-        if fall < enough:
+        elif is_fresh and is_learned:
             break
+        if not is_fresh:
+            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
+            fit, is_fresh = replace(fit, columns=columns), True
+        if not is_learned and not 0.0 < fall <= _NEWS:
+            learned = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
+            is_learned = True
+            if fit.score - learned.score > enough:
+                fit, damping = learned, min(damping, _LOOSEST)
+                cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     if not is_fresh:
-        fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free))
+        fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit
+
+
+def _solve(fit: PartFit, damping: float) -> tuple[list[Free], list[float], float]:
+    """The numbers that move, their step, and the fall of the cost that it promises."""
+    part, free, white = fit.part, fit.free, fit.white
+    pulls = white.columns.T @ white.residual + part.prior.pull(fit.state, free)
+    moving = [
+        index for index in fit.smooth if not _is_pushed_out(fit.state, free[index], float(pulls[index]))
+    ]
+    if not moving:
+        return [], [], 0.0
+    normal = fit.normal[np.ix_(moving, moving)]
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-24))
+    scaled = normal / np.outer(size, size) + (RIDGE + damping) * np.eye(size.size)
+    step = np.linalg.solve(scaled, pulls[moving] / size) / size
+    return [free[index] for index in moving], step.tolist(), float(step @ pulls[moving])
 
 
 def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
@@ -304,7 +294,7 @@ def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
     return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
 
 
-def _walk_grid(fit: PartFit, number: Free, enough: float) -> PartFit:
+def _walk_grid(fit: PartFit, number: Free, most: int, *, exact: bool) -> PartFit:
     """Search a number on a shrinking grid, the others adapted linearly; then all of them are fitted."""
     part, noise, smooth = fit.part, fit.noise, fit.smooth
     columns = pick_columns(fit.columns, smooth)
@@ -331,9 +321,8 @@ def _walk_grid(fit: PartFit, number: Free, enough: float) -> PartFit:
     moved = replace(
         fit, state=state, residual=residual, columns=part.differentiate(state, residual, fit.free)
     )
-    beyond = _descend(moved, enough)
-    costs = [measure_cost(part, noise, one.state, one.free, one.residual) for one in (beyond, fit)]
-    return beyond if costs[0] < costs[1] else fit
+    beyond = _descend(moved, most, exact=exact)
+    return beyond if beyond.score < fit.score else fit
 
 
 def make_folds(part: Part) -> Ints:

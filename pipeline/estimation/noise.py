@@ -36,6 +36,8 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
+_ROUGHLY = {"maxiter": 80, "xatol": 0.1, "fatol": 0.05}
+"""When the likelihood has converged, in its units and in those of the logits of both numbers."""
 _SCALE_ROUNDS = 30
 _SAME_SCALE = 1e-4
 """Relative change of a scale at which it has converged."""
@@ -124,7 +126,14 @@ class Noise:
         return poses, self.share * variance * grown
 
 
-def learn_noise(residual: Floats, steps: Steps, channels: Sequence[int], start: Noise | None = None) -> Noise:
+def learn_noise(
+    residual: Floats,
+    steps: Steps,
+    channels: Sequence[int],
+    start: Noise | None = None,
+    *,
+    exact: bool = False,
+) -> Noise:
     """Noise of residuals by maximum likelihood, outliers weighted down.
 
     Args:
@@ -132,6 +141,7 @@ def learn_noise(residual: Floats, steps: Steps, channels: Sequence[int], start: 
         steps: the steps.
         channels: those that say anything.
         start: noise of nearly the same residuals.
+        exact: whether its numbers must converge, not only the likelihood.
     """
     step_s, runs = float(np.median(steps.spans)), int(steps.run[-1]) + 1
     correlation, share, scale = np.zeros(3), np.zeros(3), np.full((runs, 3), np.inf)
@@ -143,7 +153,7 @@ def learn_noise(residual: Floats, steps: Steps, channels: Sequence[int], start: 
             continue
         known = None if start is None else (start.correlation[channel], start.share[channel])
         scaled = np.clip(values / np.where(rough > _LEAST, rough, np.inf)[steps.run][:, None], -_JUMP, _JUMP)
-        phi, part = _maximize(scaled, steps, step_s, known)
+        phi, part = _maximize(scaled, steps, step_s, known, exact=exact)
         made, deviations = _filter(scaled, steps, step_s, phi, part)
         correlation[channel], share[channel] = phi, part
         for run, mine in enumerate(rows):
@@ -175,40 +185,36 @@ def huber_cost(innovations: Floats) -> Floats:
 
 
 def _maximize(
-    values: Floats, steps: Steps, step_s: float, known: tuple[float, float] | None
+    values: Floats, steps: Steps, step_s: float, known: tuple[float, float] | None, *, exact: bool
 ) -> tuple[float, float]:
     """Correlation and share of the disturbance."""
     most = math.exp(-step_s / _LONGEST_S)
 
-    def read(at: Floats) -> tuple[float, float]:
-        phi, part = 1.0 / (1.0 + np.exp(-np.clip(at, -12.0, 12.0)))
-        return float(phi) * most, float(part)
+    def read(at: Sequence[float]) -> tuple[float, float]:
+        phi, part = (1.0 / (1.0 + math.exp(-min(max(one, -12.0), 12.0))) for one in at)
+        return phi * most, part
 
     flat, size = np.ascontiguousarray(values[:, 0]), np.empty(values.shape[0])
 
     def cost(at: Floats) -> float:
-        return _find_cost(flat, steps.fresh, steps.spans, step_s, *read(at), size)
+        return _find_cost(flat, steps.fresh, steps.spans, step_s, *read(at.tolist()), size)
 
-    starts = [(2.0, -2.0), (0.0, 1.0)]
+    starts, width = [(2.0, -2.0), (0.0, 1.0)], 1.2
     if known is not None:
-        inside = np.clip((known[0] / most, known[1]), 1e-4, 1.0 - 1e-4)
-        first, second = np.log(inside / (1.0 - inside)).tolist()
-        starts = [(first, second)]
+        inside = (min(max(one, 1e-4), 1.0 - 1e-4) for one in (known[0] / most, known[1]))
+        first, second = (math.log(one / (1.0 - one)) for one in inside)
+        starts, width = [(first, second)], 0.4
+    at_most = {"maxiter": 300, "xatol": 1e-5, "fatol": 1e-7} if exact else _ROUGHLY
     outcome = [
         minimize(
             cost,
             np.array(start),
             method="Nelder-Mead",
-            options={
-                "maxiter": 80,
-                "xatol": 0.02,
-                "fatol": 0.3,
-                "initial_simplex": np.add(start, [[0.0, 0.0], [1.2, 0.0], [0.0, 1.2]]),
-            },
+            options={**at_most, "initial_simplex": np.add(start, [[0.0, 0.0], [width, 0.0], [0.0, width]])},
         )
         for start in starts
     ]
-    return read(min(outcome, key=lambda one: float(one.fun)).x)
+    return read(min(outcome, key=lambda one: float(one.fun)).x.tolist())
 
 
 def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: float) -> tuple[Floats, Floats]:
@@ -227,12 +233,15 @@ def _find_scale(size: Floats) -> float:
         mean += value
     scale = max(1.2533 * mean / size.size, 1e-12)
     for _ in range(_SCALE_ROUNDS):
-        total = 0.0
+        total, slope = 0.0, 0.0
         for value in size:
-            total += min(value, CLIP * scale) * value
-        grown = math.sqrt(total / size.size) / scale
-        scale *= grown
-        if abs(grown - 1.0) < _SAME_SCALE:
+            z = value / scale
+            held = min(z, CLIP)
+            total += held * z
+            slope += held * (z if z > CLIP else 2.0 * z)
+        grown = (total - size.size) / max(slope, 1e-300)
+        scale *= math.exp(grown)
+        if abs(grown) < _SAME_SCALE:
             break
     return scale
 
@@ -252,14 +261,16 @@ def _find_cost(
         share: its share in the variance.
         size: room for the sizes of the innovations, shape (n,).
     """
-    noise = 1.0 - share
-    of_a, of_both, of_n, a, n, logs = share, 0.0, noise, 0.0, 0.0, 0.0
+    noise, decay = 1.0 - share, math.log(max(phi, 1e-300)) / step_s
+    of_a, of_both, of_n, a, n, logs, span, keep = share, 0.0, noise, 0.0, 0.0, 0.0, 0.0, 1.0
     for row in range(values.size):
         if fresh[row]:
             of_a, of_both, of_n, a, n = share, 0.0, noise, 0.0, 0.0
         variance = of_a + of_n - 2.0 * of_both + noise
         gain_a, gain_n = (of_a - of_both) / variance, noise / variance
-        keep = phi ** (spans[row] / step_s)
+        if spans[row] != span:
+            span = spans[row]
+            keep = math.exp(decay * span)
         fresh_part = values[row] - a + n
         size[row] = abs(fresh_part) / math.sqrt(variance)
         a = keep * (a + gain_a * fresh_part)
@@ -293,8 +304,8 @@ def _walk(
     deviations: Floats,
 ) -> None:
     """Kalman filter of a disturbance and the error of the last pose; see the module for the equations."""
-    noise = 1.0 - share
-    of_a, of_both, of_n = share, 0.0, noise
+    noise, decay = 1.0 - share, math.log(max(phi, 1e-300)) / step_s
+    of_a, of_both, of_n, span, keep = share, 0.0, noise, 0.0, 1.0
     for row in range(values.shape[0]):
         if fresh[row]:
             of_a, of_both, of_n = share, 0.0, noise
@@ -302,7 +313,9 @@ def _walk(
                 state[0, column], state[1, column] = 0.0, 0.0
         variance = of_a + of_n - 2.0 * of_both + noise
         gain_a, gain_n = (of_a - of_both) / variance, noise / variance
-        keep = phi ** (spans[row] / step_s)
+        if spans[row] != span:
+            span = spans[row]
+            keep = math.exp(decay * span)
         for column in range(values.shape[1]):
             fresh_part = values[row, column] - state[0, column] + state[1, column]
             made[row, column] = fresh_part

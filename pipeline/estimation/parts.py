@@ -135,9 +135,9 @@ class Part(ABC):
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """Increments of one run with that clock delayed by ``late_s`` [s], shape (m, 3)."""
 
-    def learn(self, residual: Floats, start: Noise | None = None) -> Noise:
+    def learn(self, residual: Floats, start: Noise | None = None, *, exact: bool = False) -> Noise:
         """Noise of residuals of shape (n, 3)."""
-        return learn_noise(residual, self.steps, self.channels, start)
+        return learn_noise(residual, self.steps, self.channels, start, exact=exact)
 
     def differentiate(
         self, state: State, residual: Floats, free: Sequence[Free], *, both_sides: bool = False
