@@ -36,8 +36,11 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_ROUGHLY = {"maxiter": 80, "xatol": 0.1, "fatol": 0.05}
-"""When the likelihood has converged, in its units and in those of the logits of both numbers."""
+_SAME, _EXACTLY_SAME = 0.05, 1e-7
+"""Difference of chi-square at which the likelihood of both numbers has converged, and that of a model that
+is written. Where one of them says nothing, as the correlation of no disturbance, it may be anything."""
+_FARTHEST = 8.0
+"""Largest logit of a share or a correlation."""
 _SCALE_ROUNDS = 30
 _SAME_SCALE = 1e-4
 """Relative change of a scale at which it has converged."""
@@ -191,7 +194,7 @@ def _maximize(
     most = math.exp(-step_s / _LONGEST_S)
 
     def read(at: Sequence[float]) -> tuple[float, float]:
-        phi, part = (1.0 / (1.0 + math.exp(-min(max(one, -12.0), 12.0))) for one in at)
+        phi, part = (1.0 / (1.0 + math.exp(-min(max(one, -_FARTHEST), _FARTHEST))) for one in at)
         return phi * most, part
 
     flat, size = np.ascontiguousarray(values[:, 0]), np.empty(values.shape[0])
@@ -204,13 +207,16 @@ def _maximize(
         inside = (min(max(one, 1e-4), 1.0 - 1e-4) for one in (known[0] / most, known[1]))
         first, second = (math.log(one / (1.0 - one)) for one in inside)
         starts, width = [(first, second)], 0.4
-    at_most = {"maxiter": 300, "xatol": 1e-5, "fatol": 1e-7} if exact else _ROUGHLY
     outcome = [
         minimize(
             cost,
             np.array(start),
             method="Nelder-Mead",
-            options={**at_most, "initial_simplex": np.add(start, [[0.0, 0.0], [width, 0.0], [0.0, width]])},
+            options={
+                "xatol": math.inf,
+                "fatol": _EXACTLY_SAME if exact else _SAME,
+                "initial_simplex": np.add(start, [[0.0, 0.0], [width, 0.0], [0.0, width]]),
+            },
         )
         for start in starts
     ]
