@@ -204,8 +204,9 @@ def _maximize(
 
     starts, width = [(2.0, -2.0), (0.0, 1.0)], 1.2
     if known is not None:
-        inside = (min(max(one, 1e-4), 1.0 - 1e-4) for one in (known[0] / most, known[1]))
-        first, second = (math.log(one / (1.0 - one)) for one in inside)
+        logits = (math.log(max(one, 1e-9) / max(1.0 - one, 1e-9)) for one in (known[0] / most, known[1]))
+        # Near the ends the likelihood is flat, and nothing would lead away from there.
+        first, second = (min(max(one, -_FARTHEST / 2.0), _FARTHEST / 2.0) for one in logits)
         starts, width = [(first, second)], 0.4
     outcome = [
         minimize(
@@ -215,7 +216,7 @@ def _maximize(
             options={
                 "xatol": math.inf,
                 "fatol": _EXACTLY_SAME if exact else _SAME,
-                "initial_simplex": np.add(start, [[0.0, 0.0], [width, 0.0], [0.0, width]]),
+                "initial_simplex": np.add(start, [[0.0, 0.0], [-width, 0.0], [0.0, -width]]),
             },
         )
         for start in starts
