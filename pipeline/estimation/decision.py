@@ -469,21 +469,17 @@ def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
 def _compare_horizons(
     before: Sequence[HorizonError], after: Sequence[HorizonError]
 ) -> tuple[Floats, float, str]:
-    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance as the fall that would undo
-    it, and where it is."""
+    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where it is."""
     falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
     for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
         for channel, name in enumerate(("position", "heading")):
             one, other = getattr(old, name), getattr(new, name)
             if not one.size or not one.mean() > 0.0:
                 continue
-            ratio = math.sqrt(float(other.mean() / one.mean()))
-            falls[index, channel] = 1.0 - ratio
-            # An error that doubles weighs as much as one that is halved.
-            grown = 1.0 - 1.0 / max(ratio, 1e-12)
-            if grown > rise and _measure_block_t(other - one, old.block) > _RISEN:
+            fall = falls[index, channel] = 1.0 - math.sqrt(float(other.mean() / one.mean()))
+            if -fall > rise and _measure_block_t(other - one, old.block) > _RISEN:
                 length = "a whole stretch" if math.isinf(horizon) else f"{horizon:g} s"
-                rise, risen = grown, f"in {name} over {length}"
+                rise, risen = -fall, f"in {name} over {length}"
     return falls, rise, risen
 
 
