@@ -36,7 +36,7 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _EXACTLY_SAME = 0.05, 1e-7
+_SAME, _EXACTLY_SAME = 0.005, 1e-7
 """Difference of chi-square at which the likelihood of both numbers has converged, and that of a model that
 is written. Where one of them says nothing, as the correlation of no disturbance, it may be anything."""
 _FARTHEST = 8.0
