@@ -34,8 +34,6 @@ MISSES = {
         "the errors of the pasted file differ from those promised by 1 %",
     "tests/fleet/test_fleet_plan.py::test_what_the_fleet_knows_adds_to_what_a_run_says":
         "what the fleet knows is not tied to a run that shows nothing of the track: 1.93 for 1.5",
-    "tests/estimation/test_diagnosis_budget.py::test_a_run_without_a_noise_floor_is_diagnosed":
-        "a run without a noise floor names nothing",
     "tests/estimation/test_diagnosis_search.py::"
     "test_a_dead_time_and_a_limited_torque_take_the_place_of_a_lag_and_a_ramp":
         "a lag and a limited acceleration are named for a dead time and a limited torque",

@@ -62,8 +62,7 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
         lambda *given: replace(estimate_floor(*given), t_mrmse_m=0.0, r_mrmse_rad=0.0),
     )
     monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
-    # A search that is cut leaves a structure with a lead.
-    diagnosis = diagnose_runs([recording], vehicle, budget_s=0.0)
+    diagnosis = diagnose_runs([recording], vehicle)
     (run,) = diagnosis.runs
     assert run.noise_floor["t_mrmse_m"] == 0.0
     assert run.effects
