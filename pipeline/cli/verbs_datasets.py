@@ -25,8 +25,8 @@ def compare(  # noqa: D417 - arguments document themselves
     *datasets: Annotated[
         str,
         Parameter(
-            help="datasets to compare with each other (default: all, and those that differ in vehicle and "
-            "terrain without a test); the results folder may stand before them"
+            help="datasets to compare with each other (default: all of each vehicle); the results folder may "
+            "stand before them"
         ),
     ],
     results: Results = Path("results"),
@@ -41,7 +41,7 @@ def compare(  # noqa: D417 - arguments document themselves
         Literal["command", "measured"] | None,
         Parameter(
             name="--input",
-            help="input of the ideal model (default: the command where all runs have one)",
+            help="input of the ideal model (default: both)",
         ),
     ] = None,
     as_published: bool = False,
@@ -50,7 +50,7 @@ def compare(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Compare datasets: medians, intervals, tests, effect sizes.
+    """Compare datasets: which is harder, as driven and at equal driving.
 
     The unit of the tests is the run.
     Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.

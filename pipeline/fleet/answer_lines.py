@@ -62,7 +62,12 @@ def list_lines(answer: Answer) -> list[Line]:
             word = "as published" if published else "as driven"
             lines.append(Line(family, name, word, _describe_driven(driven, labels)))
             extremes = _find_extremes(driven)
-            if equal is None or extremes is None:
+            if published or extremes is None:
+                continue
+            if equal is None:
+                lines.append(
+                    Line(family, name, "at equal driving", "no number, too little driving in common")
+                )
                 continue
             lines.append(Line(family, name, "at equal driving", _describe_equal(equal, labels)))
             if text := _split_difference(driven, equal, extremes, labels):

@@ -47,7 +47,7 @@ _MANY_PAIRS = 200
 """Number of pairs of single runs above which each takes `FEWER_DRAWS`, to limit the time."""
 ABOUT_BLOCKS = "a difference between two runs, not between terrains"
 NOT_SHARED = "no driving in common, no number"
-NO_SPREAD = "no dataset has several runs: how much runs differ is not known"
+NO_SPREAD = "too few runs to know how much runs differ: no test"
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,7 @@ def compare_groups(
 ) -> list[Pair]:
     """Compare pairs of groups.
 
-    Groups that tested pairs connect are one family. Where one of its groups has several runs, `compare_means`
+    Groups that tested pairs connect are one family. Where its groups have several runs, `compare_means`
     tests its pairs with the spread between runs of all of them. Where every group is one run, pairs are
     compared block by block: the result applies to these two runs only, and p is corrected after Holm over the
     pairs that can be significant (Tarone).

@@ -17,6 +17,9 @@ from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, student_quantile
 from pipeline.fleet.confidence import Interval
 from pipeline.fleet.rank_tests import (
+    DRAWS,
+    FEWER_DRAWS,
+    LARGEST_EXACT,
     LEVEL,
     MOST_GROUPS,
     adjust_max_t,
@@ -25,6 +28,10 @@ from pipeline.fleet.rank_tests import (
     permute_means,
     smallest_p,
 )
+
+_FEW_GROUPS = 6
+"""Largest number of groups for which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the
+pairs times the draws."""
 
 
 @dataclass(frozen=True)
@@ -70,10 +77,10 @@ def pool_spread(groups: Sequence[Floats]) -> tuple[float, int]:
         groups: values of each group, each shape (n,).
 
     Returns:
-        NaN and 0 where no group has two values.
+        NaN and 0 where there are too few values for a spread: it takes as many as of one group of three.
     """
     freedom = sum(group.size - 1 for group in groups)
-    if freedom < 1:
+    if freedom < FEWEST_OF_SPREAD - 1:
         return math.nan, 0
     squares = sum(float(np.sum((group - group.mean()) ** 2)) for group in groups)
     return math.sqrt(squares / freedom), freedom
@@ -96,12 +103,12 @@ def compare_means(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) ->
     """Compare the means of groups pair by pair, with a familywise error of 5 %.
 
     One method serves all pairs. Where spreads between runs differ it is Games-Howell; where every pair has
-    enough runs, permutation of whole runs; else Tukey-Kramer. Sources: Kramer, Biometrics 12 (1956); Games
-    and Howell, Journal of Educational Statistics 1 (1976); for permutation see `adjust_max_t`.
+    enough runs, exact permutation of whole runs; else Tukey-Kramer. Sources: Kramer, Biometrics 12 (1956);
+    Games and Howell, Journal of Educational Statistics 1 (1976); for permutation see `adjust_max_t`.
 
     Args:
-        groups: values of each group (usually logarithms of run medians), each shape (n,); one has at least
-            two.
+        groups: values of each group (usually logarithms of run medians), each shape (n,), enough
+            for `pool_spread`.
         pairs: indices of the groups of each pair, the lower first.
 
     Raises:
@@ -113,11 +120,9 @@ def compare_means(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) ->
     if do_spreads_differ(values):
         method = f"Games-Howell{over}, spreads between runs differ"
         differences = _compare_games_howell(values, pairs)
-    elif len(values) <= MOST_GROUPS and all(
-        smallest_p(values[i].size, values[j].size) <= LEVEL for i, j in pairs
-    ):
-        method, differences = _compare_permuted(values, pairs)
-        method += f", max-T{over}" * bool(over)
+    elif len(values) <= MOST_GROUPS and all(_can_permute(values[i].size, values[j].size) for i, j in pairs):
+        method = "exact permutation of whole runs" + f", max-T{over}" * bool(over)
+        differences = _compare_permuted(values, pairs)
     else:
         method = f"Tukey-Kramer{over}, spread between runs pooled"
         errors = [spread * math.sqrt(1.0 / values[i].size + 1.0 / values[j].size) for i, j in pairs]
@@ -175,14 +180,17 @@ def _find_limit(groups: int, freedom: float) -> float:
     return float(studentized_range.isf(LEVEL, groups, freedom)) / math.sqrt(2.0)
 
 
-def _compare_permuted(
-    groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]
-) -> tuple[str, list[Difference]]:
-    matrix = adjust_max_t(groups, pairs)
-    tests = [permute_means(groups[i], groups[j]) for i, j in pairs]
-    kind = "exact" if all(test.exact for test in tests) else "random"
+def _can_permute(first: int, second: int) -> bool:
+    """Whether a permutation of so many runs can be significant, and all of its labellings be counted."""
+    return smallest_p(first, second) <= LEVEL and math.comb(first + second, first) <= LARGEST_EXACT
+
+
+def _compare_permuted(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) -> list[Difference]:
+    draws = DRAWS if len(groups) <= _FEW_GROUPS else FEWER_DRAWS
+    matrix = adjust_max_t(groups, pairs, draws=draws)
     differences = []
-    for (i, j), test in zip(pairs, tests, strict=True):
+    for i, j in pairs:
+        test = permute_means(groups[i], groups[j])
         ends = bound_permuted(groups[i], groups[j], level=LEVEL)
         differences.append(
             Difference(
@@ -193,7 +201,7 @@ def _compare_permuted(
                 test.smallest_p,
             )
         )
-    return f"{kind} permutation of whole runs", differences
+    return differences
 
 
 def bound_levels(groups: Sequence[Floats]) -> list[Interval | None]:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.core import read_version
+from pipeline.core import FEWEST_OF_SPREAD, read_version
 from pipeline.core.arrays import Ints
 from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import (
@@ -268,10 +268,10 @@ class Question:
 
     Attributes:
         by: columns that define a dataset.
-        input: input u; None: the command if every run has one, else the measured wheels.
+        input: input u; None: both, the command first if every run has one.
         as_published: compare the window norms of the published chain instead of the median slip modulus.
-        datasets: compare only these, each with every other; all if empty, and of those that differ in both
-            vehicle and terrain no test.
+        datasets: compare only these, each with every other; if empty all, and those of one vehicle with each
+            other.
         vehicle: compare only runs of this vehicle; of any if empty.
     """
 
@@ -393,7 +393,8 @@ class _Material:
                 counted.append(levelled.cells)
                 if levelled.apart:
                     runs = ", ".join(levelled.apart)
-                    self.notes.append(f"no level at equal driving, too little driving in common: {runs}")
+                    why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
+                    self.notes.append(f"no level at equal driving, too little in common ({why}): {runs}")
                 levels = levelled.runs.select(
                     "run",
                     pl.lit(name).cast(self.runs.schema["input"]).alias("input"),
@@ -630,7 +631,7 @@ def _keys(compared: ComparedRuns) -> dict[str, str]:
 def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str]:
     """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
     if len(groups) < 2:  # noqa: PLR2004 - a pair
-        return [f"there is one dataset only: nothing to compare it with ({of})"]
+        return ["there is one dataset only: nothing to compare it with"] if groups else []
     silent: dict[str, list[str]] = {}
     for pair in pairs:
         if pair.p is None or "cannot be significant" in pair.note:

@@ -72,7 +72,7 @@ def test_where_every_pair_has_enough_runs_whole_runs_are_permuted() -> None:
 
 
 def test_runs_without_any_scatter_have_no_doubt() -> None:
-    equal, other = compare_means([np.ones(2), np.ones(2)], [(0, 1)]), [np.ones(2), 2.0 * np.ones(1)]
+    equal, other = compare_means([np.ones(2), np.ones(2)], [(0, 1)]), [np.ones(3), 2.0 * np.ones(1)]
     assert equal.differences[0].p == 1.0
     assert compare_means(other, [(0, 1)]).differences[0].p == 0.0
 
@@ -90,7 +90,7 @@ def test_intervals_of_levels_pool_the_spread_and_are_scipys_for_one_group() -> N
     assert first is not None
     assert single is not None
     assert math.log(single.high / single.low) == pytest.approx(2.0 * math.log(first.high / first.low))
-    assert bound_levels([np.ones(1), np.ones(1)]) == [None, None]
+    assert bound_levels([np.ones(2), np.ones(1)]) == [None, None], "two runs do not determine a spread"
 
 
 def test_what_no_mean_can_be_made_of_is_refused() -> None:

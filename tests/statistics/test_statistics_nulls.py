@@ -165,7 +165,7 @@ def alarms(groups: list[np.ndarray]) -> MeansTest:
     ("sizes", "spreads", "method"),
     [
         ((3, 2, 2, 1, 1), (0.2,) * 5, "Tukey-Kramer"),
-        ((2, 1), (0.2, 0.2), "Tukey-Kramer"),
+        ((3, 1), (0.2, 0.2), "Tukey-Kramer"),
         ((3, 3, 3), (0.2,) * 3, ""),
         ((9, 7), (0.02, 0.5), "Games-Howell"),
     ],
