@@ -273,7 +273,7 @@ class Comparisons(Table):
     unit_of_analysis = choice(UNITS, "the unit of the test: runs, or blocks of single runs")
     spread = optional("1", "standard deviation of the logarithm between runs, pooled over datasets")
     freedom = count("degrees of freedom of the spread", nullable=True)
-    cells = count("cells of commanded speed and yaw rate that both drove", nullable=True)
+    bins = count("cells of commanded speed and yaw rate that both drove", nullable=True)
     overlap = bounded("1", "share of the samples in them, of the side with less", 0.0, 1.0, nullable=True)
     p_uncorrected = bounded(
         "1",

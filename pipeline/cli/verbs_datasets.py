@@ -193,10 +193,10 @@ def _format_pairs(answer: Answer, name: str) -> list[str]:
     columns = [k for k in range(len(head)) if any(row[k] for row in shown[1:])]
     widths = {k: max(len(row[k]) for row in shown) + 2 for k in columns}
     lines = ["", *("".join(f"{row[k]:<{widths[k]}}" for k in columns).rstrip() for row in shown)]
-    more = len(rows) - _MOST_PAIRS
+    omitted = len(rows) - _MOST_PAIRS
     marked = any("*" in text for row in rows[:_MOST_PAIRS] for text in row)
     lines += ["* significant over all pairs of the vehicle"] if marked else []
-    return [*lines, f"... and {more} more pairs on the page"] if more > 0 else lines
+    return [*lines, f"... and {omitted} more pairs on the page"] if omitted > 0 else lines
 
 
 _OWN = Path("deployments.csv")

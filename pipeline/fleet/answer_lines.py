@@ -100,12 +100,14 @@ class _Part:
     def count(self) -> str:
         """How many pairs are significant."""
         verdicts = [judge_pair(row) for row in self.pairs.values()]
-        tested = [verdict for verdict in verdicts if verdict != UNTESTED]
-        if not tested:
+        decided = [verdict for verdict in verdicts if verdict != UNTESTED]
+        if not decided:
             return "no pair can be tested" if verdicts else "nothing to compare it with"
-        if OF_TWO_RUNS in tested and DIFFERENT not in tested:
-            return f"{tested.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs only"
-        return f"{tested.count(DIFFERENT)} of {len(verdicts)} pairs significant"
+        if OF_TWO_RUNS in decided and DIFFERENT not in decided:
+            return (
+                f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs only"
+            )
+        return f"{decided.count(DIFFERENT)} of {len(verdicts)} pairs significant"
 
 
 def orient_ratio(row: Mapping[str, object], over: str) -> Ratios | None:
@@ -182,7 +184,7 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
         hard, easy = ("b", "a") if (shift if whole is None else whole - 1.0) >= 0.0 else ("a", "b")
         ratios = [orient_ratio(one, row[hard]) if one else None for one in (row, other)]
         parts = [ratio[0] for ratio in ratios if ratio]
-        share, cells = number_in(other, "overlap"), number_in(other, "cells")
+        share, bins = number_in(other, "overlap"), number_in(other, "bins")
         lines.append(
             PairLine(
                 hard=labels[row[hard]],
@@ -192,7 +194,7 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
                 equal=format_ratio(ratios[1]) or "no number" * bool(other),
                 is_equal_sure=bool(other) and judge_pair(other) == DIFFERENT,
                 driving=_format_two(parts[0] / parts[1]) if len(parts) > 1 else "",
-                common="" if share is None or cells is None else _format_overlap(share, int(cells)),
+                common="" if share is None or bins is None else _format_overlap(share, int(bins)),
                 carrier=answer.carriers.get((input_name, frozenset((row["a"], row["b"]))), ""),
                 p_driven=number_in(row, "p_adjusted"),
                 p_equal=number_in(other, "p_adjusted"),
@@ -208,8 +210,8 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
     )
 
 
-def _format_overlap(share: float, cells: int) -> str:
-    return f"{format_share(share)}, {cells} cell{'s' * (cells != 1)}" if cells else "none"
+def _format_overlap(share: float, bins: int) -> str:
+    return f"{format_share(share)}, {bins} cell{'s' * (bins != 1)}" if bins else "none"
 
 
 def _format_two(value: float) -> str:
@@ -252,10 +254,10 @@ def _describe_equal(part: _Part, labels: Mapping[str, str]) -> str:
     if extremes is None:
         return "no driving in common with another dataset, no number"
     easiest, hardest = extremes
-    found = part.divide(easiest, hardest)
-    if found is None:
+    quotient = part.divide(easiest, hardest)
+    if quotient is None:
         return f"{labels[hardest]} and {labels[easiest]} have no driving in common; {part.count()}"
-    ratio, row = found
+    ratio, row = quotient
     sure = ", not significant" if judge_pair(row) == ALIKE else ""
     return f"{labels[hardest]} {format_ratio(ratio)} times {labels[easiest]}{sure}; {part.count()}"
 
@@ -270,13 +272,13 @@ def _split_difference(
     if whole is None:
         return ""
     if ground is None:
-        return f"{b} and {a} have no driving in common: whether it is the driving cannot be told"
+        return f"{b} and {a} have no driving in common, so the two cannot be separated"
     (whole_factor, *_), (ground_factor, *_) = whole[0], ground[0]
     driving = whole_factor / ground_factor
     common = f"{format_share(number_in(ground[1], 'overlap') or 0.0)} of the driving in common"
     start = f"{b} is {_format_two(whole_factor)} times {a} as driven"
     if driving <= _LITTLE:
-        return f"{start}, and the driving is no reason ({common})"
+        return f"{start}, and the driving does not explain it ({common})"
     if ground_factor <= _LITTLE:
         return f"{start}, and all of it is the driving ({common})"
     return (

@@ -1,8 +1,8 @@
-"""Slip at equal driving: cells of what was commanded, and levels of runs over them.
+"""Slip at equal driving: bins of what was commanded, and levels of runs over them.
 
-A gentle run slips less on any ground. Samples are therefore sorted into cells of commanded speed and yaw
-rate, and the logarithm of a cell's median slip modulus is the level of its run plus that of the cell. The
-levels of runs then compare grounds as if all runs had driven all cells.
+A gentle run slips less on any ground. Samples are therefore sorted into bins of commanded speed and yaw
+rate, and the logarithm of a bin's median slip modulus is the level of its run plus that of the bin. The
+levels of runs then compare grounds as if all runs had driven all bins.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ last above; the last class is open."""
 TURN_EDGES = (0.3, 0.8, 1.5, 2.5, 6.0)
 """Edges of the classes of commanded yaw rate [rad/s]; the last class is open."""
 LEAST_SAMPLES = 100
-"""Fewest samples of a run in a cell: 5 s at 20 Hz, several correlation times of slip (1 to 2.5 s)."""
+"""Fewest samples of a run in a bin: 5 s at 20 Hz, several correlation times of slip (1 to 2.5 s)."""
 
 
-def measure_cells(slip: pl.LazyFrame) -> pl.DataFrame:
-    """Median slip modulus of every run in every cell of commanded speed and yaw rate.
+def measure_bins(slip: pl.LazyFrame) -> pl.DataFrame:
+    """Median slip modulus of every run in every bin of commanded speed and yaw rate.
 
     Samples in which the vehicle is commanded to stand say nothing of the ground and are left out, and so are
     runs without commands.
@@ -71,59 +71,59 @@ class Levelled:
     """Runs at equal driving.
 
     Attributes:
-        runs: ``run``, ``level`` [m/s]: the geometric mean slip modulus over all cells, as if the run had
-            driven each; ``cells``: how many it did drive.
-        cells: the cells that count, as from `measure_cells`.
+        runs: ``run``, ``level`` [m/s]: the geometric mean slip modulus over all bins, as if the run had
+            driven each; ``bins``: how many it did drive.
+        bins: the bins that count, as from `measure_bins`.
         apart: runs that share no driving with the others, and have no level.
     """
 
     runs: pl.DataFrame
-    cells: pl.DataFrame
+    bins: pl.DataFrame
     apart: tuple[str, ...]
 
 
-def level_runs(cells: pl.DataFrame) -> Levelled:
-    """Fit levels of runs and of cells to the logarithms of the cells' medians, by least squares.
+def level_runs(bins: pl.DataFrame) -> Levelled:
+    """Fit levels of runs and of bins to the logarithms of the bins' medians, by least squares.
 
-    A cell counts if three runs drove it, and each counts alike, however long. Of runs that no chain of shared
-    cells connects, the largest set has levels.
+    A bin counts if three runs drove it, and each counts alike, however long. Of runs that no chain of shared
+    bins connects, the largest set has levels.
 
     Args:
-        cells: as from `measure_cells`, of one input.
+        bins: as from `measure_bins`, of one input.
     """
-    place = ["speed", "turn"]
-    counted = cells.filter(pl.len().over(place) >= FEWEST_OF_SPREAD)
+    axes = ["speed", "turn"]
+    counted = bins.filter(pl.len().over(axes) >= FEWEST_OF_SPREAD)
     counted = _keep_connected(counted)
-    apart = tuple(sorted(set(cells["run"]) - set(counted["run"])))
+    apart = tuple(sorted(set(bins["run"]) - set(counted["run"])))
     names = sorted(set(counted["run"]))
-    places = counted.select(place).unique().sort(place)
-    keyed = counted.join(places.with_row_index("place"), on=place, maintain_order="left")
-    design = np.zeros((keyed.height, len(names) + places.height))
+    combinations = counted.select(axes).unique().sort(axes)
+    keyed = counted.join(combinations.with_row_index("column"), on=axes, maintain_order="left")
+    design = np.zeros((keyed.height, len(names) + combinations.height))
     rows = np.arange(keyed.height)
     design[rows, [names.index(run) for run in keyed["run"]]] = 1.0
-    design[rows, len(names) + keyed["place"].to_numpy().astype(np.int64)] = 1.0
+    design[rows, len(names) + keyed["column"].to_numpy().astype(np.int64)] = 1.0
     effects = np.linalg.lstsq(design, np.log(keyed["modulus"].to_numpy()), rcond=None)[0]
     usual = effects[len(names) :].mean() if names else 0.0
     runs = pl.DataFrame(
         {"run": names, "level": np.exp(effects[: len(names)] + usual)},
         schema={"run": pl.String, "level": pl.Float64},
-    ).join(counted.group_by("run").agg(pl.len().cast(pl.Int64).alias("cells")), on="run")
+    ).join(counted.group_by("run").agg(pl.len().cast(pl.Int64).alias("bins")), on="run")
     return Levelled(runs.sort("run"), counted, apart)
 
 
-def _keep_connected(cells: pl.DataFrame) -> pl.DataFrame:
-    """Rows of the largest set of runs that shared cells connect."""
-    left, best = cells, cells.clear()
-    while not left.is_empty():
-        part = left.head(1)
+def _keep_connected(bins: pl.DataFrame) -> pl.DataFrame:
+    """Rows of the largest set of runs that shared bins connect."""
+    rest, best = bins, bins.clear()
+    while not rest.is_empty():
+        part = rest.head(1)
         while True:
-            more = left.join(left.join(part, on="run", how="semi"), on=["speed", "turn"], how="semi")
-            if more.height == part.height:
+            grown = rest.join(rest.join(part, on="run", how="semi"), on=["speed", "turn"], how="semi")
+            if grown.height == part.height:
                 break
-            part = more
+            part = grown
         if part["run"].n_unique() > (best["run"].n_unique() if best.height else 0):
             best = part
-        left = left.join(part, on=["run", "speed", "turn"], how="anti")
+        rest = rest.join(part, on=["run", "speed", "turn"], how="anti")
     return best
 
 
@@ -132,24 +132,24 @@ class Overlap:
     """Driving that two groups of runs have in common.
 
     Attributes:
-        cells: number of cells that both drove.
+        bins: number of bins that both drove.
         share: share of the samples in them, of the group that has less of its samples there.
     """
 
-    cells: int
+    bins: int
     share: float
 
 
-def find_overlap(cells: pl.DataFrame, a: Collection[str], b: Collection[str]) -> Overlap:
+def find_overlap(bins: pl.DataFrame, a: Collection[str], b: Collection[str]) -> Overlap:
     """The driving that two groups of runs have in common.
 
     Args:
-        cells: cells of runs, of one input.
+        bins: bins of runs, of one input.
         a: runs of one group.
         b: runs of the other.
     """
     sides = [
-        cells.filter(pl.col("run").is_in(list(runs))).group_by("speed", "turn").agg(pl.col("samples").sum())
+        bins.filter(pl.col("run").is_in(list(runs))).group_by("speed", "turn").agg(pl.col("samples").sum())
         for runs in (a, b)
     ]
     both = sides[0].join(sides[1], on=["speed", "turn"], suffix="_b")

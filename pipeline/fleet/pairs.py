@@ -198,7 +198,7 @@ def _compare_family(
     known = [
         (i, j)
         for i, j in pairs
-        if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].cells
+        if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].bins
     ]
     test = compare_means(units, known) if known and pool_spread(units)[1] else None
     differences = dict(zip(known, test.differences, strict=True)) if test else {}
@@ -410,7 +410,7 @@ def _tabulate_numbers(pair: Pair) -> dict[str, float | None]:
     if pair.ratio:
         numbers |= {"ratio": pair.ratio.value, "ratio_low": pair.ratio.low, "ratio_high": pair.ratio.high}
     if pair.overlap:
-        numbers |= {"cells": pair.overlap.cells, "overlap": pair.overlap.share}
+        numbers |= {"bins": pair.overlap.bins, "overlap": pair.overlap.share}
     return numbers
 
 
@@ -504,7 +504,7 @@ class Answer:
         views: the comparisons, the main one first.
         families: vehicles, and their datasets that are compared with each other.
         runs: one row per run and input with all its measures.
-        cells: the driving of every dataset: as from `measure_cells`, with ``group`` in place of the run.
+        bins: the driving of every dataset: as from `measure_bins`, with ``group`` in place of the run.
         carriers: the cause that carries the difference of a pair as driven, by input and pair.
         windows: box plot statistics of the window norms, as from `spread_windows`.
         notes: excluded runs, pairs that cannot be distinguished.
@@ -514,7 +514,7 @@ class Answer:
     views: tuple[View, ...]
     families: Mapping[str, tuple[str, ...]]
     runs: pl.DataFrame
-    cells: pl.DataFrame
+    bins: pl.DataFrame
     carriers: Mapping[tuple[str, frozenset[str]], str]
     windows: pl.DataFrame
     notes: tuple[str, ...]
@@ -549,12 +549,12 @@ class Answer:
 
     def find_view(self, input_name: str, *, equal: bool) -> View | None:
         """The comparison on an input, at equal driving or as driven; None if there is none."""
-        found = (
+        matching = (
             view
             for view in self.views
             if view.input == input_name and (view.quantity == EQUAL_DRIVING) == equal
         )
-        return next(found, None)
+        return next(matching, None)
 
 
 @dataclass(frozen=True)

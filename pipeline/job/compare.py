@@ -24,7 +24,7 @@ from pipeline.fleet import (
 from pipeline.fleet.answer_lines import list_lines
 from pipeline.fleet.causes import find_carriers
 from pipeline.fleet.confidence import Interval
-from pipeline.fleet.equal_driving import Overlap, find_overlap, level_runs, measure_cells
+from pipeline.fleet.equal_driving import Overlap, find_overlap, level_runs, measure_bins
 from pipeline.fleet.exchange import check_features, follow_published, read_limits
 from pipeline.fleet.pairs import (
     ABOUT_UNIT,
@@ -335,8 +335,8 @@ class _Material:
             within |= self._bound_single(moduli, name)
             norms_within |= self._bound_single(read_norms(self.compared, name), name)
         labels = self.compared.labels.select("run", "group")
-        cells = measure_cells(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
-        driven = self._level_driving(cells, inputs)
+        bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
+        driven = self._level_driving(bins, inputs)
         for name in inputs:
             levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
             groups = _group_levels(levels)
@@ -344,7 +344,7 @@ class _Material:
             tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps)
         datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
         views = [View(*key, _list_levels(datasets, *key), table) for key, table in tables.items()]
-        return self._answer(datasets, views, self.compared.scan("windows"), cells)
+        return self._answer(datasets, views, self.compared.scan("windows"), bins)
 
     def compare_published(self) -> Answer:
         """Compare the window norms of the published chain."""
@@ -382,15 +382,15 @@ class _Material:
         alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
         return {(run, name): bound_run(samples[run]) for run in alone if run in samples}
 
-    def _level_driving(self, cells: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
-        """Give runs their levels at equal driving; the cells that count, by input."""
+    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
+        """Give runs their levels at equal driving; the bins that count, by input."""
         driven: dict[str, pl.DataFrame] = {}
         for name in inputs:
             counted = []
             for datasets in self.families.values():
-                own = cells.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
+                own = bins.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
                 levelled = level_runs(own)
-                counted.append(levelled.cells)
+                counted.append(levelled.bins)
                 if levelled.apart:
                     runs = ", ".join(levelled.apart)
                     why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
@@ -402,13 +402,13 @@ class _Material:
                 )
                 self.runs = self.runs.update(levels, on=["run", "input"])
             driven[name] = pl.concat(counted)
-        if short := sorted(set(self.compared.manifests) - set(cells["run"])):
+        if short := sorted(set(self.compared.manifests) - set(bins["run"])):
             runs = ", ".join(short)
             self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")
         return driven
 
     def _answer(
-        self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, cells: pl.DataFrame
+        self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, bins: pl.DataFrame
     ) -> Answer:
         labels = self.compared.labels.select("run", "group")
         return Answer(
@@ -416,7 +416,7 @@ class _Material:
             views=tuple(views),
             families=self.families,
             runs=self.runs,
-            cells=cells,
+            bins=bins,
             carriers=_find_carriers(self.compared, [view.input for view in views]),
             windows=spread_windows(windows, labels),
             notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
@@ -458,11 +458,11 @@ def _group_levels(levels: pl.DataFrame) -> list[Group]:
 
 
 def _find_overlaps(
-    groups: Sequence[Group], levels: pl.DataFrame, cells: pl.DataFrame
+    groups: Sequence[Group], levels: pl.DataFrame, bins: pl.DataFrame
 ) -> dict[frozenset[str], Overlap]:
     runs = {group.name: levels.filter(pl.col("group") == group.name)["run"].to_list() for group in groups}
     return {
-        frozenset((a, b)): find_overlap(cells, runs[a], runs[b]) for a, b in itertools.combinations(runs, 2)
+        frozenset((a, b)): find_overlap(bins, runs[a], runs[b]) for a, b in itertools.combinations(runs, 2)
     }
 
 
@@ -606,8 +606,8 @@ def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[st
     rows: list[tuple[str, float, float | None, float | None, str]] = []
     for datasets in families.values():
         own = [group for group in groups if group.name in datasets]
-        for group, found in zip(own, bound_levels([group.values for group in own]), strict=True):
-            interval, about = (found, OVER_RUNS)
+        for group, over_runs in zip(own, bound_levels([group.values for group in own]), strict=True):
+            interval, about = over_runs, OVER_RUNS
             if interval is None and len(group.runs) == 1:
                 interval, about = bound_run(group.runs[0]), THIS_RUN
             ends = (None, None) if interval is None else (interval.low, interval.high)

@@ -144,18 +144,18 @@ def draw_levels(runs: pl.DataFrame, levels: pl.DataFrame, *, name: str, title: s
     return Drawing(chart, {f"{name}_spans": spans, f"{name}_runs": points}, note, f"In m/s: {sentence}.")
 
 
-def draw_driving(cells: pl.DataFrame, input_name: str, datasets: Sequence[str]) -> Drawing:
+def draw_driving(bins: pl.DataFrame, input_name: str, datasets: Sequence[str]) -> Drawing:
     """How hard each dataset was in each cell of commanded speed and yaw rate: a column is equal driving.
 
     Args:
-        cells: as in `Answer`.
+        bins: as in `Answer`.
         input_name: input u.
         datasets: in this order.
     """
-    place = ["speed", "turn"]
+    axes = ["speed", "turn"]
     own = (
-        cells.filter(pl.col("input") == input_name)
-        .group_by("group", *place)
+        bins.filter(pl.col("input") == input_name)
+        .group_by("group", *axes)
         .agg(
             (pl.col("modulus").log() * pl.col("samples")).sum().truediv(pl.col("samples").sum()).exp(),
             pl.col("samples").sum(),
@@ -164,7 +164,7 @@ def draw_driving(cells: pl.DataFrame, input_name: str, datasets: Sequence[str]) 
             _name_classes("speed", SPEED_EDGES).alias("speed_class"),
             _name_classes("turn", TURN_EDGES).alias("turn_class"),
         )
-        .sort("group", *place)
+        .sort("group", *axes)
     )
     order = [
         name for (name,) in own.sort("speed").select("speed_class").unique(maintain_order=True).iter_rows()
@@ -339,10 +339,10 @@ def list_pictures(answer: Answer) -> list[Picture]:
         name = f"{view.quantity}_{view.input}"
         drawing = draw_levels(own, view.levels, name=name, title=title)
         pictures.append(Picture(name, f"{_TITLES[view.quantity]}, {words}", drawing, width="half"))
-    if not answer.cells.is_empty():
+    if not answer.bins.is_empty():
         datasets = [name for family in answer.families.values() for name in family]
         title = f"Equal driving: the same place in every panel, {INPUT_WORDS[answer.input]}"
-        pictures.append(Picture("driving", title, draw_driving(answer.cells, answer.input, datasets)))
+        pictures.append(Picture("driving", title, draw_driving(answer.bins, answer.input, datasets)))
     boxes = answer.windows.filter(pl.col("input") == answer.input)
     if not boxes.is_empty():
         published = answer.quantity == AS_PUBLISHED

@@ -192,8 +192,8 @@ def test_runs_alone_are_compared_by_their_blocks_and_only_with_each_other() -> N
 def test_without_driving_in_common_there_is_no_number() -> None:
     groups = [make_group(name, 1.0, 1.1) for name in ("a", "b", "c")]
     overlaps = {
-        frozenset(names): Overlap(cells, share)
-        for names, cells, share in (("ab", 3, 0.5), ("bc", 0, 0.0), ("ac", 1, 0.1))
+        frozenset(names): Overlap(bins, share)
+        for names, bins, share in (("ab", 3, 0.5), ("bc", 0, 0.0), ("ac", 1, 0.1))
     }
     pairs = {one.a.name + one.b.name: one for one in compare_groups(groups, overlaps=overlaps)}
     assert pairs["bc"].ratio is None

@@ -10,7 +10,7 @@ import pytest
 from comparison_store import Run, write_run
 
 from pipeline.fleet.answer_lines import list_lines, list_pairs
-from pipeline.fleet.equal_driving import find_overlap, level_runs, measure_cells
+from pipeline.fleet.equal_driving import find_overlap, level_runs, measure_bins
 from pipeline.fleet.pooled_tests import compare_means
 from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
@@ -49,8 +49,8 @@ HARD = [(0.7, 0.5), (1.2, 0.5), (1.2, 1.0), (2.5, 1.0), (2.5, 2.0)]
 
 
 def level(*runs: pl.DataFrame, name: str = "command") -> dict[str, float]:
-    cells = measure_cells(pl.concat(runs).lazy()).filter(input=name)
-    return dict(level_runs(cells).runs.select("run", "level").iter_rows())
+    bins = measure_bins(pl.concat(runs).lazy()).filter(input=name)
+    return dict(level_runs(bins).runs.select("run", "level").iter_rows())
 
 
 @pytest.mark.parametrize("name", FACTORS)
@@ -70,29 +70,29 @@ def test_standing_suspect_and_short_stretches_do_not_count() -> None:
     run = make_slip("a", [(0.0, 0.0), (0.7, 0.5), (2.5, 2.0)], 1.0)
     late = pl.col("t") >= 24.0
     run = run.with_columns(suspect=late)
-    cells = measure_cells(run.lazy())
-    assert cells.filter(input="command").select("speed", "turn", "samples").rows() == [(1, 1, 200)]
-    assert measure_cells(run.filter(input="measured").lazy()).is_empty(), "cells are those of the command"
+    bins = measure_bins(run.lazy())
+    assert bins.filter(input="command").select("speed", "turn", "samples").rows() == [(1, 1, 200)]
+    assert measure_bins(run.filter(input="measured").lazy()).is_empty(), "bins are those of the command"
 
 
 def test_cells_of_fewer_than_three_runs_and_runs_apart_have_no_level() -> None:
     runs = [make_slip(f"r{i}", GENTLE, 1.0) for i in range(3)]
     runs += [make_slip(f"apart{i}", [(5.0, 0.0)], 1.0) for i in range(2)]
-    levelled = level_runs(measure_cells(pl.concat(runs).lazy()).filter(input="command"))
+    levelled = level_runs(measure_bins(pl.concat(runs).lazy()).filter(input="command"))
     assert set(levelled.runs["run"]) == {"r0", "r1", "r2"}
     assert levelled.apart == ("apart0", "apart1")
     far = [make_slip(f"far{i}", [(5.0, 0.0), (8.0, 0.0)], 1.0) for i in range(4)]
-    levelled = level_runs(measure_cells(pl.concat([*runs, *far]).lazy()).filter(input="command"))
+    levelled = level_runs(measure_bins(pl.concat([*runs, *far]).lazy()).filter(input="command"))
     assert set(levelled.runs["run"]) == {"apart0", "apart1", "far0", "far1", "far2", "far3"}
     assert levelled.apart == ("r0", "r1", "r2"), "of sets without driving in common the larger one is kept"
 
 
 def test_the_overlap_is_that_of_the_side_with_less() -> None:
-    cells = measure_cells(pl.concat([make_slip("a", GENTLE, 1.0), make_slip("b", HARD, 1.0)]).lazy())
-    overlap = find_overlap(cells.filter(input="command"), ["a"], ["b"])
-    assert overlap.cells == 2
+    bins = measure_bins(pl.concat([make_slip("a", GENTLE, 1.0), make_slip("b", HARD, 1.0)]).lazy())
+    overlap = find_overlap(bins.filter(input="command"), ["a"], ["b"])
+    assert overlap.bins == 2
     assert overlap.share == pytest.approx(2 / 5)
-    assert find_overlap(cells, ["a"], []).cells == 0
+    assert find_overlap(bins, ["a"], []).bins == 0
 
 
 def test_random_halves_of_one_ground_alarm_once_in_twenty() -> None:
