@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,8 @@ from comparison_store import Run, write_run
 from pipeline.fleet.answer_lines import list_lines, list_pairs
 from pipeline.fleet.equal_driving import find_overlap, level_runs, measure_bins
 from pipeline.fleet.pooled_tests import compare_means
+from pipeline.job import Options
+from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
 
@@ -166,3 +169,25 @@ def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
         ice, gravel = (rows[f"warthog_{terrain}", name] for terrain in ("ice", "gravel"))
         assert ice["equal_modulus"] / gravel["equal_modulus"] == pytest.approx(3.0, rel=0.25)
         assert ice["equal_low"] < ice["equal_modulus"] < ice["equal_high"]
+
+
+def test_runs_of_one_ground_agree_better_at_equal_driving_on_recordings(
+    shared_logs: Path, recorded_results: Path, tmp_path: Path
+) -> None:
+    store = Store(tmp_path)
+    for log in sorted(shared_logs.glob("warthog_*.mcap")):
+        run = analyze_log(log, Options(out=recorded_results, report=False)).manifest.folder.parent
+        shutil.copytree(run, store.root / run.relative_to(recorded_results), symlinks=True)
+    answer = compare_results(store, Question(vehicle="warthog"))
+    for name, ratio in (("command", 0.4), ("measured", 0.6)):
+        driven, equal = (answer.find_view(name, equal=one) for one in (False, True))
+        assert driven is not None
+        assert equal is not None
+        assert equal.comparisons["spread"][0] < ratio * driven.comparisons["spread"][0]
+        assert equal.levels.sort("value")["dataset"][-1] == "warthog_ice"
+    order = equal.levels.sort("value", descending=True)["dataset"].to_list()
+    assert order == [f"warthog_{ground}" for ground in ("ice", "sand", "gravel", "asphalt", "grass")]
+    grass = {frozenset((row["a"], row["b"])): row for row in driven.comparisons.iter_rows(named=True)}
+    pair = frozenset(("warthog_grass", "warthog_ice"))
+    assert grass[pair]["p_adjusted"] <= 0.05, "driven gently, grass looks easier"
+    assert equal.comparisons["p_adjusted"].min() > 0.05  # type: ignore[operator]
