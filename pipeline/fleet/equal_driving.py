@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD
-from pipeline.run.signals import MOVING_MPS
+from pipeline.run.signals import STILL_MPS
 
 SPEED_EDGES = (0.5, 1.0, 1.5, 2.0, 3.0, 6.0, 12.0, 24.0)
 """Edges of the classes of commanded speed [m/s]: half a metre per second where field robots drive, twice the
@@ -42,7 +42,7 @@ def measure_bins(slip: pl.LazyFrame) -> pl.DataFrame:
     ).with_columns(pl.col("input").cast(pl.String))
     speed, turn = (pl.col("f_x") ** 2 + pl.col("f_y") ** 2).sqrt(), pl.col("f_w").abs()
     commands = (
-        slip.filter(pl.col("input") == "command", (speed > MOVING_MPS) | (turn > MOVING_MPS))
+        slip.filter(pl.col("input") == "command", (speed > STILL_MPS) | (turn > STILL_MPS))
         .select(
             "run",
             "t",

@@ -1,5 +1,6 @@
 """Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
 
+import contextlib
 import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -46,7 +47,7 @@ from pipeline.fleet.pairs import (
 )
 from pipeline.fleet.pooled_tests import bound_levels
 from pipeline.fleet.rank_tests import connect_groups
-from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
+from pipeline.job import ANALYZE_FIRST, FigureFormat, JobError, lack_runs
 from pipeline.job.compared_runs import (
     ComparedRuns,
     can_read,
@@ -497,8 +498,10 @@ def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[
 def find_level_names(store: Store) -> dict[str, str]:
     """Names of effects that the fleet model labels by their level, or by all candidate levels."""
     names_by_effect: dict[str, set[str]] = {}
-    for number in fit_results(store)[0].numbers:
-        names_by_effect.setdefault(number.effect, set()).add(number.name)
+    # Without estimates effects have no levels.
+    with contextlib.suppress(JobError):
+        for number in fit_results(store)[0].numbers:
+            names_by_effect.setdefault(number.effect, set()).add(number.name)
     called = {
         effect: name
         for effect, names in names_by_effect.items()

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 import pytest
-from comparison_store import Run, write_run
+from comparison_store import Run, make_budget, write_run
 
 from pipeline.fleet.answer_lines import list_lines, list_pairs
 from pipeline.fleet.equal_driving import find_overlap, level_runs, measure_bins
@@ -161,6 +161,21 @@ def test_both_questions_are_answered_on_both_inputs_within_a_vehicle(answer: Ans
         frozenset(f"warthog_{name}" for name in names)
         for names in (("asphalt", "gravel"), ("asphalt", "ice"), ("gravel", "ice"))
     }, "no pair of two vehicles"
+
+
+def test_the_effect_that_carries_a_difference_is_named_with_and_without_estimates(tmp_path: Path) -> None:
+    store = Store(tmp_path / "results")
+    for i in range(2):
+        for terrain, skid in (("gravel", 0.1), ("ice", 2.1)):
+            budget = make_budget({"effective_track": 0.3, "lateral_skid": skid, "disturbance": 0.1})
+            dataset = f"warthog_{terrain}"
+            write_run(
+                store, Run(name=f"{terrain}_{i}", dataset=dataset, terrain=terrain, budget=budget), seed=i
+            )
+    (pair,) = list_pairs(compare_results(store, Question()), "measured")
+    # sqrt(2.5) - sqrt(0.5) = 0.87 m/s, and skid is all of it.
+    assert pair.carrier == "lateral skid +0.87 m/s"
+    assert list_pairs(compare_results(store, Question()), "command")[0].carrier == ""
 
 
 def test_the_levels_stand_in_the_table_of_datasets(answer: Answer) -> None:
