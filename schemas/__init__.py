@@ -201,7 +201,7 @@ class Datasets(Table):
     `slip compare` alone works out are null until it has run.
     """
 
-    VERSION: ClassVar[int] = 3
+    VERSION: ClassVar[int] = 4
 
     by = text("columns that define a dataset, for example `dataset` or `vehicle,terrain`")
     input = source()
@@ -215,6 +215,9 @@ class Datasets(Table):
     low = optional("m/s", "lower end of the 95 % interval of the typical median slip modulus")
     high = optional("m/s", "upper end of it")
     interval = text("what the interval says: over runs, or within this run only; empty without one")
+    equal_modulus = optional("m/s", "slip modulus at equal driving: geometric mean over runs and cells")
+    equal_low = optional("m/s", "lower end of its 95 % interval over runs")
+    equal_high = optional("m/s", "upper end of it")
     median_window_norm = optional("m/s", "median over runs of the runs' median window norm")
     norm_low = optional("m/s", "lower end of the 95 % interval of the typical window norm")
     norm_high = optional("m/s", "upper end of it")
@@ -239,29 +242,45 @@ UNITS = ("runs", "blocks")
 
 
 class Comparisons(Table):
-    """One row a pair; ``run``, ``vehicle`` and ``terrain`` are `*`, ``dataset`` names both sides."""
+    """One row a pair, input and quantity; ``run``, ``vehicle`` and ``terrain`` are `*`.
 
-    VERSION: ClassVar[int] = 1
+    ``dataset`` names both sides. Numbers that a pair does not have are null, and its note says why.
+    """
+
+    VERSION: ClassVar[int] = 2
 
     by = text("columns that define a dataset")
     input = source()
-    quantity = text("what is compared: median_modulus, or published_norm with --as-published")
+    quantity = text(
+        "what is compared: median_modulus as driven, equal_modulus at equal driving, or published_norm"
+    )
     a = text("one dataset")
     b = text("the other")
     runs_a = count("runs of a", 1)
     runs_b = count("runs of b", 1)
-    shift = number("m/s", "Hodges-Lehmann shift b - a of the units")
+    ratio = optional("1", "geometric mean of the runs of b over that of a")
+    ratio_low = optional("1", "lower end of its 95 % interval")
+    ratio_high = optional("1", "upper end of it")
+    shift = optional("m/s", "Hodges-Lehmann shift b - a of the units")
     low = optional("m/s", "lower end of its 95 % interval")
     high = optional("m/s", "upper end of it")
-    cliffs_delta = bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0)
+    cliffs_delta = bounded("1", "Cliff's delta of the units; above 0: b is larger", -1.0, 1.0, nullable=True)
     size = text("Cliff's delta in a word")
-    p = bounded("1", "two-sided permutation p of this pair", 0.0, 1.0)
-    p_adjusted = bounded("1", "the same corrected over the family of pairs", 0.0, 1.0)
-    smallest_p = bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0)
+    p = bounded("1", "two-sided p of this pair alone", 0.0, 1.0, nullable=True)
+    p_adjusted = bounded("1", "p over the family of pairs", 0.0, 1.0, nullable=True)
+    smallest_p = bounded("1", "smallest corrected p that the counts allow", 0.0, 1.0, nullable=True)
     method = text("test and correction")
-    unit_of_analysis = choice(UNITS, "what is permuted: runs, or blocks of single runs")
+    unit_of_analysis = choice(UNITS, "the unit of the test: runs, or blocks of single runs")
+    spread = optional("1", "standard deviation of the logarithm between runs, pooled over datasets")
+    freedom = count("degrees of freedom of the spread", nullable=True)
+    bins = count("cells of commanded speed and yaw rate that both drove", nullable=True)
+    overlap = bounded("1", "share of the samples in them, of the side with less", 0.0, 1.0, nullable=True)
     p_uncorrected = bounded(
-        "1", "plain Mann-Whitney of all samples: not valid, they are correlated", 0.0, 1.0
+        "1",
+        "plain Mann-Whitney of all samples: not valid, they are correlated",
+        0.0,
+        1.0,
+        nullable=True,
     )
     note = text("remarks on the row; may be empty")
     keys = text("run/generation of every run counted, separated by spaces")

@@ -25,8 +25,8 @@ def compare(  # noqa: D417 - arguments document themselves
     *datasets: Annotated[
         str,
         Parameter(
-            help="datasets to compare with each other (default: all, and those that differ in vehicle and "
-            "terrain without a test); the results folder may stand before them"
+            help="datasets to compare with each other (default: all of each vehicle); the results folder may "
+            "stand before them"
         ),
     ],
     results: Results = Path("results"),
@@ -41,7 +41,7 @@ def compare(  # noqa: D417 - arguments document themselves
         Literal["command", "measured"] | None,
         Parameter(
             name="--input",
-            help="input of the ideal model (default: the command where all runs have one)",
+            help="input of the ideal model (default: both)",
         ),
     ] = None,
     as_published: bool = False,
@@ -50,7 +50,7 @@ def compare(  # noqa: D417 - arguments document themselves
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Compare datasets: medians, intervals, tests, effect sizes.
+    """Compare datasets: which is harder, as driven and at equal driving.
 
     The unit of the tests is the run.
     Writes datasets.parquet, comparisons.parquet, both as CSV and LaTeX, and comparison.html.
@@ -108,24 +108,25 @@ def _compare_causes(
     return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
+_MOST_PAIRS = 10
+"""Pairs on the screen, as many as five datasets have; the page has all."""
+
+
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.fleet import MEASURES  # noqa: PLC0415 - heavy
+    from pipeline.fleet.answer_lines import list_lines, title_line  # noqa: PLC0415 - heavy
     from pipeline.fleet.pairs import compare_orders  # noqa: PLC0415 - heavy
     from pipeline.job.compare import list_shown_notes  # noqa: PLC0415 - heavy
 
-    datasets = answer.datasets.filter(answer.datasets["input"] == answer.input).select(
-        "dataset", "runs", "median_window_norm"
-    )
-    rated = answer.intervals.join(datasets, on="dataset").sort("value")
-    width = max([len(name) for name in rated["dataset"]] + [7]) + 1
-    lines = [
-        f"slip {INPUT_WORDS[answer.input]}, {answer.measure} [m/s]",
-        "",
-        f"{'dataset':<{width}}{'runs':>5}{'median':>9}   {'95 % interval':<16}{'window norm':>12}",
-    ]
-    lines += [_format_dataset(row, width) for row in rated.iter_rows(named=True)]
-    pairs = _format_pairs(list(answer.comparisons.sort("p_adjusted", "p").iter_rows(named=True)))
-    lines += ["", *pairs] if pairs else []
+    lines: list[str] = []
+    title = ""
+    for line in list_lines(answer):
+        if title_line(line) != title:
+            title = title_line(line)
+            lines += [""] * bool(lines) + [f"slip of {title}"]
+        lines.append(f"  {line.driving:<18}{line.text}")
+    for name in answer.inputs:
+        lines += ["", *_format_datasets(answer, name), *_format_pairs(answer, name)]
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
@@ -133,40 +134,69 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     return [*lines, "", *notes, f"page    {written['comparison.html']}"]
 
 
-def _format_dataset(row: Mapping[str, object], width: int) -> str:
-    low, high = row["low"], row["high"]
-    ends = f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
-    only = " (this run)" if row["interval"] == "this run only" and ends != "-" else ""
-    return (
-        f"{row['dataset']:<{width}}{row['runs']:>5}{format_value(row['value']):>9}   "
-        f"{ends:<16}{format_value(row['median_window_norm']):>12}{only}"
-    )
-
-
-def _format_pairs(rows: Sequence[Mapping[str, object]]) -> list[str]:
-    from pipeline.fleet.pairs import (  # noqa: PLC0415 - heavy
-        ABOUT_BLOCKS,
-        BLOCKS,
-        DIFFERENT,
-        OF_TWO_RUNS,
-        RUNS,
-        count_pairs,
-        judge_pair,
-    )
-
-    verdicts = [judge_pair(row) for row in rows]
-    lines = [
-        f"{row['b']} slips {format_value(abs(cast('float', row['shift'])))} m/s "
-        f"{'more' if cast('float', row['shift']) > 0.0 else 'less'} than {row['a']}: "
-        f"Cliff's delta {format_value(row['cliffs_delta'])} ({row['size']}), "
-        f"p = {format_value(row['p_adjusted'])} corrected" + f", {ABOUT_BLOCKS}" * (verdict == OF_TWO_RUNS)
-        for row, verdict in zip(rows, verdicts, strict=True)
-        if verdict in (DIFFERENT, OF_TWO_RUNS)
+def _format_datasets(answer: Answer, name: str) -> list[str]:
+    """Medians of the datasets on an input, as driven and at equal driving."""
+    driven, equal = (answer.find_view(name, equal=one) for one in (False, True))
+    if driven is None:
+        return []
+    counts = answer.datasets.filter(answer.datasets["input"] == name).select("dataset", "runs")
+    shown = driven.levels.join(counts, on="dataset").sort("value", "dataset")
+    levels = {row["dataset"]: row for row in equal.levels.iter_rows(named=True)} if equal else {}
+    table = [("dataset", "runs", "as driven", "95 % interval", "equal driving", "95 % interval")]
+    table += [
+        (
+            row["dataset"],
+            str(row["runs"]),
+            format_value(row["value"]),
+            _format_ends(row) + " (this run)" * (row["interval"] == "this run only"),
+            format_value(levels.get(row["dataset"], {}).get("value")),
+            _format_ends(levels.get(row["dataset"], {})),
+        )
+        for row in shown.iter_rows(named=True)
     ]
-    units = [unit for unit in (RUNS, BLOCKS) if any(row["unit_of_analysis"] == unit for row in rows)]
-    over = f"differences are medians over all pairs of {' or '.join(units)}"
-    head = f"{over}, not differences of the medians above"
-    return [*([head] if lines else []), *lines, *([count_pairs(rows)] if len(lines) < len(rows) else [])]
+    columns = range(len(table[0]) if levels else 4)
+    widths = [max(len(row[k]) for row in table) for k in columns]
+    lines = [f"{answer.measure} [m/s], {INPUT_WORDS[name]}"]
+    for row in table:
+        aligned = (f"{row[k]:>{widths[k]}}" if k in _NUMBERS else f"{row[k]:<{widths[k]}}" for k in columns)
+        lines.append("   ".join(aligned).rstrip())
+    return lines
+
+
+_NUMBERS = (1, 2, 4)
+"""Columns of the datasets' table that are aligned at their right ends."""
+
+
+def _format_ends(row: Mapping[str, object]) -> str:
+    low, high = row.get("low"), row.get("high")
+    return f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
+
+
+def _format_pairs(answer: Answer, name: str) -> list[str]:
+    """One line a pair, the surest first."""
+    from pipeline.fleet.answer_lines import list_pairs  # noqa: PLC0415 - heavy
+
+    rows = [
+        (
+            f"{pair.hard} / {pair.easy}",
+            f"{pair.driven}{'*' * pair.is_driven_sure}",
+            f"{pair.equal}{'*' * pair.is_equal_sure}",
+            pair.common,
+            pair.carrier,
+        )
+        for pair in list_pairs(answer, name)
+    ]
+    if not rows:
+        return []
+    head = ("times as much slip", "as driven", "equal driving", "in common", "carried by, as driven")
+    shown = [head, *rows[:_MOST_PAIRS]]
+    columns = [k for k in range(len(head)) if any(row[k] for row in shown[1:])]
+    widths = {k: max(len(row[k]) for row in shown) + 2 for k in columns}
+    lines = ["", *("".join(f"{row[k]:<{widths[k]}}" for k in columns).rstrip() for row in shown)]
+    omitted = len(rows) - _MOST_PAIRS
+    marked = any("*" in text for row in rows[:_MOST_PAIRS] for text in row)
+    lines += ["* significant over all pairs of the vehicle"] if marked else []
+    return [*lines, f"... and {omitted} more pairs on the page"] if omitted > 0 else lines
 
 
 _OWN = Path("deployments.csv")

@@ -126,6 +126,7 @@ _MEASURES = {
     "relative_unpredictability": pl.Float64,
     "transitory_slip": pl.Float64,
     "published_norm": pl.Float64,
+    "equal_modulus": pl.Float64,
 }
 
 
@@ -155,7 +156,10 @@ def label_runs(runs: pl.DataFrame, by: Sequence[str]) -> pl.DataFrame:
 
 
 def find_unrelated(labels: pl.DataFrame) -> frozenset[frozenset[str]]:
-    """Pairs of groups with neither a vehicle nor a terrain in common: a difference may be due to either.
+    """Pairs of groups of different vehicles, whose difference may be due to the vehicle.
+
+    Where no pair has a vehicle in common, as where groups are vehicles, those of a common terrain are not
+    unrelated.
 
     Args:
         labels: one row per run: ``group``, ``vehicle``, ``terrain``.
@@ -164,11 +168,17 @@ def find_unrelated(labels: pl.DataFrame) -> frozenset[frozenset[str]]:
         (str(name), {column: set(rows[column]) - {UNKNOWN} for column in ("vehicle", "terrain")})
         for (name,), rows in labels.partition_by("group", as_dict=True).items()
     ]
-    return frozenset(
-        frozenset((one, other))
-        for (one, own), (other, theirs) in itertools.combinations(groups, 2)
-        if all(own[column].isdisjoint(theirs[column]) for column in own)
-    )
+    pairs = list(itertools.combinations(groups, 2))
+    unrelated: frozenset[frozenset[str]] = frozenset()
+    for column in ("vehicle", "terrain"):
+        unrelated = frozenset(
+            frozenset((one, other))
+            for (one, own), (other, theirs) in pairs
+            if own[column].isdisjoint(theirs[column])
+        )
+        if len(unrelated) < len(pairs):
+            break
+    return unrelated
 
 
 def gather_runs(aggregates: pl.DataFrame, labels: pl.DataFrame) -> pl.DataFrame:
@@ -366,45 +376,54 @@ def pool_runs(
         pl.col("place").sort().str.join(" ").alias("keys"),
         pl.col("median_modulus").drop_nulls().alias("moduli"),
         pl.col("median_window_norm").drop_nulls().alias("norms"),
+        pl.col("equal_modulus").drop_nulls().alias("levels"),
+        pl.col("equal_modulus").log().mean().exp(),
         pl.col("run").first().alias("only"),
     )
-    rows = [
-        {
-            **row,
-            **_name_ends(row, "moduli", within, ("low", "high", "interval")),
-            **_name_ends(row, "norms", norms_within, ("norm_low", "norm_high", "norm_interval")),
-        }
-        for row in grouped.iter_rows(named=True)
-    ]
-    ends = dict.fromkeys(("low", "high", "norm_low", "norm_high"), pl.Float64())
-    schema = pl.Schema({**grouped.schema, **ends, "interval": pl.String(), "norm_interval": pl.String()})
+    ends = {
+        **_bound_groups(grouped, "moduli", within, ("low", "high", "interval")),
+        **_bound_groups(grouped, "norms", norms_within, ("norm_low", "norm_high", "norm_interval")),
+        **_bound_groups(grouped, "levels", {}, ("equal_low", "equal_high", "equal_interval")),
+    }
     return (
-        pl.DataFrame(rows, schema=schema)
+        grouped.with_columns(**ends)
         .rename({"group": "dataset"})
-        .drop("moduli", "norms", "only", "norm_interval")
+        .drop("moduli", "norms", "levels", "only", "norm_interval", "equal_interval")
         .sort("dataset", "input")
     )
 
 
-def _name_ends(
-    row: Mapping[str, object],
+def _bound_groups(
+    grouped: pl.DataFrame,
     column: str,
     within: Mapping[tuple[str, str], Interval],
     names: tuple[str, str, str],
-) -> dict[str, float | str | None]:
-    """Bounds of a dataset's interval, and whether it is over runs or for this run."""
-    medians = row[column]
-    low, high, about = names
-    if isinstance(medians, list) and len(medians) >= FEWEST_OF_SPREAD:
-        from pipeline.fleet.confidence import bound_typical  # noqa: PLC0415 - heavy
+) -> dict[str, pl.Series]:
+    """Bounds of the groups' intervals, and whether they are over runs or for this run.
 
-        interval, about_which = bound_typical(medians), OVER_RUNS
-    else:
-        one = within.get((str(row["only"]), str(row["input"])))
-        if one is None:
-            return {low: None, high: None, about: ""}
-        interval, about_which = one, THIS_RUN
-    return {low: interval.low, high: interval.high, about: about_which}
+    The spread between runs is pooled over the groups of a vehicle.
+    """
+    from pipeline.fleet.pooled_tests import bound_levels  # noqa: PLC0415 - heavy
+
+    low, high, about = names
+    bounds: list[tuple[float | None, float | None, str]] = [(None, None, "")] * grouped.height
+    families: dict[tuple[str, str], list[int]] = {}
+    rows = grouped.select("vehicle", pl.col("input").cast(pl.String), "only", column).rows(named=True)
+    for index, row in enumerate(rows):
+        if row[column]:
+            families.setdefault((row["vehicle"], row["input"]), []).append(index)
+    for indices in families.values():
+        over_runs = bound_levels([np.array(rows[index][column]) for index in indices])
+        for index, interval in zip(indices, over_runs, strict=True):
+            one = within.get((rows[index]["only"], rows[index]["input"]))
+            if interval is not None:
+                bounds[index] = (interval.low, interval.high, OVER_RUNS)
+            elif one is not None:
+                bounds[index] = (one.low, one.high, THIS_RUN)
+    return {
+        name: pl.Series([one[k] for one in bounds], dtype=kind)
+        for k, (name, kind) in enumerate(((low, pl.Float64), (high, pl.Float64), (about, pl.String)))
+    }
 
 
 def spread_windows(windows: pl.LazyFrame, groups: pl.DataFrame) -> pl.DataFrame:

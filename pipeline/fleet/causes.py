@@ -131,11 +131,43 @@ def compare_causes(
     groups = [_Group.gather(str(one["group"][0]), one) for one in own]
     budgets = tuple(group.describe() for group in groups)
     pairs = [
-        _compare(*sorted(pair, key=lambda group: float(group.table.sum(axis=1).mean())))
+        _compare(*sorted(pair, key=lambda group: group.mean_square))
         for pair in combinations(groups, 2)
         if frozenset(group.name for group in pair) not in untested
     ]
     return budgets, tuple(pairs)
+
+
+@dataclass(frozen=True)
+class Carrier:
+    """The cause with the largest part in a difference of two deployments.
+
+    Attributes:
+        name: the cause.
+        difference: its part of the difference of RMS slip [m/s], of the deployment with more over the other.
+    """
+
+    name: str
+    difference: float
+
+
+def find_carriers(rows: pl.DataFrame) -> dict[frozenset[str], Carrier]:
+    """The cause that carries the difference of every two deployments, without a test.
+
+    Args:
+        rows: as for `compare_causes`.
+    """
+    parts = rows.sort("group", "run").partition_by("group", maintain_order=True)
+    groups = [_Group.gather(str(one["group"][0]), one) for one in parts]
+    carriers = {}
+    for pair in combinations(groups, 2):
+        a, b = sorted(pair, key=lambda group: group.mean_square)
+        scale = 1.0 / max(math.sqrt(a.mean_square) + math.sqrt(b.mean_square), 1e-300)
+        causes = list(dict.fromkeys((*a.causes, *b.causes)))
+        differences = {cause: float(b.take(cause)[0].mean() - a.take(cause)[0].mean()) for cause in causes}
+        largest = max(causes, key=lambda cause: differences[cause])
+        carriers[frozenset((a.name, b.name))] = Carrier(largest[0], scale * differences[largest])
+    return carriers
 
 
 @dataclass(frozen=True)
@@ -161,6 +193,11 @@ class _Group:
                 half[cell] = 0.5 * (row["high"] - row["low"]) * totals[row["run"]]
         return cls(name, causes, table, half)
 
+    @property
+    def mean_square(self) -> float:
+        """Mean over the runs of their mean square slip [m^2/s^2]."""
+        return float(self.table.sum(axis=1).mean())
+
     def take(self, cause: tuple[str, str]) -> tuple[Floats, Floats]:
         """Mean squares of a cause in every run, and their half-widths; zeros where the cause is absent."""
         if cause not in self.causes:
@@ -185,7 +222,7 @@ class _Group:
 
 
 def _compare(a: _Group, b: _Group) -> Difference:
-    roots = [math.sqrt(float(group.table.sum(axis=1).mean())) for group in (a, b)]
+    roots = [math.sqrt(group.mean_square) for group in (a, b)]
     scale = 1.0 / max(sum(roots), 1e-300)
     single = a.table.shape[0] == b.table.shape[0] == 1
     causes = list(dict.fromkeys((*a.causes, *b.causes)))

@@ -115,42 +115,6 @@ class Interval:
     level: float
 
 
-def bound_mean(values: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
-    """Student's t interval of the mean of independent values.
-
-    Args:
-        values: one value per run, shape (n,), n >= 2.
-        level: confidence level.
-
-    Raises:
-        StatisticsError: fewer than two values, or one that is not finite.
-    """
-    checked = check_values(values, what="values", fewest=2)
-    half = student_quantile(level, checked.size - 1) * float(np.std(checked, ddof=1)) / checked.size**0.5
-    centre = float(np.mean(checked))
-    return Interval(centre - half, centre + half, level)
-
-
-def bound_typical(medians: ArrayLike, *, level: float = CONFIDENCE) -> Interval:
-    """Interval of a dataset's typical median: a t interval on the logarithms of the runs' medians.
-
-    Slip is positive and varies between runs by a factor, so its logarithms are closer to normal. If a median
-    is not positive, the medians themselves are used.
-
-    Args:
-        medians: one per run, shape (n,), n >= 2.
-        level: confidence level.
-
-    Raises:
-        StatisticsError: fewer than two values, or one that is not finite.
-    """
-    checked = check_values(medians, what="medians", fewest=2)
-    if np.any(checked <= 0.0):
-        return bound_mean(checked, level=level)
-    interval = bound_mean(np.log(checked), level=level)
-    return Interval(float(np.exp(interval.low)), float(np.exp(interval.high)), level)
-
-
 def bootstrap_median(
     values: ArrayLike, blocks: ArrayLike, *, level: float = CONFIDENCE, draws: int = 2_000, seed: int = 0
 ) -> Interval:
@@ -226,13 +190,11 @@ class Comparison:
         shift: Hodges-Lehmann shift b - a, in the unit of the values.
         interval: the differences that the test does not reject; None where it can reject none.
         delta: Cliff's delta of the units, above zero if b is larger.
-        test: permutation test of the units' labels.
     """
 
     shift: float
     interval: Interval | None
     delta: float
-    test: PermutationTest
 
 
 @dataclass(frozen=True)
@@ -252,35 +214,7 @@ class Blocks:
     length: float
 
 
-def compare_runs(a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE) -> Comparison:
-    """Compare datasets by the medians of their runs; a run is the unit, whatever its length.
-
-    The test permutes whole runs (difference of means of the logarithms if all medians are positive), and the
-    interval holds the differences that it does not reject.
-
-    Args:
-        a: one median per run, shape (n,).
-        b: the same for the other dataset, shape (m,).
-        level: confidence level of the interval.
-
-    Raises:
-        StatisticsError: a side is empty or contains a value that is not finite.
-    """
-    first, second = check_values(a, what="run medians"), check_values(b, what="run medians")
-    positive = min(first.min(), second.min()) > 0.0
-    one, other = (np.log(first), np.log(second)) if positive else (first, second)
-    bounds = bound_permuted(one, other, level=1.0 - level)
-    if bounds is not None and positive:
-        bounds = (_spread_ratio(one, other, bounds[0]), _spread_ratio(one, other, bounds[1]))
-    return Comparison(
-        shift=shift_between(first, second),
-        interval=None if bounds is None else Interval(*bounds, level),
-        delta=cliffs_delta(first, second),
-        test=permute_means(one, other),
-    )
-
-
-def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
+def spread_ratio(a: Floats, b: Floats, difference: float) -> float:
     """Difference of the medians of two sides, from that of their logarithms and the mean of these."""
     mean, share = float(np.concatenate((a, b)).mean()), b.size / (a.size + b.size)
     return float(np.exp(mean + (1.0 - share) * difference) - np.exp(mean - share * difference))
@@ -288,7 +222,7 @@ def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
 
 def compare_blocks(
     a: ArrayLike, b: ArrayLike, *, level: float = CONFIDENCE, draws: int = DRAWS
-) -> Comparison:
+) -> tuple[Comparison, PermutationTest]:
     """Compare two single runs by the medians of their blocks; this does not compare terrains.
 
     The test permutes blocks with Welch's t of the medians themselves, and the interval holds the differences
@@ -307,12 +241,12 @@ def compare_blocks(
     few = min(first.size, second.size) < 2  # noqa: PLR2004 - a single block has no scatter
     permute = permute_means if few else permute_studentized
     bounds = bound_permuted(first, second, studentized=not few, level=1.0 - level, draws=draws)
-    return Comparison(
+    comparison = Comparison(
         shift=shift_between(first, second),
         interval=None if bounds is None else Interval(*bounds, level),
         delta=cliffs_delta(first, second),
-        test=permute(first, second, draws=draws),
     )
+    return comparison, permute(first, second, draws=draws)
 
 
 def cut_blocks(values: ArrayLike, ticks: ArrayLike, pieces: ArrayLike, *, step: float) -> Blocks:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import pick
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core import CONFIDENCE, pick
+from pipeline.core.arrays import Floats, Ints
 from pipeline.core.untrusted import format_csv, number_in
 from pipeline.fleet import MEASURES
 from pipeline.fleet.confidence import (
@@ -21,33 +20,34 @@ from pipeline.fleet.confidence import (
     Interval,
     bootstrap_median,
     compare_blocks,
-    compare_runs,
     cut_blocks,
+    spread_ratio,
 )
+from pipeline.fleet.equal_driving import Overlap
+from pipeline.fleet.pooled_tests import compare_means, exponentiate, pool_spread, take_logarithms
 from pipeline.fleet.rank_tests import (
     DRAWS,
     FEWER_DRAWS,
     LEVEL,
-    MOST_GROUPS,
     adjust_holm,
-    adjust_max_t,
+    cliffs_delta,
+    connect_groups,
     find_testable,
     kendall_p,
     kendall_tau,
     mann_whitney,
     name_delta,
-    runs_needed,
+    shift_between,
 )
 from schemas import contract_of
 
 RUNS = "runs"
 BLOCKS = "blocks"
-_FEW_GROUPS = 6
-"""Largest number of groups for which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the
-pairs times the draws."""
 _MANY_PAIRS = 200
 """Number of pairs of single runs above which each takes `FEWER_DRAWS`, to limit the time."""
 ABOUT_BLOCKS = "a difference between two runs, not between terrains"
+NOT_SHARED = "no driving in common, no number"
+NO_SPREAD = "too few runs to know how much runs differ: no test"
 
 
 @dataclass(frozen=True)
@@ -74,72 +74,108 @@ class Samples:
 
 @dataclass(frozen=True)
 class Group:
-    """Dataset as an input of the tests: its runs."""
+    """Dataset as an input of the tests.
+
+    Attributes:
+        name: its name.
+        values: the compared quantity of each run, shape (runs,).
+        runs: samples of each run; empty where only the values are known.
+    """
 
     name: str
-    runs: tuple[Samples, ...]
+    values: Floats
+    runs: tuple[Samples, ...] = ()
 
-    @property
-    def medians(self) -> Floats:
-        """Median of each run."""
-        return np.array([run.median for run in self.runs])
+    @classmethod
+    def of_runs(cls, name: str, runs: Sequence[Samples]) -> Group:
+        """Group whose runs are compared by their medians."""
+        return cls(name, np.array([run.median for run in runs]), tuple(runs))
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """Geometric mean of the runs of b over that of a, with its 95 % interval if the spread is known."""
+
+    value: float
+    low: float | None
+    high: float | None
 
 
 @dataclass(frozen=True)
 class Pair:
-    """Comparison of two groups.
+    """Comparison of two groups; what is not known is None.
 
     Attributes:
         a: first group.
         b: second group.
-        comparison: shift, interval, effect size and the pair's own test.
-        p_adjusted: p corrected over the family of pairs with the same unit.
+        comparison: shift, interval and effect size; None without a number.
+        ratio: ratio of b to a; None if a value is not positive.
+        p: p of the pair alone.
+        p_adjusted: p corrected over the family of pairs.
         smallest_p: smallest corrected p possible with these counts, whatever the difference.
         unit: `RUNS` or `BLOCKS`.
         method: test and correction in words.
+        spread: standard deviation of the logarithm between runs of a group, pooled over the groups.
+        freedom: its degrees of freedom.
         p_uncorrected: plain Mann-Whitney over all samples; not valid.
         note: remark on the interpretation; may be empty.
+        overlap: driving in common, for a comparison at equal driving.
     """
 
     a: Group
     b: Group
-    comparison: Comparison
-    p_adjusted: float
-    smallest_p: float
-    unit: str
-    method: str
-    p_uncorrected: float
-    note: str
+    comparison: Comparison | None = None
+    ratio: Ratio | None = None
+    p: float | None = None
+    p_adjusted: float | None = None
+    smallest_p: float | None = None
+    unit: str = RUNS
+    method: str = ""
+    spread: float | None = None
+    freedom: int | None = None
+    p_uncorrected: float | None = None
+    note: str = ""
+    overlap: Overlap | None = None
 
     @property
     def size(self) -> str:
-        """Cliff's delta in a word."""
-        return name_delta(self.comparison.delta)
+        """Cliff's delta in a word; empty without a number."""
+        return name_delta(self.comparison.delta) if self.comparison else ""
 
 
-def compare_groups(groups: Sequence[Group], *, untested: Collection[frozenset[str]] = ()) -> list[Pair]:
+def compare_groups(
+    groups: Sequence[Group],
+    *,
+    untested: Collection[frozenset[str]] = (),
+    overlaps: Mapping[frozenset[str], Overlap] | None = None,
+) -> list[Pair]:
     """Compare pairs of groups.
 
-    Two groups of one run each are compared block by block; the result applies to these two runs only. They
-    form a family of their own, corrected after Holm. All other pairs permute whole runs; their family is
-    corrected by max-T, or after Holm for more than eight groups. Pairs that can never be significant do not
-    count in their family (Tarone).
+    Groups that tested pairs connect are one family. Where its groups have several runs, `compare_means`
+    tests its pairs with the spread between runs of all of them. Where every group is one run, pairs are
+    compared block by block: the result applies to these two runs only, and p is corrected after Holm over the
+    pairs that can be significant (Tarone).
 
     Args:
-        groups: groups of at least one run each, with samples.
+        groups: groups of at least one run each.
         untested: names of pairs that are not compared.
+        overlaps: driving in common by the names of a pair; pairs without any get no number.
     """
     numbered = [
         (i, j)
         for i, j in itertools.combinations(range(len(groups)), 2)
         if frozenset((groups[i].name, groups[j].name)) not in untested
     ]
-    single = [(i, j) for i, j in numbered if len(groups[i].runs) == len(groups[j].runs) == 1]
-    several = [pair for pair in numbered if pair not in set(single)]
-    return sorted(
-        [*_compare_runs(groups, several), *_compare_blocks(groups, single)],
-        key=lambda pair: (pair.a.name, pair.b.name),
-    )
+    compared: list[Pair] = []
+    for family in connect_groups(numbered):
+        own = [groups[i] for i in family]
+        pairs = [(family.index(i), family.index(j)) for i, j in numbered if i in family]
+        several = any(group.values.size > 1 for group in own)
+        if several or not all(group.runs for group in own):
+            compared += _compare_family(own, pairs, overlaps)
+        else:
+            compared += _compare_blocks(own, pairs)
+    return sorted(compared, key=lambda pair: (pair.a.name, pair.b.name))
 
 
 def bound_run(run: Samples) -> Interval:
@@ -152,49 +188,72 @@ def cut_run(run: Samples) -> Blocks:
     return cut_blocks(run.values, run.ticks, run.pieces, step=run.step)
 
 
-def _compare_runs(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
-    compared = [compare_runs(groups[i].medians, groups[j].medians) for i, j in pairs]
-    by_max_t = len(groups) <= MOST_GROUPS
-    draws = DRAWS if len(groups) <= _FEW_GROUPS or not by_max_t else FEWER_DRAWS
-    own = np.array([comparison.test.p for comparison in compared])
-    smallest = np.array([max(comparison.test.smallest_p, 1.0 / (draws + 1)) for comparison in compared])
-    if by_max_t:
-        positive = all(np.all(group.medians > 0.0) for group in groups)
-        units = [np.log(group.medians) if positive else group.medians for group in groups]
-        counted, family = smallest <= LEVEL, 1
-        matrix = adjust_max_t(units, pairs, draws=draws)
-        adjusted = np.maximum([matrix[pair] for pair in pairs], own)[counted]
-    else:
-        counted, family = find_testable(smallest)
-        adjusted = adjust_holm(own[counted])
-    corrected = _correct(own, counted, family, adjusted)
-    correction = _name_correction("max-T" if by_max_t else "Holm", int(counted.sum()))
-    decided = []
-    for (i, j), comparison, p, least, counts in zip(
-        pairs, compared, corrected.tolist(), smallest.tolist(), counted.tolist(), strict=True
-    ):
-        kind = "exact" if comparison.test.exact else "random"
-        decided.append(
-            Pair(
-                a=groups[i],
-                b=groups[j],
-                comparison=comparison,
-                p_adjusted=p,
-                smallest_p=min(least * family, 1.0),
-                unit=RUNS,
-                method=f"{kind} permutation of whole runs{correction * counts}",
-                p_uncorrected=_ask_published(groups[i], groups[j]),
-                note=_note_runs(groups[i], groups[j], least * family, 1 if by_max_t else len(pairs)),
+def _compare_family(
+    groups: Sequence[Group],
+    pairs: Sequence[tuple[int, int]],
+    overlaps: Mapping[frozenset[str], Overlap] | None,
+) -> list[Pair]:
+    """Pairs by runs; without any spread between runs only ratios."""
+    units, positive = take_logarithms([group.values for group in groups])
+    known = [
+        (i, j)
+        for i, j in pairs
+        if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].bins
+    ]
+    test = compare_means(units, known) if known and pool_spread(units)[1] else None
+    differences = dict(zip(known, test.differences, strict=True)) if test else {}
+    compared = []
+    for i, j in pairs:
+        a, b = groups[i], groups[j]
+        pair = Pair(a, b, overlap=None if overlaps is None else overlaps[frozenset((a.name, b.name))])
+        if (i, j) not in known:
+            compared.append(replace(pair, note=NOT_SHARED))
+            continue
+        difference = differences.get((i, j))
+        centre = float(units[j].mean() - units[i].mean())
+        ends: tuple[float, float] | tuple[None, None] = (None, None)
+        if difference and difference.interval:
+            ends = (difference.interval.low, difference.interval.high)
+        pair = replace(pair, comparison=_measure_shift(a, b, units[i], units[j], ends, positive=positive))
+        if positive:
+            low, high = (None if end is None else exponentiate(end) for end in ends)
+            pair = replace(pair, ratio=Ratio(exponentiate(centre), low, high))
+        if a.runs and b.runs:
+            pair = replace(pair, p_uncorrected=_ask_published(a, b))
+        if test is None or difference is None:
+            compared.append(replace(pair, note=NO_SPREAD))
+            continue
+        note = "; ".join(_note_scatter(a.values, b.values))
+        pair = replace(pair, method=test.method, spread=test.spread, freedom=test.freedom, note=note)
+        compared.append(
+            replace(
+                pair,
+                p=difference.p,
+                p_adjusted=difference.p_adjusted,
+                smallest_p=difference.smallest_p,
             )
         )
-    return decided
+    return compared
 
 
-def _correct(own: Floats, counted: Flags, family: int, adjusted: Floats) -> Floats:
-    """Corrected p of the pairs that count, and of the others one that is above the level."""
-    corrected = np.minimum(own * family, 1.0)
-    corrected[counted] = adjusted
-    return corrected
+def _measure_shift(
+    a: Group,
+    b: Group,
+    first: Floats,
+    second: Floats,
+    ends: tuple[float | None, float | None],
+    *,
+    positive: bool,
+) -> Comparison:
+    """Shift and effect size of two groups; the ends of the interval are those of the mean of logarithms."""
+    low, high = ends
+    interval = None
+    if low is not None and high is not None:
+        low, high = (spread_ratio(first, second, end) if positive else end for end in (low, high))
+        interval = Interval(low, high, CONFIDENCE)
+    return Comparison(
+        shift=shift_between(a.values, b.values), interval=interval, delta=cliffs_delta(a.values, b.values)
+    )
 
 
 def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
@@ -202,16 +261,19 @@ def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -
     blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
     draws = DRAWS if len(pairs) <= _MANY_PAIRS else FEWER_DRAWS
     compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
-    smallest = np.array([comparison.test.smallest_p for comparison in compared])
+    smallest = np.array([test.smallest_p for _, test in compared])
     counted, family = find_testable(smallest)
-    own = np.array([comparison.test.p for comparison in compared])
-    corrected = _correct(own, counted, family, adjust_holm(own[counted]))
-    correction = _name_correction("Holm", int(counted.sum()))
+    own = np.array([test.p for _, test in compared])
+    corrected = np.minimum(own * family, 1.0)
+    corrected[counted] = adjust_holm(own[counted])
+    correction = f", Holm over {counted.sum()} pairs" * bool(counted.sum() > 1)
     return [
         Pair(
             a=groups[i],
             b=groups[j],
             comparison=comparison,
+            ratio=_divide(groups[i], groups[j]),
+            p=test.p,
             p_adjusted=p,
             smallest_p=min(least * family, 1.0),
             unit=BLOCKS,
@@ -220,30 +282,20 @@ def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -
             p_uncorrected=_ask_published(groups[i], groups[j]),
             note=_note_blocks(groups[i], groups[j], least, family, len(pairs)),
         )
-        for (i, j), comparison, p, least, counts in zip(
+        for (i, j), (comparison, test), p, least, counts in zip(
             pairs, compared, corrected.tolist(), smallest.tolist(), counted.tolist(), strict=True
         )
     ]
 
 
-def _name_correction(name: str, pairs: int) -> str:
-    return f", {name} over {pairs} pairs" if pairs > 1 else ""
+def _divide(a: Group, b: Group) -> Ratio | None:
+    first, second = float(a.values[0]), float(b.values[0])
+    return Ratio(second / first, None, None) if first > 0.0 and second > 0.0 else None
 
 
 def _ask_published(a: Group, b: Group) -> float:
     """Test used in published work, over all samples."""
     return mann_whitney(*(np.concatenate([run.values for run in group.runs]) for group in (a, b)))
-
-
-def _note_runs(a: Group, b: Group, smallest: float, family: int) -> str:
-    notes = _note_scatter(a.medians, b.medians)
-    if smallest > LEVEL:
-        counts = {len(a.runs), len(b.runs)}
-        have = (
-            f"{counts.pop()} runs per side" if len(counts) == 1 else f"{len(a.runs)} and {len(b.runs)} runs"
-        )
-        notes.append(f"cannot be significant with {have}; {runs_needed(family)} per side are needed")
-    return "; ".join(notes)
 
 
 def _note_blocks(a: Group, b: Group, smallest: float, family: int, pairs: int) -> str:
@@ -269,6 +321,7 @@ _LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
         ("median_modulus", "median $\\|g\\|$ [m/s]", 3),
         ("low", "low", 3),
         ("high", "high", 3),
+        ("equal_modulus", "at equal driving [m/s]", 3),
         ("median_window_norm", "window norm [m/s]", 2),
         ("published_norm", "as published", 2),
     ),
@@ -276,9 +329,10 @@ _LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
         ("a", "a", 0),
         ("b", "b", 0),
         ("unit_of_analysis", "unit", 0),
+        ("ratio", "$b/a$", 2),
+        ("ratio_low", "low", 2),
+        ("ratio_high", "high", 2),
         ("shift", "shift [m/s]", 3),
-        ("low", "low", 3),
-        ("high", "high", 3),
         ("cliffs_delta", "$\\delta$", 2),
         ("p", "$p$", 4),
         ("p_adjusted", "$p$ corrected", 4),
@@ -333,50 +387,44 @@ def tabulate_pairs(
             "quantity": quantity,
             "a": pair.a.name,
             "b": pair.b.name,
-            "runs_a": len(pair.a.runs),
-            "runs_b": len(pair.b.runs),
-            "shift": pair.comparison.shift,
-            **(pick(pair.comparison.interval, "low", "high") if pair.comparison.interval else {}),
-            "cliffs_delta": pair.comparison.delta,
-            "p": pair.comparison.test.p,
+            "runs_a": pair.a.values.size,
+            "runs_b": pair.b.values.size,
+            **_tabulate_numbers(pair),
             "unit_of_analysis": pair.unit,
-            **pick(pair, "size", "p_adjusted", "smallest_p", "method", "p_uncorrected", "note"),
+            **pick(pair, "size", "p", "p_adjusted", "smallest_p", "method", "p_uncorrected", "note"),
+            **pick(pair, "spread", "freedom"),
             "keys": f"{keys[pair.a.name]} {keys[pair.b.name]}",
         }
         for pair in pairs
     ]
-    frame = pl.DataFrame(rows, schema=contract_of("comparisons").schema.create_empty().schema)
+    schema = contract_of("comparisons").schema.create_empty().schema
+    frame = pl.DataFrame(rows, schema=schema)
     return frame.select(cs.string(), cs.float(), cs.integer(), cs.enum())
 
 
-DIFFERENT, OF_TWO_RUNS, ALIKE, TOO_FEW = "different", "different runs", "alike", "too few"
+def _tabulate_numbers(pair: Pair) -> dict[str, float | None]:
+    numbers: dict[str, float | None] = {}
+    if pair.comparison:
+        numbers |= {"shift": pair.comparison.shift, "cliffs_delta": pair.comparison.delta}
+        numbers |= pick(pair.comparison.interval, "low", "high") if pair.comparison.interval else {}
+    if pair.ratio:
+        numbers |= {"ratio": pair.ratio.value, "ratio_low": pair.ratio.low, "ratio_high": pair.ratio.high}
+    if pair.overlap:
+        numbers |= {"bins": pair.overlap.bins, "overlap": pair.overlap.share}
+    return numbers
+
+
+DIFFERENT, OF_TWO_RUNS, ALIKE, UNTESTED = "different", "different runs", "alike", "untested"
 
 
 def judge_pair(row: Mapping[str, object]) -> str:
-    """What a row of `comparisons` says: `DIFFERENT`, `OF_TWO_RUNS`, `ALIKE` or `TOO_FEW`."""
+    """What a row of `comparisons` says: `DIFFERENT`, `OF_TWO_RUNS`, `ALIKE` or `UNTESTED`."""
     adjusted, smallest = (number_in(row, key) for key in ("p_adjusted", "smallest_p"))
-    if adjusted is not None and adjusted <= LEVEL:
+    if adjusted is None or smallest is None:
+        return UNTESTED
+    if adjusted <= LEVEL:
         return DIFFERENT if row["unit_of_analysis"] == RUNS else OF_TWO_RUNS
-    return TOO_FEW if smallest is None or smallest > LEVEL else ALIKE
-
-
-_WORDS = {
-    DIFFERENT: ("differs significantly", "differ significantly"),
-    OF_TWO_RUNS: ("differs, but as two single runs only", "differ, but as two single runs only"),
-    ALIKE: ("shows no significant difference", "show no significant difference"),
-    TOO_FEW: ("has too few runs for a test", "have too few runs for a test"),
-}
-"""What is said of one pair, and of several."""
-
-
-def count_pairs(rows: Sequence[Mapping[str, object]]) -> str:
-    """How many pairs of the table `comparisons` differ, and what is said of the others, as one sentence."""
-    counts = Counter(judge_pair(row) for row in rows)
-    if len(rows) == 1:
-        return f"The pair of datasets {_WORDS[next(iter(counts))][0]}."
-    parts = [] if counts[DIFFERENT] else ["none differs significantly"]
-    parts += [f"{counts[kind]} {words[counts[kind] > 1]}" for kind, words in _WORDS.items() if counts[kind]]
-    return f"Of {len(rows)} pairs of datasets, {', '.join(parts)}."
+    return ALIKE if smallest <= LEVEL else UNTESTED
 
 
 def write_csv(frame: pl.DataFrame) -> str:
@@ -420,37 +468,93 @@ def _write_cell(value: object, digits: int) -> str:
     return "".join(_SPECIAL.get(mark, mark) for mark in str(value))
 
 
+ABOUT_UNIT = (
+    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), "
+    "in m/s; the paper prints the same number in m^2 rad/s^3, the product of the units of its three "
+    "components, which is the unit of no norm"
+)
+
+AS_DRIVEN, EQUAL_DRIVING, AS_PUBLISHED = "median_modulus", "equal_modulus", "published_norm"
+"""Quantities that are compared."""
+
+
+@dataclass(frozen=True)
+class View:
+    """Comparison of all datasets by one quantity on one input.
+
+    Attributes:
+        input: input u.
+        quantity: `AS_DRIVEN`, `EQUAL_DRIVING` or `AS_PUBLISHED`.
+        levels: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of the quantity.
+        comparisons: table `comparisons`.
+    """
+
+    input: str
+    quantity: str
+    levels: pl.DataFrame
+    comparisons: pl.DataFrame
+
+
 @dataclass(frozen=True)
 class Answer:
     """Result of a comparison.
 
     Attributes:
         datasets: table `datasets`, both inputs.
-        comparisons: table `comparisons`.
+        views: the comparisons, the main one first.
+        families: vehicles, and their datasets that are compared with each other.
         runs: one row per run and input with all its measures.
-        input: input u of the comparisons.
-        quantity: compared quantity.
-        intervals: ``dataset``, ``value``, ``low``, ``high``, ``interval`` of the compared quantity.
+        bins: the driving of every dataset: as from `measure_bins`, with ``group`` in place of the run.
+        carriers: the cause that carries the difference of a pair as driven, by input and pair.
         windows: box plot statistics of the window norms, as from `spread_windows`.
         notes: excluded runs, pairs that cannot be distinguished.
     """
 
     datasets: pl.DataFrame
-    comparisons: pl.DataFrame
+    views: tuple[View, ...]
+    families: Mapping[str, tuple[str, ...]]
     runs: pl.DataFrame
-    input: str
-    quantity: str
-    intervals: pl.DataFrame
+    bins: pl.DataFrame
+    carriers: Mapping[tuple[str, frozenset[str]], str]
     windows: pl.DataFrame
     notes: tuple[str, ...]
 
     @property
+    def input(self) -> str:
+        """Input u of the main comparison."""
+        return self.views[0].input
+
+    @property
+    def quantity(self) -> str:
+        """Quantity of the main comparison."""
+        return self.views[0].quantity
+
+    @property
+    def comparisons(self) -> pl.DataFrame:
+        """Rows of the main comparison."""
+        return self.views[0].comparisons
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Inputs u, that of the main comparison first."""
+        return tuple(dict.fromkeys(view.input for view in self.views))
+
+    @property
     def measure(self) -> str:
-        """Name of the compared quantity, its length scale included."""
-        if self.quantity == "published_norm":
+        """Name of the quantity as driven, its length scale included."""
+        if self.quantity == AS_PUBLISHED:
             return "2 s window norm as published (L = 1 m)"
         (scale,) = self.datasets["length_scale"].drop_nulls().unique().to_list() or (1.0,)
         return f"median slip modulus (L = {scale:g} m)"
+
+    def find_view(self, input_name: str, *, equal: bool) -> View | None:
+        """The comparison on an input, at equal driving or as driven; None if there is none."""
+        matching = (
+            view
+            for view in self.views
+            if view.input == input_name and (view.quantity == EQUAL_DRIVING) == equal
+        )
+        return next(matching, None)
 
 
 @dataclass(frozen=True)

@@ -493,10 +493,10 @@ def adjust_max_t(
     for partition in _list_partitions(tuple(range(len(values)))):
         equal = {pair for pair in possible if any(set(pair) <= set(chosen) for chosen in partition)}
         # A set that the pairs do not connect is the union of others.
-        if not equal or _connect(equal) != sorted(chosen for chosen in partition if len(chosen) > 1):
+        if not equal or connect_groups(equal) != sorted(chosen for chosen in partition if len(chosen) > 1):
             continue
         counted = equal & testable or equal
-        sets = _connect(counted)
+        sets = connect_groups(counted)
         for chosen in sets:
             if chosen not in nulls:
                 within = [(chosen.index(i), chosen.index(j)) for i, j in counted if {i, j} <= set(chosen)]
@@ -515,8 +515,8 @@ def adjust_max_t(
     return matrix
 
 
-def _connect(pairs: Iterable[tuple[int, int]]) -> list[tuple[int, ...]]:
-    """The sets of groups that pairs connect, in order."""
+def connect_groups(pairs: Iterable[tuple[int, int]]) -> list[tuple[int, ...]]:
+    """The sets of groups that pairs connect, in order; groups by their index."""
     sets: list[set[int]] = []
     for pair in pairs:
         joined = set(pair).union(*(one for one in sets if not one.isdisjoint(pair)))

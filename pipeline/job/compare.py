@@ -1,7 +1,9 @@
 """Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
 
+import contextlib
+import itertools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +11,7 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, read_version
 from pipeline.core.arrays import Ints
+from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import (
     OVER_RUNS,
     THIS_RUN,
@@ -19,13 +22,22 @@ from pipeline.fleet import (
     pool_runs,
     spread_windows,
 )
-from pipeline.fleet.confidence import Interval, bound_typical
+from pipeline.fleet.answer_lines import list_lines
+from pipeline.fleet.causes import find_carriers
+from pipeline.fleet.confidence import Interval
+from pipeline.fleet.equal_driving import Overlap, find_overlap, level_runs, measure_bins
 from pipeline.fleet.exchange import check_features, follow_published, read_limits
 from pipeline.fleet.pairs import (
+    ABOUT_UNIT,
+    AS_DRIVEN,
+    AS_PUBLISHED,
+    BLOCKS,
+    EQUAL_DRIVING,
     Answer,
     Group,
     Pair,
     Samples,
+    View,
     bound_run,
     compare_groups,
     compare_orders,
@@ -33,14 +45,30 @@ from pipeline.fleet.pairs import (
     write_csv,
     write_latex,
 )
-from pipeline.job import ANALYZE_FIRST, FigureFormat, lack_runs
-from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
+from pipeline.fleet.pooled_tests import bound_levels
+from pipeline.fleet.rank_tests import connect_groups
+from pipeline.job import ANALYZE_FIRST, FigureFormat, JobError, lack_runs
+from pipeline.job.compared_runs import (
+    ComparedRuns,
+    can_read,
+    choose_runs,
+    find_material,
+    keep_runs,
+    read_digest,
+)
+from pipeline.job.prediction import fit_results
+from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.report import Picture
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.store import Store
 from schemas import Features
 
 _FEWEST = 2
+
+Bounds = dict[tuple[str, str], Interval]
+"""Intervals by run and input."""
+Overlaps = Mapping[frozenset[str], Overlap]
+"""Driving in common by the datasets of a pair."""
 
 
 def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
@@ -153,10 +181,14 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     from pipeline.report.comparison_page import list_pictures, render_comparison  # noqa: PLC0415 - heavy
 
     store.write_results_table("datasets", answer.datasets)
-    store.write_results_table("comparisons", answer.comparisons)
+    comparisons = pl.concat([view.comparisons for view in answer.views])
+    store.write_results_table("comparisons", comparisons)
     written: dict[str, Path] = {}
-    for name, frame in (("datasets", answer.datasets), ("comparisons", answer.comparisons)):
-        written |= write_tables(store, name, frame, frame.filter(pl.col("input") == answer.input))
+    for name, frame, shown in (
+        ("datasets", answer.datasets, answer.datasets.filter(pl.col("input") == answer.input)),
+        ("comparisons", comparisons, answer.comparisons),
+    ):
+        written |= write_tables(store, name, frame, shown)
     page = render_comparison(answer, list_shown_notes(answer))
     written["comparison.html"] = write_page(store, "comparison.html", page)
     return written | write_figures(store, lambda: list_pictures(answer), figures)
@@ -190,12 +222,29 @@ def summarize_answer(answer: Answer) -> dict[str, object]:
         "input": answer.input,
         "quantity": answer.quantity,
         "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
-        "pairs": _list_rows(answer.comparisons.drop("run", "dataset", "vehicle", "terrain")),
+        "pairs": _list_pairs(answer.comparisons),
+        "answer": [vars(line) for line in list_lines(answer)],
+        "views": [
+            {
+                "input": view.input,
+                "quantity": view.quantity,
+                "levels": _list_rows(view.levels),
+                "pairs": _list_pairs(view.comparisons),
+            }
+            for view in answer.views
+        ],
+        "carried_by": [
+            {"input": name, "pair": sorted(pair), "by": by} for (name, pair), by in answer.carriers.items()
+        ],
         "orders": [
             vars(one) for one in compare_orders(answer.datasets.filter(pl.col("input") == answer.input))
         ],
         "notes": list(answer.notes),
     }
+
+
+def _list_pairs(comparisons: pl.DataFrame) -> list[dict[str, object]]:
+    return _list_rows(comparisons.drop("run", "dataset", "vehicle", "terrain"))
 
 
 def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
@@ -214,23 +263,16 @@ NOT_VALID = (
 )
 
 
-ABOUT_UNIT = (
-    "the norm of a 2 s window is sqrt(40) = 6.32 times the root mean square of its slip modulus (L = 1 m), "
-    "in m/s; the paper prints the same number in m^2 rad/s^3, the product of the units of its three "
-    "components, which is the unit of no norm"
-)
-
-
 @dataclass(frozen=True)
 class Question:
     """Options of a comparison.
 
     Attributes:
         by: columns that define a dataset.
-        input: input u; None: the command if every run has one, else the measured wheels.
+        input: input u; None: both, the command first if every run has one.
         as_published: compare the window norms of the published chain instead of the median slip modulus.
-        datasets: compare only these, each with every other; all if empty, and of those that differ in both
-            vehicle and terrain no test.
+        datasets: compare only these, each with every other; if empty all, and those of one vehicle with each
+            other.
         vehicle: compare only runs of this vehicle; of any if empty.
     """
 
@@ -254,37 +296,226 @@ def compare_results(store: Store, question: Question) -> Answer:
     if runs.is_empty():
         what = "there is no run whose numbers can be compared"
         raise lack_runs("nothing_to_compare", what, store.root, ANALYZE_FIRST, compared.notes)
-    chosen = question.input or choose_input(runs)
-    quantity = "median_modulus"
-    if question.as_published:
-        chosen, quantity = "command", "published_norm"
-    moduli = samples = read_moduli(compared, chosen)
-    if question.as_published:
-        samples, runs, comments = follow_published_runs(compared, runs)
-        notes += [ABOUT_UNIT, *comments]
-    elif chosen == "command":
-        notes += _doubt_commands(compared)
-    missing = sorted(set(compared.manifests) - set(samples))
-    if missing:
-        notes.append(f"{', '.join(missing)} not compared: no {quantity.replace('_', ' ')} on {chosen}")
-    groups = _group(compared, samples)
     untested = find_untested(compared, question)
-    pairs = compare_groups(groups, untested=untested)
-    single = _find_single(compared)
-    datasets = pool_runs(
-        runs,
-        question.by,
-        within=_bound_single(moduli, single, chosen),
-        norms_within=_bound_single(read_norms(compared, chosen), single, chosen),
+    material = _Material(compared, question, untested, _find_families(compared, untested), runs, notes)
+    return material.compare_published() if question.as_published else material.compare_driving()
+
+
+@dataclass
+class _Material:
+    """What a comparison is made of.
+
+    Attributes:
+        compared: the runs.
+        question: what is asked.
+        untested: pairs of datasets without a test.
+        families: datasets that are compared with each other, by their vehicles.
+        runs: one row per run and input with all its measures.
+        notes: grows with what is found.
+    """
+
+    compared: ComparedRuns
+    question: Question
+    untested: frozenset[frozenset[str]]
+    families: dict[str, tuple[str, ...]]
+    runs: pl.DataFrame
+    notes: list[str]
+
+    def compare_driving(self) -> Answer:
+        """Compare slip moduli on the inputs, each as driven and at equal driving."""
+        main = self.question.input or choose_input(self.runs)
+        others = {"command", "measured"} & set(self.runs["input"].cast(pl.String)) - {main}
+        inputs = [main, *(sorted(others) if self.question.input is None else ())]
+        self.notes += _doubt_commands(self.compared) if "command" in inputs else []
+        tables: dict[tuple[str, str], pl.DataFrame] = {}
+        within: Bounds = {}
+        norms_within: Bounds = {}
+        for name in inputs:
+            moduli = read_moduli(self.compared, name)
+            tables[name, AS_DRIVEN] = self._compare(self._group(moduli, name, AS_DRIVEN), name, AS_DRIVEN)
+            within |= self._bound_single(moduli, name)
+            norms_within |= self._bound_single(read_norms(self.compared, name), name)
+        labels = self.compared.labels.select("run", "group")
+        bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
+        driven = self._level_driving(bins, inputs)
+        for name in inputs:
+            levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
+            groups = _group_levels(levels)
+            overlaps = _find_overlaps(groups, levels, driven[name])
+            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps)
+        datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
+        views = [View(*key, _list_levels(datasets, *key), table) for key, table in tables.items()]
+        return self._answer(datasets, views, self.compared.scan("windows"), bins)
+
+    def compare_published(self) -> Answer:
+        """Compare the window norms of the published chain."""
+        name = "command"
+        samples, self.runs, comments = follow_published_runs(self.compared, self.runs)
+        self.notes += [ABOUT_UNIT, *comments]
+        groups = self._group(samples, name, AS_PUBLISHED)
+        table = self._compare(groups, name, AS_PUBLISHED)
+        datasets = pool_runs(
+            self.runs,
+            self.question.by,
+            within=self._bound_single(read_moduli(self.compared, name), name),
+            norms_within=self._bound_single(read_norms(self.compared, name), name),
+        )
+        view = View(name, AS_PUBLISHED, _bound_published(groups, self.families), table)
+        return self._answer(datasets, [view], _tabulate_windows(samples, name), pl.DataFrame())
+
+    def _group(self, samples: Mapping[str, Samples], name: str, quantity: str) -> list[Group]:
+        if missing := sorted(set(self.compared.manifests) - set(samples)):
+            what = f"no {quantity.replace('_', ' ')} on {name}"
+            self.notes.append(f"{', '.join(missing)} not compared: {what}")
+        return _group(self.compared, samples)
+
+    def _compare(
+        self, groups: Sequence[Group], name: str, quantity: str, overlaps: Overlaps | None = None
+    ) -> pl.DataFrame:
+        """Table `comparisons` of the groups by a quantity on an input."""
+        pairs = compare_groups(groups, untested=self.untested, overlaps=overlaps)
+        self.notes += _sum_up(pairs, groups, _WORDS[quantity])
+        keys = _keys(self.compared)
+        return tabulate_pairs(pairs, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
+
+    def _bound_single(self, samples: Mapping[str, Samples], name: str) -> Bounds:
+        """Intervals of runs that are alone in their dataset."""
+        alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
+        return {(run, name): bound_run(samples[run]) for run in alone if run in samples}
+
+    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
+        """Give runs their levels at equal driving; the bins that count, by input."""
+        driven: dict[str, pl.DataFrame] = {}
+        for name in inputs:
+            counted = []
+            for datasets in self.families.values():
+                own = bins.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
+                levelled = level_runs(own)
+                counted.append(levelled.bins)
+                if levelled.apart:
+                    runs = ", ".join(levelled.apart)
+                    why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
+                    self.notes.append(f"no level at equal driving, too little in common ({why}): {runs}")
+                levels = levelled.runs.select(
+                    "run",
+                    pl.lit(name).cast(self.runs.schema["input"]).alias("input"),
+                    pl.col("level").alias(EQUAL_DRIVING),
+                )
+                self.runs = self.runs.update(levels, on=["run", "input"])
+            driven[name] = pl.concat(counted)
+        if short := sorted(set(self.compared.manifests) - set(bins["run"])):
+            runs = ", ".join(short)
+            self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")
+        return driven
+
+    def _answer(
+        self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, bins: pl.DataFrame
+    ) -> Answer:
+        labels = self.compared.labels.select("run", "group")
+        return Answer(
+            datasets=datasets,
+            views=tuple(views),
+            families=self.families,
+            runs=self.runs,
+            bins=bins,
+            carriers=_find_carriers(self.compared, [view.input for view in views]),
+            windows=spread_windows(windows, labels),
+            notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
+        )
+
+
+_WORDS = {
+    AS_DRIVEN: "as driven",
+    EQUAL_DRIVING: "at equal driving",
+    AS_PUBLISHED: "as published",
+}
+
+
+def _find_families(
+    compared: ComparedRuns, untested: Collection[frozenset[str]]
+) -> dict[str, tuple[str, ...]]:
+    """Datasets that are compared with each other, by their vehicles."""
+    names = sorted(set(compared.labels["group"]))
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if frozenset((names[i], names[j])) not in untested
+    ]
+    sets = connect_groups(pairs)
+    alone = set(range(len(names))) - {i for one in sets for i in one}
+    families: dict[str, tuple[str, ...]] = {}
+    for members in sorted([*sets, *((i,) for i in alone)]):
+        datasets = tuple(names[i] for i in members)
+        own = compared.labels.filter(pl.col("group").is_in(list(datasets)))
+        vehicle = ", ".join(sorted(set(own["vehicle"])))
+        # Datasets of a vehicle that have nothing to be compared with would share its name.
+        families[vehicle if vehicle not in families else f"{vehicle}: {datasets[0]}"] = datasets
+    return families
+
+
+def _group_levels(levels: pl.DataFrame) -> list[Group]:
+    parts = levels.sort("group", "run").partition_by("group", as_dict=True, maintain_order=True)
+    return [Group(str(name), rows[EQUAL_DRIVING].to_numpy()) for (name,), rows in parts.items()]
+
+
+def _find_overlaps(
+    groups: Sequence[Group], levels: pl.DataFrame, bins: pl.DataFrame
+) -> dict[frozenset[str], Overlap]:
+    runs = {group.name: levels.filter(pl.col("group") == group.name)["run"].to_list() for group in groups}
+    return {
+        frozenset((a, b)): find_overlap(bins, runs[a], runs[b]) for a, b in itertools.combinations(runs, 2)
+    }
+
+
+def read_budgets(compared: ComparedRuns) -> pl.DataFrame:
+    """Rows of the slip's budget of every run, with ``group``; no columns without runs."""
+    if not compared.manifests:
+        return pl.DataFrame()
+    return (
+        compared.scan("budget")
+        .filter(pl.col("quantity").cast(pl.String) == "slip")
+        .with_columns(pl.col("input", "kind").cast(pl.String))
+        .collect()
+        .join(compared.labels.select("run", "group"), on="run")
     )
-    comparisons = tabulate_pairs(
-        pairs, by=question.by, input_name=chosen, quantity=quantity, keys=_keys(compared)
-    )
-    windows = _tabulate_windows(samples, chosen) if question.as_published else compared.scan("windows")
-    boxes = spread_windows(windows, compared.labels.select("run", "group"))
-    all_notes = (*compared.notes, *notes, *_sum_up(pairs, groups), *note_untested(untested))
-    intervals = _list_intervals(groups, datasets, chosen, quantity)
-    return Answer(datasets, comparisons, runs, chosen, quantity, intervals, boxes, all_notes)
+
+
+def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:
+    """The effect that carries the difference of two datasets as driven, in words; of diagnosed runs."""
+    diagnosed = {run: one for run, one in compared.manifests.items() if can_read(one, "budget")}
+    rows = read_budgets(replace(compared, manifests=diagnosed))
+    if rows.is_empty():
+        return {}
+    names = name_causes(find_level_names(compared.store))
+    carriers = {}
+    for name in inputs:
+        for pair, one in find_carriers(rows.filter(pl.col("input") == name)).items():
+            cause = names.get(one.name, one.name.replace("_", " "))
+            carriers[name, pair] = f"{cause} {one.difference:+.2g} m/s"
+    return carriers
+
+
+def find_level_names(store: Store) -> dict[str, str]:
+    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
+    names_by_effect: dict[str, set[str]] = {}
+    # Without estimates effects have no levels.
+    with contextlib.suppress(JobError):
+        for number in fit_results(store)[0].numbers:
+            names_by_effect.setdefault(number.effect, set()).add(number.name)
+    called = {
+        effect: name
+        for effect, names in names_by_effect.items()
+        for name in names
+        if names == {name} != {effect}
+    }
+    return called | CAUSE_NAMES
+
+
+def name_causes(level_names: Mapping[str, str]) -> dict[str, str]:
+    """What effects and the other causes of slip are called within a sentence, by their levels where known."""
+    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
+    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
+    return names | {effect: name.replace("_", " ") for effect, name in level_names.items()}
 
 
 def find_untested(compared: ComparedRuns, question: Question) -> frozenset[frozenset[str]]:
@@ -298,7 +529,7 @@ def note_untested(untested: Collection[frozenset[str]]) -> list[str]:
         return []
     first, second = sorted(min(untested, key=sorted))
     pairs = f"{len(untested)} pairs" if len(untested) > 1 else "1 pair"
-    why = "with neither vehicle nor terrain in common"
+    why = "of different vehicles"
     return [f"{pairs} of datasets {why}: no test, unless named, as in: slip compare {first} {second}"]
 
 
@@ -354,46 +585,43 @@ def _doubt_commands(compared: ComparedRuns) -> list[str]:
 def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:
     known = compared.labels.filter(pl.col("run").is_in(list(samples))).sort("group", "run")
     return [
-        Group(str(name), tuple(samples[run] for run in rows["run"]))
+        Group.of_runs(str(name), [samples[run] for run in rows["run"]])
         for (name,), rows in known.partition_by("group", as_dict=True, maintain_order=True).items()
     ]
 
 
-def _find_single(compared: ComparedRuns) -> list[str]:
-    """Runs that are alone in their dataset."""
-    alone = compared.labels.filter(pl.len().over("group") == 1)
-    return alone["run"].to_list()
+def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.DataFrame:
+    """Value and interval of a quantity, one row per dataset that has it."""
+    low, high, about = ("low", "high", pl.col("interval"))
+    if quantity == EQUAL_DRIVING:
+        low, high, about = ("equal_low", "equal_high", pl.lit(OVER_RUNS))
+    return datasets.filter(pl.col("input") == input_name, pl.col(quantity).is_not_null()).select(
+        "dataset",
+        pl.col(quantity).alias("value"),
+        pl.col(low).alias("low"),
+        pl.col(high).alias("high"),
+        pl.when(pl.col(low).is_null()).then(pl.lit("")).otherwise(about).alias("interval"),
+    )
 
 
-def _bound_single(
-    samples: Mapping[str, Samples], single: Sequence[str], chosen: str
-) -> dict[tuple[str, str], Interval]:
-    """Intervals of runs that are alone in their dataset."""
-    return {(run, chosen): bound_run(samples[run]) for run in single if run in samples}
-
-
-def _list_intervals(
-    groups: Sequence[Group], datasets: pl.DataFrame, chosen: str, quantity: str
-) -> pl.DataFrame:
-    """Value and interval of the compared quantity, one row per dataset."""
-    own = datasets.filter(pl.col("input") == chosen)
-    if quantity == "median_modulus":
-        return own.select("dataset", pl.col(quantity).alias("value"), "low", "high", "interval")
-    rows = []
-    for group in groups:
-        interval, about = None, ""
-        if len(group.runs) >= FEWEST_OF_SPREAD:
-            interval, about = bound_typical(group.medians), OVER_RUNS
-        elif len(group.runs) == 1:
-            interval, about = bound_run(group.runs[0]), THIS_RUN
-        ends = (None, None) if interval is None else (interval.low, interval.high)
-        rows.append((group.name, float(np.median(group.medians)), *ends, about))
+def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[str]]) -> pl.DataFrame:
+    """Value and interval of the published norm, one row per dataset."""
+    rows: list[tuple[str, float, float | None, float | None, str]] = []
+    for datasets in families.values():
+        own = [group for group in groups if group.name in datasets]
+        for group, over_runs in zip(own, bound_levels([group.values for group in own]), strict=True):
+            interval, about = over_runs, OVER_RUNS
+            if interval is None and len(group.runs) == 1:
+                interval, about = bound_run(group.runs[0]), THIS_RUN
+            ends = (None, None) if interval is None else (interval.low, interval.high)
+            value = float(np.median(group.values))
+            rows.append((group.name, value, *ends, about if interval else ""))
     kinds = {
         "dataset": pl.String,
         **dict.fromkeys(("value", "low", "high"), pl.Float64),
         "interval": pl.String,
     }
-    return pl.DataFrame(rows, schema=kinds, orient="row")
+    return pl.DataFrame(rows, schema=kinds, orient="row").sort("dataset")
 
 
 def _keys(compared: ComparedRuns) -> dict[str, str]:
@@ -403,18 +631,19 @@ def _keys(compared: ComparedRuns) -> dict[str, str]:
     return dict(zip(joined["group"].to_list(), joined["place"].to_list(), strict=True))
 
 
-def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group]) -> list[str]:
+def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str]:
+    """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
     if len(groups) < 2:  # noqa: PLR2004 - a pair
-        return ["there is one dataset only: nothing to compare it with"]
-    hopeless: dict[str, list[str]] = {}
+        return ["there is one dataset only: nothing to compare it with"] if groups else []
+    silent: dict[str, list[str]] = {}
     for pair in pairs:
-        if "cannot be significant" in pair.note:
-            hopeless.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
-    single = sorted(group.name for group in groups if len(group.runs) == 1)
+        if pair.p is None or "cannot be significant" in pair.note:
+            silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
     sentences = []
-    for note, (first, *others) in sorted(hopeless.items()):
+    for note, (first, *others) in sorted(silent.items()):
         count_text = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
-        sentences.append(f"{first}{count_text}: {note}")
+        sentences.append(f"{first}{count_text}, {of}: {note}")
+    single = sorted({group.name for pair in pairs if pair.unit == BLOCKS for group in (pair.a, pair.b)})
     if single:
         sentences.append(
             f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"

@@ -11,7 +11,6 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
 from pipeline.core.untrusted import read_bounded
-from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.deployments import (
@@ -39,15 +38,17 @@ from pipeline.job import FigureFormat, JobError, lack_runs
 from pipeline.job.compare import (
     Question,
     choose_input,
+    find_level_names,
     find_untested,
     measure_runs,
+    name_causes,
     note_untested,
+    read_budgets,
     write_figures,
     write_tables,
 )
 from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
-from pipeline.job.prediction import fit_results
-from pipeline.models.catalogue import list_effects, name_effect
+from pipeline.models.catalogue import list_effects
 from pipeline.store import Store
 
 _EFFECT = "effect"
@@ -67,15 +68,7 @@ def find_causes(store: Store, question: Question) -> Causes:
     """
     compared = find_material(store, question.by, trusted_only=True, tables=("budget", "estimates"))
     compared = choose_runs(compared, question.vehicle, question.datasets)
-    rows = pl.DataFrame()
-    if compared.manifests:
-        rows = (
-            compared.scan("budget")
-            .filter(pl.col("quantity").cast(pl.String) == "slip")
-            .with_columns(pl.col("input", "kind").cast(pl.String))
-            .collect()
-            .join(compared.labels.select("run", "group"), on="run")
-        )
+    rows = read_budgets(compared)
     if rows.is_empty():
         hint = "Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME."
         what = "no run has a budget of its slip"
@@ -91,21 +84,7 @@ def find_causes(store: Store, question: Question) -> Causes:
     budgets, differences = compare_causes(own, untested=untested)
     keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
     notes = (*compared.notes, *note_untested(untested))
-    return Causes(budgets, differences, source, _find_names(store), keys, notes)
-
-
-def _find_names(store: Store) -> dict[str, str]:
-    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
-    names_by_effect: dict[str, set[str]] = {}
-    for number in fit_results(store)[0].numbers:
-        names_by_effect.setdefault(number.effect, set()).add(number.name)
-    called = {
-        effect: name
-        for effect, names in names_by_effect.items()
-        for name in names
-        if names == {name} != {effect}
-    }
-    return called | CAUSE_NAMES
+    return Causes(budgets, differences, source, find_level_names(store), keys, notes)
 
 
 def summarize_causes(causes: Causes) -> dict[str, object]:
@@ -174,9 +153,7 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         ("cause_differences", _tabulate_pairs(causes)),
     ):
         written |= write_tables(store, name, frame, frame)
-    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
-    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
-    names |= {effect: name.replace("_", " ") for effect, name in causes.names.items()}
+    names = name_causes(causes.names)
     sentences = [
         format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
     ]
@@ -265,6 +242,7 @@ def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
         pl.format("{}" + _SHARED, "dataset").alias("group"),
         pl.col("from_results").alias("key"),
         pl.lit(None, pl.Float64).alias("published_norm"),
+        pl.lit(None, pl.Float64).alias("equal_modulus"),
     )
     return pool_runs(others, ("dataset",))
 

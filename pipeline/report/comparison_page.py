@@ -1,21 +1,29 @@
-"""Page of `slip compare`: published figure, and figure with intervals over runs."""
+"""Page of `slip compare`: the answer, its figures, the pairs, the published figure."""
 
+import itertools
+import json
 from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_duration, format_share
-from pipeline.fleet import MEASURES
+from pipeline.core import INPUT_WORDS, format_duration
+from pipeline.fleet import MEASURES, THIS_RUN
+from pipeline.fleet.answer_lines import Line, list_lines, list_pairs, title_line
+from pipeline.fleet.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
 from pipeline.fleet.pairs import (
+    ABOUT_BLOCKS,
+    ABOUT_UNIT,
+    AS_DRIVEN,
+    AS_PUBLISHED,
     DIFFERENT,
+    EQUAL_DRIVING,
     OF_TWO_RUNS,
-    TOO_FEW,
     Answer,
+    View,
     compare_orders,
-    count_pairs,
     judge_pair,
 )
-from pipeline.fleet.rank_tests import LEVEL, kendall_tau, list_swaps
+from pipeline.fleet.rank_tests import kendall_tau, list_swaps
 from pipeline.report import (
     MISSING,
     Cell,
@@ -30,7 +38,7 @@ from pipeline.report import (
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.scene import format_ends
-from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
+from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
 
 _ROW_HEIGHT = 34
 _GUTTER = 210
@@ -69,33 +77,33 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {sentence}.")
 
 
-def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: str) -> Drawing:
-    """Median of every run as a point, and the interval of the dataset: the statistically valid figure.
+def draw_levels(runs: pl.DataFrame, levels: pl.DataFrame, *, name: str, title: str) -> Drawing:
+    """Value of every run as a point, and of its dataset with an interval over runs.
 
     Args:
-        runs: ``group``, ``run`` and the column ``value``, one row per run.
-        datasets: ``dataset``, ``value``, ``low``, ``high``, ``interval``.
-        value: column with the medians.
+        runs: ``group``, ``run`` and ``value``, one row per run.
+        levels: as in `View`.
+        name: name of the rows, unlike that of other drawings of the page.
         title: title of the axis, with its unit.
     """
-    labels = label_names(datasets.sort("value")["dataset"].to_list())
-    points = runs.filter(pl.col(value).is_not_null(), pl.col("group").is_in(list(labels)))
-    points = points.select(_label(labels), "run", pl.col(value).alias("value"))
+    labels = label_names(levels.sort("value", "dataset")["dataset"].to_list())
+    points = runs.filter(pl.col("value").is_not_null(), pl.col("group").is_in(list(labels)))
+    points = points.select(_label(labels), "run", "value")
     highest = points["value"].max()
     end = 1.6 * float(highest) if isinstance(highest, float) else 1.0
-    spans = datasets.select(
+    kinds = ["95 % interval over runs", "of this run only"]
+    spans = levels.select(
         _label(labels, of="dataset"),
         "value",
         pl.col("low").clip(0.0, end),
         pl.col("high").clip(0.0, end),
-        pl.when(pl.col("interval") == "over runs")
-        .then(pl.lit("95 % interval over runs"))
-        .otherwise(pl.lit("of this run only"))
+        pl.when(pl.col("interval") == THIS_RUN)
+        .then(pl.lit(kinds[1]))
+        .otherwise(pl.lit(kinds[0]))
         .alias("kind"),
     )
-    kinds = ["95 % interval over runs", "of this run only"]
     bars = (
-        Chart.of_rows("spans")
+        Chart.of_rows(f"{name}_spans")
         .mark("rule", strokeWidth=5, opacity=0.75)
         .encode(
             y=_names(labels),
@@ -109,12 +117,12 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
         )
     )
     middles = (
-        Chart.of_rows("spans")
+        Chart.of_rows(f"{name}_spans")
         .mark("tick", size=18, thickness=2.5, color=theme.MEASURED)
         .encode(y=_names(labels), x="value:Q")
     )
     dots = (
-        Chart.of_rows("run_medians")
+        Chart.of_rows(f"{name}_runs")
         .mark("point", size=70, filled=True, fill=theme.SLIP, stroke=theme.PAPER, strokeWidth=1, opacity=1)
         .encode(
             y=_names(labels),
@@ -123,17 +131,104 @@ def draw_runs(runs: pl.DataFrame, datasets: pl.DataFrame, *, value: str, title: 
         )
     )
     chart = _frame(layer(bars, dots, middles), len(labels))
-    cut = datasets.filter(pl.col("high") > end).height
-    note = "A point is a run; a tick the median over runs."
+    cut = levels.filter(pl.col("high") > end).height
+    note = ""
     if cut:
-        note += (
-            f" {cut} interval{'s are' if cut > 1 else ' is'} longer than the axis and cut: so few runs tell "
+        note = (
+            f"{cut} interval{'s are' if cut > 1 else ' is'} longer than the axis and cut: so few runs tell "
             "little of others."
         )
     sentence = ", ".join(
-        f"{name} {value:.3g}" for name, value in datasets.select("dataset", "value").iter_rows()
+        f"{dataset} {value:.3g}" for dataset, value in levels.select("dataset", "value").iter_rows()
     )
-    return Drawing(chart, {"spans": spans, "run_medians": points}, note, f"In m/s: {sentence}.")
+    return Drawing(chart, {f"{name}_spans": spans, f"{name}_runs": points}, note, f"In m/s: {sentence}.")
+
+
+def draw_driving(bins: pl.DataFrame, input_name: str, datasets: Sequence[str]) -> Drawing:
+    """How hard each dataset was in each cell of commanded speed and yaw rate: a column is equal driving.
+
+    Args:
+        bins: as in `Answer`.
+        input_name: input u.
+        datasets: in this order.
+    """
+    axes = ["speed", "turn"]
+    own = (
+        bins.filter(pl.col("input") == input_name)
+        .group_by("group", *axes)
+        .agg(
+            (pl.col("modulus").log() * pl.col("samples")).sum().truediv(pl.col("samples").sum()).exp(),
+            pl.col("samples").sum(),
+        )
+        .with_columns(
+            _name_classes("speed", SPEED_EDGES).alias("speed_class"),
+            _name_classes("turn", TURN_EDGES).alias("turn_class"),
+        )
+        .sort("group", *axes)
+    )
+    order = [
+        name for (name,) in own.sort("speed").select("speed_class").unique(maintain_order=True).iter_rows()
+    ]
+    turns = [
+        name for (name,) in own.sort("turn").select("turn_class").unique(maintain_order=True).iter_rows()
+    ]
+    there = set(own["group"])
+    labels = label_names([name for name in datasets if name in there])
+    rows = own.select(
+        _label(labels), "speed_class", "turn_class", "modulus", pl.col("samples").cast(pl.Float64)
+    )
+    panels = []
+    for label in labels.values():
+        heat = (
+            Chart.of_rows("driving")
+            .filter(f"datum.label === {json.dumps(label)}")
+            .mark("rect")
+            .encode(
+                x=encode_column(
+                    "speed_class:N",
+                    sort=order,
+                    title=None,
+                    scale={"domain": order},
+                    axis={"labelAngle": 0, "grid": False},
+                ),
+                y=encode_column(
+                    "turn_class:N",
+                    sort=turns[::-1],
+                    title=None,
+                    scale={"domain": turns[::-1]},
+                    axis={"minExtent": 44, "grid": False},
+                ),
+                color=encode_column(
+                    "modulus:Q",
+                    scale={"type": "log", "range": list(theme.SLIP_RAMP)},
+                    legend={"title": "slip modulus [m/s]"},
+                ),
+                tooltip=[
+                    "label:N",
+                    "speed_class:N",
+                    "turn_class:N",
+                    encode_column("modulus:Q", format=".3"),
+                    encode_column("samples:Q", format=","),
+                ],
+            )
+            .properties(width=520, height=15 * len(turns), title={"text": label, "anchor": "start"})
+        )
+        panels.append(heat)
+    chart = stack(*panels)
+    note = (
+        "Across: commanded speed [m/s]; up: commanded yaw rate [rad/s]. Empty: fewer than "
+        f"{LEAST_SAMPLES} samples of a run."
+    )
+    words = (
+        f"Median slip modulus by commanded speed and yaw rate, one panel for each of {len(labels)} datasets."
+    )
+    return Drawing(chart, {"driving": rows}, note, words)
+
+
+def _name_classes(column: str, edges: Sequence[float]) -> pl.Expr:
+    ends = (0.0, *edges)
+    words = [f"{low:g}\u2013{high:g}" for low, high in itertools.pairwise(ends)] + [f"> {ends[-1]:g}"]
+    return pl.col(column).replace_strict(dict(enumerate(words)), return_dtype=pl.String)
 
 
 def _label(labels: Mapping[str, str], *, of: str = "group") -> pl.Expr:
@@ -159,10 +254,7 @@ def _frame(chart: Chart, rows: int) -> Chart:
 
 _MOST_SWAPS = 4
 _FEWEST = 2
-_ABOUT_PAIRS = (
-    "Whole runs are permuted where a side has several, blocks where each side is one run; p corrected over "
-    "all pairs of the same unit"
-)
+_ABOUT_PAIRS = "A run is the unit; where every dataset is one run, blocks of it are"
 _SHOWN = (
     "transitory_median_modulus", "steady_median_modulus", "median_window_norm", "published_norm",
     "drivetrain_mean_square", "ground_mean_square", "cross_mean_square", "height_rate",
@@ -179,30 +271,35 @@ _DATASETS = (
     Column("cross", number=True), Column("height rate", "m/s", number=True),
     Column("largest energy", "J", number=True),
 )  # fmt: skip
+_RATIOS = (
+    Column("pair"), Column("as driven"), Column("equal driving"), Column("of it driving", number=True),
+    Column("in common"), Column("carried by"),
+)  # fmt: skip
 _PAIRS = (
     Column("pair"), Column("shift b \u2212 a", "m/s", number=True), Column("95 % interval", number=True),
     Column("Cliff\u2019s delta"), Column("p corrected", number=True), Column("p of the pair", number=True),
-    Column("smallest p", number=True), Column("verdict"), Column("unit"),
+    Column("spread", number=True), Column("method"),
 )  # fmt: skip
 
 
 def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
     """Render the complete page as HTML, with these of its notes."""
     shown = answer.datasets.filter(pl.col("input") == answer.input)
-    facts = [
-        f"{shown.height} datasets",
-        f"{shown['runs'].sum()} runs",
-        f"slip {INPUT_WORDS[answer.input]}",
-        answer.measure,
-    ]
+    facts = [f"{shown.height} datasets", f"{shown['runs'].sum()} runs", answer.measure]
+    pictures = list_pictures(answer)
+    published = [picture for picture in pictures if picture.id == _PUBLISHED]
     return render_figures(
         "report/templates/comparison.html",
-        list_pictures(answer),
+        pictures,
         title="Deployments compared",
         facts=facts,
-        verdict=_format_verdict(answer.comparisons),
+        answers=_list_answers(answer),
+        main_pictures=[picture for picture in pictures if picture.id != _PUBLISHED],
+        ratios=[table for name in answer.inputs if (table := _tabulate_ratios(answer, name))],
+        published=published,
+        unit=ABOUT_UNIT,
         datasets=_tabulate_datasets(shown, answer.input),
-        pairs=_tabulate_pairs(answer.comparisons),
+        pairs=[table for view in answer.views if (table := _tabulate_pairs(view))],
         difficulty=tabulate_difficulty(shown),
         swaps=list_contradictions(shown),
         measures=list(MEASURES.values()),
@@ -212,34 +309,67 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
     )
 
 
+def _list_answers(answer: Answer) -> list[dict[str, object]]:
+    """The answer's lines under what they are about."""
+    answers: dict[str, list[Line]] = {}
+    for line in list_lines(answer):
+        answers.setdefault(title_line(line), []).append(line)
+    return [{"title": title, "lines": lines} for title, lines in answers.items()]
+
+
+_PUBLISHED = "window_norms_by_dataset"
+_TITLES = {
+    AS_DRIVEN: "How hard it was, as driven",
+    EQUAL_DRIVING: "How hard the ground is, at equal driving",
+    AS_PUBLISHED: "Median over runs, as published",
+}
+
+
 def list_pictures(answer: Answer) -> list[Picture]:
-    """The published figure and the one with intervals over runs."""
-    input_name = answer.input
-    boxes = answer.windows.filter(pl.col("input") == input_name)
-    own = answer.runs.filter(pl.col("input") == input_name)
-    published = answer.quantity == "published_norm"
+    """Levels of every comparison, the driving, and the published figure."""
     pictures = []
-    if not boxes.is_empty():
-        words = "of the published chain" if published else INPUT_WORDS[input_name]
-        drawing = draw_boxes(boxes, input_name, title=f"2 s window norm {words} [m/s]")
-        pictures.append(Picture("window_norms_by_dataset", "The published figure", drawing))
-    rated = answer.intervals.filter(pl.col("value").is_not_null()).sort("value")
-    if not rated.is_empty():
-        title = (
-            "window norm of the published chain [m/s]"
-            if published
-            else f"{answer.measure} {INPUT_WORDS[input_name]} [m/s]"
+    for view in answer.views:
+        own = answer.runs.filter(pl.col("input") == view.input).with_columns(
+            pl.col(view.quantity).alias("value")
         )
-        drawing = draw_runs(own, rated, value=answer.quantity, title=title)
-        pictures.append(Picture("run_medians_by_dataset", "Median over runs", drawing))
+        if view.levels.is_empty():
+            continue
+        words = INPUT_WORDS[view.input]
+        title = f"{answer.measure if view.quantity != EQUAL_DRIVING else 'slip modulus'} {words} [m/s]"
+        name = f"{view.quantity}_{view.input}"
+        drawing = draw_levels(own, view.levels, name=name, title=title)
+        pictures.append(Picture(name, f"{_TITLES[view.quantity]}, {words}", drawing, width="half"))
+    if not answer.bins.is_empty():
+        datasets = [name for family in answer.families.values() for name in family]
+        title = f"Equal driving: the same place in every panel, {INPUT_WORDS[answer.input]}"
+        pictures.append(Picture("driving", title, draw_driving(answer.bins, answer.input, datasets)))
+    boxes = answer.windows.filter(pl.col("input") == answer.input)
+    if not boxes.is_empty():
+        published = answer.quantity == AS_PUBLISHED
+        words = "of the published chain" if published else INPUT_WORDS[answer.input]
+        drawing = draw_boxes(boxes, answer.input, title=f"2 s window norm {words} [m/s]")
+        pictures.append(Picture(_PUBLISHED, "The published figure", drawing))
     return pictures
 
 
-def _format_verdict(comparisons: pl.DataFrame) -> str:
-    if comparisons.is_empty():
-        return "No pair of datasets is tested."
-    counts = count_pairs(comparisons.to_dicts())
-    return f"{counts} Level {format_share(LEVEL)}, corrected for multiple comparisons."
+def _tabulate_ratios(answer: Answer, input_name: str) -> Table | None:
+    """One line a pair: ratios as driven and at equal driving."""
+    rows: list[list[str | Cell]] = [
+        [
+            f"{pair.hard} / {pair.easy}",
+            Cell(pair.driven or MISSING, tag="b" if pair.is_driven_sure else ""),
+            Cell(pair.equal or MISSING, tag="b" if pair.is_equal_sure else ""),
+            f"{pair.driving} \u00d7" if pair.driving else MISSING,
+            pair.common or MISSING,
+            pair.carrier or MISSING,
+        ]
+        for pair in list_pairs(answer, input_name)
+    ]
+    if not rows:
+        return None
+    columns = [i for i in range(len(_RATIOS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
+    caption = f"Times as much slip, {INPUT_WORDS[input_name]}; bold: significant over all pairs"
+    return Table(caption, [_RATIOS[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 
 def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
@@ -264,36 +394,32 @@ def _tabulate_datasets(shown: pl.DataFrame, input_name: str) -> Table:
     return Table(caption, [_DATASETS[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 
-def _tabulate_pairs(comparisons: pl.DataFrame) -> Table | None:
-    if comparisons.is_empty():
-        return None
-    rows = [
+def _tabulate_pairs(view: View) -> Table | None:
+    """Tests of the pairs of a comparison, in full."""
+    rows: list[list[str | Cell]] = [
         [
             Cell(f"a {row['a']}", notes=[f"b {row['b']}", f"{row['runs_a']} + {row['runs_b']} runs"]),
             format_number(row["shift"]),
             _format_ends(row),
             f"{format_number(row['cliffs_delta'], digits=2)} {row['size']}",
-            _format_p(row["p_adjusted"]),
+            Cell(_format_p(row["p_adjusted"]), tag="b" if judge_pair(row) == DIFFERENT else ""),
             _format_p(row["p"]),
-            _format_p(row["smallest_p"]),
-            _format_pair(row),
-            "runs" if row["unit_of_analysis"] == "runs" else "run\u00a0against\u00a0run",
+            MISSING if row["spread"] is None else f"{row['spread']:.2g} ({row['freedom']})",
+            Cell(
+                row["method"] or row["note"] or MISSING, small=ABOUT_BLOCKS * (judge_pair(row) == OF_TWO_RUNS)
+            ),
         ]
-        for row in comparisons.sort("p_adjusted", "p").iter_rows(named=True)
+        for row in view.comparisons.sort("p_adjusted", "p", "a", "b", nulls_last=True).iter_rows(named=True)
     ]
-    return Table(_ABOUT_PAIRS, _PAIRS, rows)
+    if not rows:
+        return None
+    caption = f"{_TITLES[view.quantity]}, {INPUT_WORDS[view.input]}. {_ABOUT_PAIRS}"
+    return Table(caption, _PAIRS, rows)
 
 
-def _format_pair(row: Mapping[str, object]) -> str | Cell:
-    verdict = judge_pair(row)
-    if verdict == DIFFERENT:
-        return Cell("different", tag="b")
-    if verdict == OF_TWO_RUNS:
-        return "different as two single runs"
-    return "too few runs for a test" if verdict == TOO_FEW else "no significant difference"
-
-
-def _format_p(p: float) -> str:
+def _format_p(p: float | None) -> str:
+    if p is None:
+        return MISSING
     return f"{p:.4f}" if p >= 1e-4 else "< 0.0001"  # noqa: PLR2004 - as many digits as are shown
 
 
@@ -352,9 +478,3 @@ def list_contradictions(shown: pl.DataFrame) -> list[str]:
 
 def _rate(shown: pl.DataFrame) -> pl.DataFrame:
     return shown.drop_nulls("median_modulus").sort("median_modulus")
-
-
-# Comparison of datasets on one offline page.
-#
-# The published figure (all windows of a dataset in one box), the statistically valid one beside it (runs as
-# points, with an interval over runs), the pairs with their tests, and the measures of difficulty.

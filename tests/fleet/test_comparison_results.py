@@ -9,6 +9,7 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
+from pipeline.fleet.equal_driving import Overlap
 from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders
 from pipeline.job.compare import Question, compare_results, write_answer
 from pipeline.store import Store
@@ -143,24 +144,63 @@ def test_the_same_question_gets_the_same_bytes(store: Store) -> None:
     assert first == second
 
 
-@pytest.mark.parametrize("others", [6, 7])
-def test_pairs_with_too_few_runs_take_nothing_from_those_with_enough(others: int) -> None:
-    """By closed testing of eight groups, and after Holm for nine."""
-    rng = np.random.default_rng(0)
+def make_group(name: str, *medians: float) -> Group:
     ticks = np.arange(40)
+    return Group.of_runs(
+        name, [Samples(np.full(40, one), ticks, np.zeros_like(ticks), 40.0) for one in medians]
+    )
 
-    def make(level: float) -> Samples:
-        median = level * float(np.exp(rng.normal(0.0, 0.3)))
-        return Samples(np.full(40, median), ticks, np.zeros_like(ticks), 40.0)
 
-    many = [Group(name, tuple(make(level) for _ in range(7))) for name, level in (("a", 0.5), ("b", 0.9))]
-    few = [Group(f"few{i}", (make(10.0 ** (i % 3 - 1)),)) for i in range(others)]
-    pairs = compare_groups([*many, *few])
-    (pair,) = (one for one in pairs if {one.a.name, one.b.name} == {"a", "b"})
-    assert pair.p_adjusted == pair.comparison.test.p < 0.05
-    hopeless = [one for one in pairs if one.unit == "runs" and one is not pair]
-    assert len(hopeless) == 2 * others
-    assert all(one.p_adjusted > 0.05 and "cannot be significant" in one.note for one in hopeless)
+def test_a_ground_with_one_run_is_tested_by_the_spread_of_the_others() -> None:
+    groups = [
+        make_group("asphalt", 0.5, 0.55, 0.45),
+        make_group("gravel", 0.52, 0.57, 0.5),
+        make_group("ice", 2.0),
+    ]
+    pairs = {(one.a.name, one.b.name): one for one in compare_groups(groups)}
+    ice = pairs["asphalt", "ice"]
+    assert ice.unit == "runs"
+    assert ice.freedom == 4
+    assert "Tukey-Kramer over 3 pairs" in ice.method
+    assert ice.p_adjusted is not None
+    assert ice.p_adjusted < 0.01
+    assert ice.ratio is not None
+    assert ice.ratio.low is not None
+    assert ice.ratio.high is not None
+    assert 1.0 < ice.ratio.low < 4.0 < ice.ratio.high
+    assert pairs["asphalt", "gravel"].p_adjusted > 0.5
+
+
+def test_runs_alone_are_compared_by_their_blocks_and_only_with_each_other() -> None:
+    rng = np.random.default_rng(0)
+    ticks = np.arange(4_000)
+    groups = [
+        Group.of_runs(name, [Samples(rng.lognormal(level, 0.5, 4_000), ticks, np.zeros_like(ticks), 40.0)])
+        for name, level in (("a", 0.0), ("b", 1.0))
+    ]
+    (pair,) = compare_groups(groups)
+    assert pair.unit == "blocks"
+    assert pair.p_adjusted is not None
+    assert pair.p_adjusted < 0.01
+    assert "not between terrains" in pair.note
+    (levels,) = compare_groups([Group(one.name, one.values) for one in groups])
+    assert levels.p is None, "levels of single runs have no spread"
+    assert levels.ratio is not None
+    assert levels.ratio.low is None
+
+
+def test_without_driving_in_common_there_is_no_number() -> None:
+    groups = [make_group(name, 1.0, 1.1) for name in ("a", "b", "c")]
+    overlaps = {
+        frozenset(names): Overlap(bins, share)
+        for names, bins, share in (("ab", 3, 0.5), ("bc", 0, 0.0), ("ac", 1, 0.1))
+    }
+    pairs = {one.a.name + one.b.name: one for one in compare_groups(groups, overlaps=overlaps)}
+    assert pairs["bc"].ratio is None
+    assert pairs["bc"].p_adjusted is None
+    assert pairs["bc"].note == "no driving in common, no number"
+    assert pairs["ab"].ratio is not None
+    assert pairs["ab"].overlap == Overlap(3, 0.5)
 
 
 def test_simulated_runs_are_never_pooled_with_recordings(store: Store) -> None:

@@ -92,7 +92,7 @@ JSON = {
     "effects": ("effects", "drive_lag"),
 }
 SEASON = {
-    "compare.txt": [("compare",), ("compare", "--by", "run"), ("compare", "--causes")],
+    "compare.txt": [("compare", "--by", "run"), ("compare",), ("compare", "--causes")],
     "fleet.txt": [
         ("fleet", "fit"),
         ("fleet", "show"),

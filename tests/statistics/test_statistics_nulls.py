@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline.fleet.confidence import bootstrap_median, bound_typical, compare_runs, cut_blocks
+from pipeline.fleet.confidence import bootstrap_median, cut_blocks
 from pipeline.fleet.joint_levels import find_changes
+from pipeline.fleet.pooled_tests import Difference, MeansTest, bound_levels, compare_means
 from pipeline.fleet.rank_tests import (
     adjust_holm,
     adjust_max_t,
@@ -32,26 +33,32 @@ def rejections_allowed(level: float, repetitions: int) -> tuple[float, float]:
     return level - 2.6 * error, level + 2.6 * error
 
 
-def compare_once(runs: int, rng: np.random.Generator, *, seconds: float, memory: float, factor: float = 1.0):  # noqa: ANN201
+def compare_once(
+    runs: int, rng: np.random.Generator, *, seconds: float, memory: float, factor: float = 1.0
+) -> Difference:
     sides = [
-        np.median(
-            simulate_runs(runs, seconds=seconds, memory=memory, spread=SPREAD, rng=rng, median=median), axis=1
+        np.log(
+            np.median(
+                simulate_runs(runs, seconds=seconds, memory=memory, spread=SPREAD, rng=rng, median=median),
+                axis=1,
+            )
         )
         for median in (1.0, factor)
     ]
-    return compare_runs(*sides)
+    (difference,) = compare_means(sides, [(0, 1)]).differences
+    return difference
 
 
-@pytest.mark.parametrize(("runs", "attainable"), [(3, 0.0), (4, 2 / 70), (5, 12 / 252)])
+@pytest.mark.parametrize(("runs", "attainable"), [(3, 0.05), (4, 2 / 70), (5, 12 / 252)])
 def test_whole_runs_are_rejected_at_the_attainable_level(runs: int, attainable: float) -> None:
     rng = np.random.default_rng(100 + runs)
     repetitions = 800
     found = [compare_once(runs, rng, seconds=30.0, memory=1.0) for _ in range(repetitions)]
-    rate = np.mean([one.test.p <= 0.05 for one in found])
+    rate = np.mean([one.p <= 0.05 for one in found])
     low, high = rejections_allowed(attainable, repetitions)
     assert low <= rate <= high
     covered = [one.interval is None or one.interval.low <= 0.0 <= one.interval.high for one in found]
-    assert np.mean(covered) == pytest.approx(1.0 - rate), "three runs a side exclude no difference"
+    assert np.mean(covered) == pytest.approx(1.0 - rate), "an interval excludes what its test rejects"
 
 
 @pytest.mark.parametrize(("first", "second"), [(4, 4), (6, 3), (7, 7)])
@@ -59,10 +66,10 @@ def test_intervals_of_a_difference_hold_it(first: int, second: int) -> None:
     rng = np.random.default_rng(first)
     hits = []
     for _ in range(400):
-        a, b = (np.exp(rng.normal(level, 0.3, count)) for level, count in ((0.0, first), (0.5, second)))
-        found = compare_runs(a, b).interval
+        sides = [rng.normal(level, 0.3, count) for level, count in ((0.0, first), (0.5, second))]
+        found = compare_means(sides, [(0, 1)]).differences[0].interval
         assert found is not None
-        hits.append(found.low <= math.exp(0.5) - 1.0 <= found.high)
+        hits.append(found.low <= 0.5 <= found.high)
     assert 0.92 <= np.mean(hits) <= 0.99
 
 
@@ -72,7 +79,8 @@ def test_intervals_over_runs_hold_the_truth(runs: int) -> None:
     hits = []
     for _ in range(600):
         medians = np.median(simulate_runs(runs, seconds=30.0, memory=1.0, spread=SPREAD, rng=rng), axis=1)
-        found = bound_typical(medians)
+        (found,) = bound_levels([medians])
+        assert found is not None
         hits.append(found.low <= 1.0 <= found.high)
     assert 0.92 <= np.mean(hits) <= 0.97
 
@@ -149,14 +157,39 @@ def test_a_family_with_pairs_that_never_count_gives_a_false_alarm_once_in_twenty
     assert np.mean(by_holm) <= most
 
 
+def alarms(groups: list[np.ndarray]) -> MeansTest:
+    return compare_means(groups, list(combinations(range(len(groups)), 2)))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "spreads", "method"),
+    [
+        ((3, 2, 2, 1, 1), (0.2,) * 5, "Tukey-Kramer"),
+        ((3, 1), (0.2, 0.2), "Tukey-Kramer"),
+        ((3, 3, 3), (0.2,) * 3, ""),
+        ((9, 7), (0.02, 0.5), "Games-Howell"),
+    ],
+)
+def test_grounds_that_are_one_alarm_once_in_twenty(
+    sizes: tuple[int, ...], spreads: tuple[float, ...], method: str
+) -> None:
+    rng = np.random.default_rng([len(sizes), *sizes])
+    repetitions = 200
+    found = [
+        alarms([rng.normal(0.0, spread, size) for size, spread in zip(sizes, spreads, strict=True)])
+        for _ in range(repetitions)
+    ]
+    rate = np.mean([min(one.p_adjusted for one in test.differences) <= 0.05 for test in found])
+    low, high = rejections_allowed(0.05, repetitions)
+    assert low <= rate <= high
+    assert np.mean([test.method.startswith(method) for test in found]) > 0.9
+
+
 def test_power_grows_with_the_difference_and_the_runs() -> None:
     rng = np.random.default_rng(8)
     power = {
         (runs, factor): np.mean(
-            [
-                compare_once(runs, rng, seconds=120.0, memory=1.0, factor=factor).test.p <= 0.05
-                for _ in range(150)
-            ]
+            [compare_once(runs, rng, seconds=120.0, memory=1.0, factor=factor).p <= 0.05 for _ in range(150)]
         )
         for runs in (4, 6)
         for factor in (1.2, 1.7)
@@ -185,6 +218,6 @@ def test_long_nulls_at_every_memory() -> None:
             rejected.append(test.p <= 0.05)
         assert np.mean(rejected) <= rejections_allowed(0.05, repetitions)[1]
     for runs, attainable in ((4, 2 / 70), (5, 12 / 252)):
-        found = [compare_once(runs, rng, seconds=120.0, memory=1.0).test.p <= 0.05 for _ in range(2_000)]
+        found = [compare_once(runs, rng, seconds=120.0, memory=1.0).p <= 0.05 for _ in range(2_000)]
         low, high = rejections_allowed(attainable, 2_000)
         assert low <= np.mean(found) <= high
