@@ -20,15 +20,6 @@ MISSES = {
     "tests/stages/test_stages_recordings.py::test_a_recording_gives_its_known_numbers_and_its_known_faults"
     "[warthog_wheels_gravel_2024_8_6_11h37s32]":
         "one test of blocks finds no bad stretch where the older rule found one",
-    "tests/stages/test_wiring.py::test_a_wrong_line_of_the_configuration_is_corrected_or_told"
-    "[text2-command_reversed-angular.z or of the steering is inverted]":
-        "the contradiction is told, but not that the command is the wrong one of the two",
-    "tests/stages/test_wiring.py::test_poses_in_north_east_down_are_not_taken_for_a_wrong_command"
-    "[husky_body_command-changes3-command_reversed-words3]":
-        "the contradiction is told, but not that the command is the wrong one of the two",
-    "tests/stages/test_wiring.py::test_poses_in_north_east_down_are_not_taken_for_a_wrong_command"
-    "[husky_body_command-changes5-command_reversed-words5]":
-        "the contradiction is told, but not that the command is the wrong one of the two",
     "tests/estimation/test_diagnosis.py::"
     "test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a_model_file":
         "the errors of the pasted file differ from those promised by 1 %",
