@@ -17,9 +17,6 @@ MISSES = {
         "the heading's delay is .076 to .087 s in place of .1 s: steps of .25 s say little of a clock",
     "tests/models/test_motion_fit.py::test_every_rung_is_what_its_effects_are_as_a_model":
         "a rung starts from the larger model's values and ends within rounding of another fit",
-    "tests/stages/test_stages_recordings.py::test_a_recording_gives_its_known_numbers_and_its_known_faults"
-    "[warthog_wheels_gravel_2024_8_6_11h37s32]":
-        "one test of blocks finds no bad stretch where the older rule found one",
     "tests/estimation/test_diagnosis.py::"
     "test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a_model_file":
         "the errors of the pasted file differ from those promised by 1 %",
