@@ -14,9 +14,7 @@ from pipeline.stages.spans import find_spans
 STEP_S = 0.05
 
 
-def find(
-    command: Floats, is_stopped: Flags, times: Floats | None = None
-) -> list[tuple[str, float, float]]:
+def find(command: Floats, is_stopped: Flags, times: Floats | None = None) -> list[tuple[str, float, float]]:
     """Incidents of a vehicle that follows its commands, but for some time."""
     vehicle = find_preset("husky_a200")
     assert vehicle is not None
