@@ -583,7 +583,7 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 14, "velocity": 7, "slip": 15, "aggregate": 4}
+VERSIONS: Mapping[str, int] = {"extract": 14, "velocity": 7, "slip": 16, "aggregate": 4}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": (*EXTRACTED, "alignments"),
