@@ -6,8 +6,10 @@ import hashlib
 import json
 import math
 import os
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Literal
 
@@ -109,15 +111,20 @@ def set_up_log(path: Path, options: Options, index: LogIndex | None = None) -> L
     _require_sources(chosen.sources, index, options)
     if chosen.recording is not None:
         configuration = chosen.recording.configuration
-    chosen = replace(chosen, findings=(*chosen.findings, *_list_unused(index, chosen.sources)))
+    chosen = _report_unused(chosen, index)
     vehicle = chosen.vehicle
     terrain = configuration.run.terrain or recorded.get("terrain") or UNKNOWN
     dataset = configuration.run.dataset or f"{vehicle.id}_{terrain}"
     return LogSetup(path, index, configuration, vehicle, terrain, dataset, chosen.sources, chosen)
 
 
+def _report_unused(chosen: Choice, index: LogIndex) -> Choice:
+    """The choice with findings on what might be wheels or commands, and is not used."""
+    return replace(chosen, findings=(*chosen.findings, *_list_unused(index, chosen.sources)))
+
+
 def _list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
-    """Findings on topics of two numbers a message that may be those of a left and a right wheel."""
+    """Findings on numbers that may be those of a left and a right wheel, and whose type does not say so."""
     drives = [drive for drive in (sources.command, sources.wheels) if drive is not None]
     used = {signal.topic for drive in drives for signal in drive.signals}
     fields = {
@@ -141,7 +148,31 @@ def _list_unused(index: LogIndex, sources: Sources) -> list[Finding]:
         )
         severity: Severity = "info" if getattr(sources, role) else "warning"
         findings.append(Finding("numbers_not_used", severity, text, where=topic))
-    return findings
+    return findings if sources.wheels is not None else [*findings, *_list_sides(index, used)]
+
+
+_OF_A_WHEEL = re.compile("wheel|motor|rpm|tick|encoder|count|speed|vel")
+_MOST_SIDES = 3
+"""Maximum number of pairs that are named."""
+
+
+def _list_sides(index: LogIndex, used: Collection[str]) -> Iterator[Finding]:
+    """Findings on pairs of numbers that are named as those of left and right wheels, of unknown types."""
+    unknown = {
+        topic: paths
+        for topic, paths in list_fields(index).items()
+        if topic not in used and find_type(index.types.get(topic, "")) == MessageType()
+    }
+    numbers = {f"{topic}.{path}": topic for topic, paths in unknown.items() for path in paths}
+    pairs = ((left, left.replace("left", "right")) for left in numbers if "left" in left)
+    named = ((left, right) for left, right in pairs if right in numbers and _OF_A_WHEEL.search(left.lower()))
+    for left, right in islice(named, _MOST_SIDES):
+        text = (
+            f"not used: {left} and {right}, whose meaning is not known; if they are the left and right "
+            f'wheels, in run.toml: [wheels] left_topic = "{left}"; right_topic = "{right}"; unit = "rad/s" '
+            '(or "m/s", "rpm", "rad", "ticks" with per_turn)'
+        )
+        yield Finding("numbers_not_used", "warning", text, where=numbers[left])
 
 
 def _require_messages(index: LogIndex) -> None:
@@ -416,7 +447,7 @@ def _choose(
         _require_sources(chosen.sources, index, options)
     except SlipError as error:
         return chosen or _choose_by_name(index, configuration), error
-    return chosen, None
+    return _report_unused(chosen, index), None
 
 
 def _choose_by_name(index: LogIndex, configuration: Configuration) -> Choice | None:
@@ -552,7 +583,7 @@ def _format(vehicle: Vehicle, names: Sequence[str]) -> str:
 # A key is a hash of the previous stage's key, of the stage's own configuration and of the stage's version.
 # The version must be incremented with every change of what the stage computes.
 
-VERSIONS: Mapping[str, int] = {"extract": 14, "velocity": 7, "slip": 15, "aggregate": 4}
+VERSIONS: Mapping[str, int] = {"extract": 14, "velocity": 7, "slip": 16, "aggregate": 4}
 EXTRACTED = ("commands", "wheels", "poses", "imu", "power")
 TABLES: Mapping[str, tuple[str, ...]] = {
     "extract": (*EXTRACTED, "alignments"),

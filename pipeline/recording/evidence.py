@@ -8,7 +8,7 @@ gains and a free delay; names and types are priors in the same unit (nats).
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Literal
@@ -130,12 +130,18 @@ def find_reversed(signs: Mapping[tuple[str, Axis], int]) -> Reversal:
     if all(sign > 0 for sign in known.values()):
         return Reversal()
     there = {signal for signal, _ in known}
-    usable = [name for name in _FAULTS if name.split("_")[0] in {"pose", *there}]
+    axes = {"ahead", "turned", *(axis for _, axis in known)}
+    # Of a base that does not move to the side, faults that differ in that only are one.
+    usable: dict[frozenset[tuple[str, Axis]], str] = {}
+    for name, (reversed_by_it, _) in _FAULTS.items():
+        part = frozenset(key for key in reversed_by_it if key[1] in axes)
+        if part and name.split("_")[0] in {"pose", *there}:
+            usable.setdefault(part, name)
     matches: list[tuple[float, tuple[str, ...]]] = []
     for count in (1, 2, 3):
-        for names in combinations(usable, count):
-            parts = [_FAULTS[name][0] for name in names]
+        for parts in combinations(usable, count):
             if all(_sign_of(key, parts) == sign for key, sign in known.items()):
+                names = tuple(usable[part] for part in parts)
                 matches.append((sum(_FAULTS[name][1] for name in names), names))
     if not matches:
         return Reversal()
@@ -144,9 +150,8 @@ def find_reversed(signs: Mapping[tuple[str, Axis], int]) -> Reversal:
     return Reversal(best[0], tuple(best[1:]))
 
 
-def _sign_of(key: tuple[str, Axis], parts: Iterable[frozenset[tuple[str, Axis]]]) -> int:
+def _sign_of(key: tuple[str, Axis], parts: Sequence[frozenset[tuple[str, Axis]]]) -> int:
     """Sign that a signal would have against the pose with these faults."""
-    parts = list(parts)
     count = sum(key in part for part in parts) + sum(("pose", key[1]) in part for part in parts)
     return -1 if count % 2 else 1
 

@@ -33,9 +33,13 @@ def unknown_name(kind: str, name: str, known: list[str]) -> SimulateError:
         known: the names that exist.
 
     Returns:
-        An error with code ``unknown_<kind>`` whose hint lists the names, nearest first.
+        An error with code ``unknown_<kind>`` whose hint says the nearest names, and all of them or what lists
+        them.
     """
-    hint = f"{guess_names(name, known)}Known: {', '.join(known)}"
+    every = f"Known: {', '.join(known)}"
+    if kind in {"case", "effect"}:
+        every = f"`slip simulate --cases` lists every {kind}."
+    hint = f"{guess_names(name, known)}{every}"
     return SimulateError(f"unknown_{kind}", f"there is no {kind} '{name}'", hint=hint)
 
 

@@ -128,8 +128,9 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
             return [Finding("unit_wrong", "error", text, where="wheels", value=gain)]
     radius = vehicle.wheel_radius_m
     text = (
-        f"the vehicle covers {gain:.3g} times the distance of wheels with a radius of {radius:g} m: if the "
-        f"radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another --vehicle"
+        f"the vehicle covers {format_share(gain)} of the distance that wheels with a radius of {radius:.3g} "
+        f"m roll: if the radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another "
+        f"--vehicle (in the controller: a wheel radius multiplier of {gain:.2g})"
     )
     return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
 

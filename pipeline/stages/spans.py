@@ -231,13 +231,15 @@ class _Blocks:
     """
 
     def __init__(self, times: Floats) -> None:
-        breaks = np.append(True, np.diff(times) > 1.5 * float(np.median(np.diff(times))))
+        period = float(np.median(np.diff(times)))
+        # Where the poses jump, two segments may overlap.
+        breaks = np.append(True, np.abs(np.diff(times) - period) > 0.5 * period)
         number = number_stretches(times - times[0], BLOCK_S)
         begins = np.flatnonzero(breaks | np.append(True, np.diff(number) != 0))
         self._begins, self._sizes = begins, np.diff(np.append(begins, times.size))
         self.start, self.end = times[begins], times[begins + self._sizes - 1]
         self.is_first = breaks[begins]
-        self.is_whole = self._sizes > 0.5 * float(np.max(self._sizes))
+        self.is_whole = self._sizes > 0.5 * BLOCK_S / period
 
     def average(self, values: Floats) -> Floats:
         """Means of some columns, shape (m, k)."""

@@ -13,6 +13,7 @@ from drawn_drives import (
     extract_drawn,
     read_findings,
     record_cdr,
+    record_json,
     record_twist,
     write_drawn,
 )
@@ -73,3 +74,32 @@ def test_without_commands_such_a_topic_may_be_named(tmp_path: Path) -> None:
     with pytest.raises(SlipError, match=r"Name it in run\.toml") as caught:
         extract_drawn(log)
     assert caught.value.code == "no_command"
+
+
+@pytest.mark.parametrize("split", [False, True], ids=["one message", "two topics"])
+def test_left_and_right_numbers_of_an_unknown_type_are_named_with_the_lines_that_use_them(
+    split: bool,  # noqa: FBT001
+    tmp_path: Path,
+) -> None:
+    drive = draw_drive()
+    speeds = wheel_speeds(drive)
+    if split:
+        names = ("/left_ticks.data", "/right_ticks.data")
+        counts = np.cumsum(speeds, axis=0).astype(np.int64)
+        topics = [
+            record_cdr(drive, name.removesuffix(".data"), "std_msgs/msg/Int64", {"data": values})
+            for name, values in zip(names, counts.T, strict=True)
+        ]
+    else:
+        names = ("/wheels.left_speed", "/wheels.right_speed")
+        fields = [{"left_speed": left, "right_speed": right} for left, right in speeds.tolist()]
+        topics = [record_json(drive, "/wheels", "own.Wheels", fields)]
+    pose = record_cdr(drive, "/icp", POSE, drive.pose("pose."))
+    log = write_drawn(tmp_path / "run.mcap", record_twist(drive), pose, *topics)
+    said = read_findings(log)["numbers_not_used"]
+    left, right = (f'{side}_topic = "{name}"' for side, name in zip(("left", "right"), names, strict=True))
+    assert f"[wheels] {left}; {right}" in said
+    unit = 'unit = "ticks"\nper_turn = 1000' if split else 'unit = "rad/s"'
+    (tmp_path / "run.toml").write_text(f"[wheels]\n{left}\n{right}\n{unit}", encoding="utf-8")
+    assert not extract_drawn(log, "wheels").is_empty()
+    assert "numbers_not_used" not in read_findings(log)

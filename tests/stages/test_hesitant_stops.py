@@ -14,11 +14,11 @@ from pipeline.stages.spans import find_spans
 STEP_S = 0.05
 
 
-def find(command: Floats, is_stopped: Flags) -> list[tuple[str, float, float]]:
+def find(command: Floats, is_stopped: Flags, times: Floats | None = None) -> list[tuple[str, float, float]]:
     """Incidents of a vehicle that follows its commands, but for some time."""
     vehicle = find_preset("husky_a200")
     assert vehicle is not None
-    times = np.arange(command.size) * STEP_S
+    times = np.arange(command.size) * STEP_S if times is None else times
     follows = np.where(is_stopped, 0.0, command)
     flags = np.zeros(command.size, dtype=bool)
     asked, driven = (np.outer(one, [1.0, 0.0, 0.0]) for one in (command, follows))
@@ -47,3 +47,14 @@ def test_commands_that_never_move_it_show_no_stop() -> None:
     times = np.arange(0.0, 100.0, STEP_S)
     command = np.where(times % 10.0 < 5.0, 0.5, 0.1)
     assert find(command, command < 0.2) == []
+
+
+def test_segments_that_overlap_where_the_poses_jump_hide_no_stop() -> None:
+    times = np.arange(0.0, 100.0, STEP_S)
+    twice = np.concatenate((times[times < 30.0], times[times >= 29.5]))
+    ((kind, start, end),) = find(
+        np.where(twice % 1.9 < 1.5, 0.5, 0.15), (twice >= 50.0) & (twice < 58.0), twice
+    )
+    assert kind == "emergency_stop"
+    assert abs(start - 50.0) < 1.0
+    assert abs(end - 58.0) < 1.0
