@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from functools import cache
@@ -16,7 +15,7 @@ from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import Excitation, KinematicEffect, Late
-from pipeline.models.formula import parse_expression
+from pipeline.models.expression import parse_expression
 from pipeline.models.parameter import parse_unit
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
@@ -70,7 +69,7 @@ def test_neutral_parameters_change_nothing_bit_for_bit(effect: type[Effect]) -> 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
 def test_the_page_names_formula_parameters_units_and_source(effect: type[Effect]) -> None:
-    page = inspect.getdoc(inspect.getmodule(effect)) or ""
+    page = effect.find_page()
     assert "Source: " in page
     assert re.search(r"^ {4}\S", page, flags=re.MULTILINE), "the page has no indented formula"
     for parameter in effect.parameters:
@@ -103,7 +102,9 @@ UNITS = {
     "v0": "m/s",
     "w0": "rad/s",
     "s0": "m/s",
-    "w": "rad/s",
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "v_w": "rad/s",
     "turning": "1",
     "pitch": "rad",
     "roll": "rad",
@@ -113,7 +114,7 @@ UNITS = {
     "l": "m",
     "delta": "rad",
 }
-FORMULA = re.compile(r"(v0|w0|s0|v_[xyw])\s*(\+?=)\s*([^,]+?)(?=,\s| {2}|$)", re.MULTILINE)
+FORMULA = re.compile(r"(v0|w0|s0|v_[xyw]) (\+?=) (.+)$", re.MULTILINE)
 # A change of terrain begins at a place or a moment, play remembers: no formula of a moment.
 UNWRITTEN = ("terrain_change", "steering_sensor_play")
 WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) and e.id not in UNWRITTEN]
@@ -144,7 +145,9 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         "v0": v0,
         "w0": w0,
         "s0": s0,
-        "w": velocity.w,
+        "v_x": velocity.x,
+        "v_y": velocity.y,
+        "v_w": velocity.w,
         "turning": find_turning(wheels, around),
         "pitch": around.attitude[:, 1],
         "roll": around.attitude[:, 0],
@@ -154,7 +157,7 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         "l": around.vehicle.wheelbase_m or 1.0,
         "delta": wheels.steering,
     }
-    page = inspect.getdoc(inspect.getmodule(effect)) or ""
+    page = effect.find_page()
     found = FORMULA.findall("\n".join(line for line in page.splitlines() if line.startswith("    ")))
     assert found, "the page has no formula that could be compared"
     if isinstance(chosen, LinearEffect):
@@ -165,12 +168,10 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         assert isinstance(chosen, KinematicEffect)
         rolled = chosen.roll(rolling, around)
         results = {"v0": rolled.v0, "s0": rolled.s0, "w0": rolled.w0}
-    for name, sign, text in found:
+    for name, _, text in found:
         expression = parse_expression(text, known, effect.id)
         assert expression.unit == parse_unit("m/s" if name in {"v0", "s0", "v_x", "v_y"} else "rad/s", "")
-        expected = np.asarray(expression.evaluate(values)) + (
-            values[name] if sign == "+=" and name in values else 0.0
-        )
+        expected = np.asarray(expression.evaluate(values))
         assert np.allclose(results[name], expected, rtol=1e-9, atol=1e-12), text
 
 

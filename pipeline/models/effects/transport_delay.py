@@ -36,14 +36,10 @@ class TransportDelay(CommandEffect):
             quantities=(Quantity.COMMAND_DELAY,),
         ),
     )
-    motion = "Transport delay: dead time {d:.2f} s"
-    clause = "follows commands after a dead time of {d:.2g} s"
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "turn_lag", "body_inertia")
     equivalent_to = ("clock_offset",)
     equivalent_when = "if the input is the command and there are no encoders, no gyro and no other clock"
-
-    python = ""  # the exported function reads commands with this delay
 
     def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula above."""
