@@ -17,6 +17,7 @@ from types import ModuleType
 
 from pipeline.core import guess_names, suffix_unit
 from pipeline.models.effect import Effect, Excitation, Late, Parameter, Search, find_late
+from pipeline.models.families import check_formula
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.parameter import is_of_one_run
@@ -244,6 +245,8 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
             hint="Correct it; it must be importable Python.",
         ) from error
     effects = {effect.id: effect for effect in _effects_of(module)}
+    for effect in effects.values():
+        check_formula(effect)
     if not effects:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
         raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)

@@ -216,6 +216,7 @@ class Written(Effect):
         return cls.formula.get(kind, cls.formula[""])
 
     @classmethod
+    @functools.cache
     def list_equations(cls, kind: str) -> Mapping[str, Expression]:
         """Right sides of the formula on a kind of vehicle, by the signal that each changes."""
         return _parse_equations(
@@ -263,7 +264,6 @@ def _spread(drive: _Drive, context: RunContext, name: str, added: Floats) -> _Dr
     return replace(drive, left=drive.left - half, right=drive.right + half)
 
 
-@functools.lru_cache(maxsize=256)
 def _parse_equations(
     effect: str,
     lines: tuple[str, ...],
@@ -312,6 +312,7 @@ class _WrittenTerm(Written, LinearEffect):
     adds = True
 
     @classmethod
+    @functools.cache
     def list_slopes(cls) -> Mapping[str, Mapping[str, Expression]]:
         """Derivatives of the formula by each parameter, by the signal that changes."""
         own = tuple((p.name, p.unit) for p in cls.parameters)
@@ -358,6 +359,7 @@ class Lag(Written, DriveEffect):
     has_state = True
 
     @classmethod
+    @functools.cache
     def list_lags(cls) -> list[tuple[str, str]]:
         """Time constants, and the signal that each delays: all sides of Omega, what moves sideways with M."""
         pairs = [(match[1], match[2]) for line in cls.formula[""] if (match := _LAG.fullmatch(line))]
@@ -467,8 +469,7 @@ def declare(
         facts: further attributes of `Effect`, and methods that take the place of its own.
 
     Raises:
-        MotionError: ``bad_formula``, ``unknown_signal``, ``wrong_units``; ``unknown_fact``; ``not_neutral``,
-            the formula changes something at the neutral values; ``not_linear``, a term is not linear in them.
+        MotionError: ``unknown_fact``. The formula is read when it is needed, see `check_formula`.
     """
     lines = {
         kind: tuple(line.strip() for line in text.strip().splitlines())
@@ -494,8 +495,6 @@ def declare(
             **facts,
         },
     )
-    for kind in lines if base not in {Lag, Ramp, Filtered} else ():
-        _check(made, kind)
     return made
 
 
@@ -518,13 +517,21 @@ def _choose_family(first: str, facts: Mapping[str, Any]) -> tuple[type[Written],
     return families[place], {}
 
 
-def _check(made: type[Written], kind: str) -> None:
-    """Refuse a formula that does something at neutral values, or a term that is not linear."""
+def check_formula(made: type[Effect]) -> None:
+    """Refuse a formula that cannot be; one that is not declared, a lag and a filter pass.
+
+    Raises:
+        MotionError: ``bad_formula``, ``unknown_signal``, ``wrong_units``; ``not_neutral``, it changes
+            something at the neutral values; ``not_linear``, a term is not linear in its parameters.
+    """
+    if not issubclass(made, Written) or issubclass(made, Lag | Filtered):
+        return
     generator = np.random.default_rng(1)
     signals = {name: generator.uniform(0.1, 1.0) for name in SIGNALS} | {"e_m": 0.0}
     neutral = {p.name: 0.0 if np.isnan(p.neutral) else p.neutral for p in made.parameters}
     other = {p.name: generator.uniform(0.1, 1.0) for p in made.parameters}
-    for name, expression in made.list_equations(kind).items():
+    equations = [item for kind in made.formula for item in made.list_equations(kind).items()]
+    for name, expression in equations:
         result, once, twice = (
             float(expression.evaluate({**signals, **values}))
             for values in (neutral, other, {key: 2.0 * value for key, value in other.items()})
@@ -537,6 +544,12 @@ def _check(made: type[Written], kind: str) -> None:
             what = f"{name} += {expression.text!r} is not linear in its parameters"
             hint = "Write a sum of parameters times signals, or a formula of a model file."
             raise MotionError("not_linear", what, where=made.id, hint=hint)
+
+
+def list_terms(effect: type[Effect]) -> Mapping[str, str]:
+    """What an effect adds to v_x, v_y and v_w as formulas; empty for one that is no sum of terms."""
+    equations = effect.list_equations("") if issubclass(effect, Written) and effect.adds else {}
+    return {channel: one.text.replace("^", "**") for channel, one in equations.items()}
 
 
 # Methods of effects that several have in common.

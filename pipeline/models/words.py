@@ -34,8 +34,8 @@ class Words(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     A template holds fields ``{formula:format}`` over the parameters, ``radius``, ``track`` and ``wheelbase``
     of the vehicle, and ``others``. A format is one of Python's, one of `_FORMATS`, or two words for a
-    positive and a negative number, ``left|right``. Of several templates the first applies whose numbers are all known;
-    of the last one, parts after a comma or in brackets with an unknown number are left out.
+    positive and a negative number, ``left|right``. Of several templates the first applies whose numbers are
+    all known; of the last one, parts after a comma or in brackets with an unknown number are left out.
 
     Attributes:
         motion: name, colon, and what the vehicle does.

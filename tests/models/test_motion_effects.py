@@ -11,11 +11,13 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
+from pipeline.cli.verbs_drives import list_written_effects
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression
+from pipeline.models.families import check_formula
 from pipeline.models.parameter import parse_unit
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
     from pipeline.run import MotionRun
 
 EFFECTS = list_effects()
-SIMULATED = {spec.id: spec for spec in list_simulated()}
+WRITTEN_EFFECTS = list_written_effects()
+SIMULATED = {spec.id: spec for spec in (*list_simulated(), *WRITTEN_EFFECTS)}
 KIND_OF = {"differential": "husky_a200", "ackermann": "ackermann_car", "mecanum": "youbot"}
 
 
@@ -96,6 +99,13 @@ def test_parameters_are_those_of_the_simulator(effect: type[Effect]) -> None:
 def test_what_it_is_confused_with_exists(effect: type[Effect]) -> None:
     assert set(effect.confused_with) | set(effect.equivalent_to) <= set(ids(EFFECTS)) - {effect.id}
     assert bool(effect.equivalent_to) == bool(effect.equivalent_when)
+
+
+@pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
+def test_its_formula_does_nothing_at_neutral_values_and_is_linear_where_it_is_added(
+    effect: type[Effect],
+) -> None:
+    check_formula(effect)
 
 
 UNITS = {
@@ -204,7 +214,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
         more, vehicle = more | {"vehicle": VEHICLES["warthog"]}, "warthog"
     # What only shows where fast turns stand beside slow ones, or across a slope, takes longer.
     duration_s = 240.0 if effect.id in {"speed_track", "understeer", "side_slope_turn"} else 100.0
-    run = simulate(hidden, duration_s=duration_s, **more)
+    run = simulate(hidden, duration_s=duration_s, written=WRITTEN_EFFECTS, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(vehicle), source)
     searched = tuple(kind() for kind in EFFECTS if kind.id in names)
