@@ -11,9 +11,9 @@ import copy
 import functools
 import math
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib import resources
-from typing import cast
+from typing import Any, cast
 
 import msgspec
 
@@ -22,11 +22,10 @@ from pipeline.export import Target
 from pipeline.models.catalogue import is_own
 from pipeline.models.effect import Effect, Place
 from pipeline.models.expression import Expression
-from pipeline.models.families import Filtered, Lag, Ramp, Written
+from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm, find_kind
 from pipeline.models.model import Model
-from pipeline.models.parameter import Quantity
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 
@@ -73,17 +72,19 @@ def write_function(model: Model) -> str:
 
 
 def _write_step(effect: Effect, vehicle: Vehicle) -> _Step:
-    if isinstance(effect, FormulaEffect):
-        return _write_formula(effect)
-    if isinstance(effect, ResidualTerm):
-        return _write_learned(effect)
     if effect.id in _read_steps() and not is_own(type(effect)):
         known = _read_steps()[effect.id]
         return _Step(_fill(known.step, effect), known.state)
-    if isinstance(effect, Lag):
-        return _write_lag(effect)
-    if isinstance(effect, Ramp):
-        return _write_ramp(effect)
+    writers: dict[type[Effect], Callable[[Any], _Step]] = {
+        FormulaEffect: _write_formula,
+        ResidualTerm: _write_learned,
+        Delay: lambda _effect: _Step(""),  # the function reads commands with this delay
+        Lag: _write_lag,
+        Ramp: _write_ramp,
+    }
+    for family, write in writers.items():
+        if isinstance(effect, family):
+            return write(effect)
     if isinstance(effect, Written) and not isinstance(effect, Filtered):
         return _Step("\n".join(_write_equations(effect, vehicle.kind)))
     what = f"{effect.id} is Python of your own and cannot be written out"
@@ -199,12 +200,7 @@ def _write_learned(term: ResidualTerm) -> _Step:
 
 def _write_head(model: Model, state: list[str]) -> str:
     vehicle, text = model.vehicle, _HEAD
-    delay = math.fsum(
-        effect.values[parameter.name]
-        for effect in model
-        for parameter in effect.parameters
-        if Quantity.COMMAND_DELAY in parameter.quantities and not is_own(type(effect))
-    )
+    delay = math.fsum(effect.delay for effect in model if isinstance(effect, Delay))
     unknown = vehicle.format_unknown()
     text = text.replace("{unknown}", f"# {unknown}\n" if unknown else "")
     for key, number in (

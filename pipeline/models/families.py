@@ -102,7 +102,7 @@ __all__ = [
     "never_attained",
     "never_reached",
     "take_largest",
-]  # fmt: skip
+]
 
 _LEAST_SPEED = 1e-9
 """Smallest speed of the fastest wheel [rad/s]: a divisor at rest."""
@@ -177,6 +177,7 @@ time t of the run's T; radius r, track b and wheelbase l.
 
 _EQUATION = re.compile(r"(\w+)\s*(\+?=)\s*(.+)")
 _LAG = re.compile(r"(\w+) \* d(\w+)/dt = u - \2")
+_DELAY = re.compile(r"Omega\(t\) = u\(t - (\w+)\)")
 _RAMP = re.compile(r"abs\(d(\w+)/dt\) <= (\w+)")
 _PLACES = {
     **dict.fromkeys(
@@ -291,6 +292,14 @@ class _WrittenCommand(Written, CommandEffect):
     def change_commands(self, commands: Commands, context: RunContext) -> Commands:
         """See the formula."""
         return commands if self.is_neutral else self._change_drive(commands, context)
+
+
+class Delay(Written, CommandEffect):
+    """Commands that take effect after a dead time, ``Omega(t) = u(t - d)``."""
+
+    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
+        """See the formula."""
+        return replace(commands, times=commands.times + self.delay)
 
 
 class _WrittenDrive(Written, DriveEffect):
@@ -461,8 +470,8 @@ def declare(
         page: what happens in one line; then parameters, and the source.
         formula: lines of equations of `SIGNALS` and parameters. ``v_y += c * turning`` adds a term to the
             body velocity, linear in its parameters; ``w0 = w0 / k`` changes a signal; ``tau * dOmega/dt = u -
-            Omega`` is a lag and ``abs(dOmega/dt) <= limit`` a ramp. A mapping has the lines by kind of
-            vehicle, the empty kind for all others.
+            Omega`` is a lag, ``abs(dOmega/dt) <= limit`` a ramp and ``Omega(t) = u(t - d)`` a dead time. A
+            mapping has the lines by kind of vehicle, the empty kind for all others.
         own: parameters.
         walk: the filter of an effect of the drive, see `Filtered`; its formula is any text that says what it
             does.
@@ -500,6 +509,8 @@ def declare(
 
 def _choose_family(first: str, facts: Mapping[str, Any]) -> tuple[type[Written], dict[str, Any]]:
     """Class of an effect by the first line of its formula, and what that line says of it."""
+    if _DELAY.fullmatch(first):
+        return Delay, {}
     if _LAG.fullmatch(first):
         return Lag, {}
     if ramp := _RAMP.fullmatch(first):
@@ -524,7 +535,7 @@ def check_formula(made: type[Effect]) -> None:
         MotionError: ``bad_formula``, ``unknown_signal``, ``wrong_units``; ``not_neutral``, it changes
             something at the neutral values; ``not_linear``, a term is not linear in its parameters.
     """
-    if not issubclass(made, Written) or issubclass(made, Lag | Filtered):
+    if not issubclass(made, Written) or issubclass(made, Delay | Lag | Filtered):
         return
     generator = np.random.default_rng(1)
     signals = {name: generator.uniform(0.1, 1.0) for name in SIGNALS} | {"e_m": 0.0}
