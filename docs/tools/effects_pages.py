@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import sys
 from typing import TYPE_CHECKING
 
 from pipeline.export import export_model, list_targets
@@ -83,7 +82,7 @@ def _write_list() -> str:
 
 
 def _write_page(kind: type[Effect]) -> str:
-    page = (sys.modules[kind.__module__].__doc__ or "").strip()
+    page = kind.find_page()
     first, _, rest = page.partition("\n")
     title = first.partition(":")[0]
     vehicle = _vehicle_of(kind)

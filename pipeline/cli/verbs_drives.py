@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple, cast
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from pipeline.job import Options
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
+    from pipeline.simulate import EffectSpec
+    from pipeline.simulate.facts import Kind
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -356,7 +358,7 @@ def simulate(  # noqa: D417 - arguments document themselves
         topics = {name: [one.topic for one in PLATFORMS[name].topics] for name in sorted(PLATFORMS)}
         lists = {
             "cases": {one.name: one.shows for one in list_cases()},
-            "effects": {effect.id: effect.formula for effect in list_effects()},
+            "effects": {one.id: one.formula for one in (*list_effects(), *list_written_effects())},
             "platforms": {name: ", ".join(published) for name, published in topics.items()},
         }
         return print_result(lists, lambda: _format_case(lists), json=json)
@@ -375,8 +377,27 @@ def simulate(  # noqa: D417 - arguments document themselves
         program=program,
         platform=platform,
         play=play,
+        written=() if effects.keys() <= {one.id for one in list_effects()} else list_written_effects(),
     )
     return print_result({"path": str(path), "effects": effects}, lambda: [str(path)], json=json)
+
+
+def list_written_effects() -> tuple[EffectSpec, ...]:
+    """Effects of the catalogue that the simulator does not have, by the formulas of their files."""
+    from pipeline import models, simulate  # noqa: PLC0415 - heavy
+
+    known = {effect.id for effect in simulate.list_effects()}
+    return tuple(
+        simulate.EffectSpec(
+            effect.id,
+            "; ".join(f"{channel} += {text}" for channel, text in adds.items()),
+            tuple(simulate.ParameterSpec(p.name, p.unit, p.neutral, p.typical) for p in effect.parameters),
+            cast("tuple[Kind, ...]", effect.kinds),
+            adds,
+        )
+        for effect in models.list_effects()
+        if effect.id not in known and (adds := models.list_terms(effect))
+    )
 
 
 def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:

@@ -10,7 +10,7 @@ from pipeline.core import enumerate_texts, format_share
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation.error_regions import ABOVE_FLOOR, BREVITY, format_errors, format_excess
 from pipeline.estimation.ladder import ERRORS_OVER_2S
-from pipeline.models.catalogue import list_effects
+from pipeline.models import catalogue
 from pipeline.recording import FAULTS
 from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.run.windows import HORIZON_S
@@ -248,8 +248,7 @@ def _list_names(candidates: Sequence[str]) -> list[str]:
 
 def name_effect(name: str) -> str:
     """An effect by its term in place of its id: `lateral centre of rotation`."""
-    known = {effect.id: effect.motion or effect.__doc__ or "" for effect in list_effects()}
-    term = known.get(name, "").partition(":")[0] or name.replace("_", " ")
+    term = catalogue.name_effect(name)
     return f"{term[:1].lower()}{term[1:]}"
 
 

@@ -27,6 +27,7 @@ from pipeline.models.effect import (
     ReportEffect,
     Search,
 )
+from pipeline.models.families import declare, list_terms
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import LEARNED, find_learned, learned_as_table
 from pipeline.models.model import Model, Timing

@@ -17,9 +17,11 @@ from types import ModuleType
 
 from pipeline.core import guess_names, suffix_unit
 from pipeline.models.effect import Effect, Excitation, Late, Parameter, Search, find_late
+from pipeline.models.families import check_formula
 from pipeline.models.formula import FormulaEffect
 from pipeline.models.learned_term import ResidualTerm
 from pipeline.models.parameter import is_of_one_run
+from pipeline.models.words import find_words
 from pipeline.run import MotionError
 
 # The user's own Python code is read once, and run only if exactly this content is trusted.
@@ -184,7 +186,7 @@ def find_effect(name: str, own: Mapping[str, EffectClass] | None = None) -> Effe
 
 def name_effect(effect: str) -> str:
     """Name of an effect in words, as `Yaw rate limit` for `body_turn_limit`."""
-    return find_effect(effect).motion.partition(": ")[0] or effect.replace("_", " ").capitalize()
+    return find_words(effect).name or effect.replace("_", " ").capitalize()
 
 
 def name_parameter(effect: str, parameter: str) -> str:
@@ -243,6 +245,8 @@ def run_effects(code: bytes, path: Path) -> Mapping[str, EffectClass]:
             hint="Correct it; it must be importable Python.",
         ) from error
     effects = {effect.id: effect for effect in _effects_of(module)}
+    for effect in effects.values():
+        check_formula(effect)
     if not effects:
         hint = "Derive a class from one of pipeline.models's effect classes and give it an id."
         raise MotionError("effects_file", "the file defines no effect", where=str(path), hint=hint)
@@ -294,10 +298,8 @@ def format_effect(effect: type[Effect] | Effect) -> str:
     if isinstance(effect, FormulaEffect):
         page = effect.describe()
     else:
-        module = inspect.getmodule(effect if inspect.isclass(effect) else type(effect))
-        page = inspect.cleandoc((module.__doc__ if module else None) or effect.__doc__ or "")
         # A paragraph is one line; the display wraps it.
-        page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", page)
+        page = re.sub(r"(?m)^(\S.*)\n(?=\S)", r"\1 ", effect.find_page())
     lines = [page, "", f"id            {effect.id}", f"acts on       {effect.place.name.lower()}"]
     lines += [f"acts beside   {name}, which a model must contain" for name in effect.acts_with]
     lines.append(f"vehicles      {', '.join(effect.kinds)}")
@@ -352,8 +354,7 @@ def list_pages(effects: Sequence[type[Effect]]) -> list[str]:
     """The catalogue: one line per effect."""
     lines = []
     for effect in effects:
-        module = inspect.getmodule(effect)
-        title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+        title = effect.find_page().splitlines()[0]
         lines.append(f"{effect.id:<24}{effect.place.name.lower():<13}{title.split(': ', 1)[-1]}")
     return lines
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import enum
+import inspect
 import math
-import re
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Mapping
 from copy import copy
 from functools import cached_property
-from string import Formatter
 from typing import ClassVar, Literal, Self, TypeVar
 
-from pipeline.core import format_angle, format_length, format_share, suffix_unit
+from pipeline.core import suffix_unit
 from pipeline.models.parameter import (
     Conditions,
     Excitation,
@@ -26,21 +26,11 @@ from pipeline.models.parameter import (
     Search,  # noqa: F401 - what a file of an effect needs
     Spread,  # noqa: F401 - what a file of an effect needs
 )
+from pipeline.models.words import Sentences, find_words
 from pipeline.run import MotionError
 from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
 from pipeline.sources import Vehicle
 from pipeline.sources.kinematics import list_kinds
-
-
-def name_side(value: float) -> str:
-    """The side of a signed number, positive to the left."""
-    return "left" if value >= 0.0 else "right"
-
-
-def format_share_of_gain(gain: float) -> str:
-    """Deviation of a gain from one: `29 % less`."""
-    return f"{format_share(abs(1.0 - gain), 0)} {'less' if gain <= 1.0 else 'more'}"
-
 
 # An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
 # values: changing a parameter makes another effect.
@@ -101,18 +91,11 @@ class Effect(ABC):
         acts_with: effects of which a model must have one for it to act; empty if it acts alone.
         companions: effects that usually act beside it, with which a search begins at once.
         parts: parameters of other effects as which it is searched; identified together, they are this effect.
+        tied_to: effects of whose parameter one motion determines only the product or ratio with its own.
         late: what it delays, if a delay is its only parameter.
         scale_role: what a wrong scale of the encoders seems to be: a gain of the drive and a factor on the
             radius; empty for all other effects.
-        motion: name and numbers as a sentence, with `{name}` for a parameter. For the first parameter also
-            `{size}`, the absolute value times `size_in`, `{way}`, the one of `ways` for its sign,
-            `{percent}`, `{length}` or `{angle}`, the size in metres or radians as text, and `{share}`, the
-            deviation from one of `share_of` (a constant, and the factor of the parameter).
-        clause: what the vehicle does, as a predicate of "the robot" or as a clause that begins with "the"; it
-            takes the fields of `motion`, and `{rim}`, the rim speed of a wheel of this rate. Empty where the
-            part of `motion` after the colon serves.
-        python: its step in the exported function, parameters as `{name}`; None where there is none.
-        python_state: state variables of its step; zero at the start.
+        has_state: whether it remembers what was before, in the drive.
         readings: its interpretation if its parameters prove to belong to the vehicle, the ground or a run,
             where one run cannot distinguish these.
         values: parameter values by name.
@@ -136,15 +119,10 @@ class Effect(ABC):
     acts_with: tuple[str, ...] = ()
     companions: tuple[str, ...] = ()
     parts: tuple[Part, ...] = ()
+    tied_to: tuple[str, ...] = ()
     late: Late | None = None
     scale_role: Literal["", "gain", "radius"] = ""
-    motion: str = ""
-    clause: str = ""
-    ways: tuple[str, str] = ("left", "right")
-    size_in: float = 1.0
-    share_of: tuple[float, float] = (0.0, 1.0)
-    python: str | None = None
-    python_state: tuple[str, ...] = ()
+    has_state: bool = False
     readings: tuple[Reading, ...] = ()
     open_numbers: frozenset[str] = frozenset()
 
@@ -177,6 +155,11 @@ class Effect(ABC):
     def is_neutral(self) -> bool:
         """Whether every parameter that has a neutral value is at it."""
         return all(math.isnan(p.neutral) or self.values[p.name] == p.neutral for p in self.parameters)
+
+    @classmethod
+    def find_page(cls) -> str:
+        """Its manual page: what happens, the formula, the parameters, the source."""
+        return inspect.cleandoc(sys.modules[cls.__module__].__doc__ or cls.__doc__ or "")
 
     @classmethod
     def acts_in(cls, ids: Collection[str]) -> bool:
@@ -223,54 +206,29 @@ class Effect(ABC):
         )
 
     def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers; without a `motion` the first line of the docstring.
+        """What the vehicle does, with numbers: the words of `words.toml`, or all parameters.
 
         Args:
             vehicle: its nominal geometry.
             beside: all effects of the model, for numbers that depend on other effects.
         """
-        if self.motion:
-            name, colon, numbers = self.motion.partition(": ")
-            filled = self._fill(numbers, vehicle) if colon else ""
-            return f"{name}: {filled}" if filled else self._fill(name, vehicle)
-        summary = (type(self).__doc__ or self.id).strip().splitlines()[0].rstrip(".")
-        return summary.partition(": ")[2] or summary
+        said = self._say(vehicle, beside)
+        if said.words.motion:
+            return said.describe_motion()
+        known = [p for p in self.parameters if p.name not in self.open_numbers]
+        numbers = [f"{p.name} = {self.values[p.name]:.3g}{suffix_unit(p.unit)}" for p in known]
+        return f"{said.title}: {', '.join(numbers)}"
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers, as a clause of a sentence; see `clause`."""
-        if self.clause:
-            does = self._fill(self.clause, vehicle)
-        else:
-            does = self.describe_motion(vehicle, beside).partition(": ")[2].removeprefix("the robot ")
-            does = does.replace("base_link", "the reference point")
+        """What the vehicle does, with numbers, as a clause of a sentence."""
+        said = self._say(vehicle, beside)
+        does = said.describe_clause() if said.words.motion else ""
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
-    def _fill(self, template: str, vehicle: Vehicle) -> str:
-        """A template with its numbers, less parts after a comma or in brackets with one that is open."""
-        (name_of_first, first), *_ = self.values.items()
-        base, slope = self.share_of
-        size = abs(first) * self.size_in
-        words: dict[str, float | str] = {
-            **self.values,
-            "size": size,
-            "way": self.ways[first < 0.0],
-            "share": format_share_of_gain(base + slope * first),
-            "percent": format_share(first, 3),
-            "length": format_length(size),
-            "angle": format_angle(size),
-            "rim": abs(first) * vehicle.wheel_radius_m,
-        }
-        unknown = {*self.open_numbers, *(name for name, value in self.values.items() if math.isinf(value))}
-        parts = []
-        for part in re.split(r"(?=, | \()", template):
-            names = [name for _, name, _, _ in Formatter().parse(part) if name]
-            if unknown.isdisjoint(name if name in self.values else name_of_first for name in names):
-                parts.append(part.format(**words))
-        return "".join(parts).removeprefix(", ")
-
-    def choose_python(self, kind: str) -> str | None:
-        """Its step in the exported function on a kind of vehicle; see `python`."""
-        return self.python
+    def _say(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
+        others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
+        title = self.id.replace("_", " ").capitalize()
+        return Sentences(title, find_words(self.id), self.values, vehicle, self.open_numbers, others)
 
     def can_show(self, conditions: Conditions) -> bool:
         """Whether the sensors and the driving can identify it at all."""
@@ -298,7 +256,7 @@ class Effect(ABC):
 
     def depends_on(self, other: Effect) -> bool:
         """Whether one motion determines only its product or ratio with the parameter of another effect."""
-        return False
+        return other.id in self.tied_to
 
     def is_used(self, parameter: Parameter) -> bool:
         """Whether a parameter is used: of two alternative parameters, only the one that is given."""
@@ -310,7 +268,7 @@ class Effect(ABC):
 
     def make_usual(self, largest: Largest) -> Self:
         """The same effect with typical values, clipped to its bounds."""
-        return self.change_within(**self._list_usual(largest))
+        return self.change_within(**self.list_usual(largest))
 
     def change_within(self, **values: float) -> Self:
         """The effect with other values, finite ones clipped to their bounds: those of another are wider."""
@@ -323,7 +281,7 @@ class Effect(ABC):
         """Start values of all parameters together."""
         return [dict(values) for values in self.starts]
 
-    def _list_usual(self, largest: Largest) -> dict[str, float]:
+    def list_usual(self, largest: Largest) -> dict[str, float]:
         """Typical values: a limit below the largest command, a change point in the middle of the run."""
         shares = {"": None, "duration": _USUAL_MOMENT}
         usual = {}

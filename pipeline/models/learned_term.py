@@ -52,42 +52,42 @@ def _miss(total: Velocity, context: RunContext, channel: str, tau_s: float) -> F
 
 
 @dataclass(frozen=True)
-class _Kind:
+class Kind:
     """An input that a learned term may have.
 
     Attributes:
         unit: its unit.
         read: its values on the grid.
-        python: its expression in the exported function; `0.0` if it vanishes for a vehicle starting at rest.
+        formula: its expression in the exported function; `0.0` if it vanishes for a vehicle starting at rest.
         state: name, channel and time constant [s] of a lag that the expression needs.
     """
 
     unit: str
     read: Source
-    python: str
+    formula: str
     state: tuple[str, str, float] | None = None
 
 
-def _list_kinds() -> dict[str, _Kind]:
+def _list_kinds() -> dict[str, Kind]:
     kinds = {
-        "v_x": _Kind("m/s", lambda total, _: total.x, "v_x"),
-        "v_y": _Kind("m/s", lambda total, _: total.y, "v_y"),
-        "v_w": _Kind("rad/s", lambda total, _: total.w, "v_w"),
-        "|v_x|": _Kind("m/s", lambda total, _: np.abs(total.x), "abs(v_x)"),
-        "|v_w|": _Kind("rad/s", lambda total, _: np.abs(total.w), "abs(v_w)"),
-        "v_x |v_x|": _Kind("m^2/s^2", lambda total, _: total.x * np.abs(total.x), "v_x * abs(v_x)"),
-        "v_w |v_w|": _Kind("rad^2/s^2", lambda total, _: total.w * np.abs(total.w), "v_w * abs(v_w)"),
-        "v_x v_w": _Kind("m rad/s^2", lambda total, _: total.x * total.w, "v_x * v_w"),
-        "|v_x| v_w": _Kind("m rad/s^2", lambda total, _: np.abs(total.x) * total.w, "abs(v_x) * v_w"),
-        "v_x |v_w|": _Kind("m rad/s^2", lambda total, _: total.x * np.abs(total.w), "v_x * abs(v_w)"),
-        "roll": _Kind("rad", lambda _, context: context.attitude[:, 0], "roll"),
-        "pitch": _Kind("rad", lambda _, context: context.attitude[:, 1], "pitch"),
+        "v_x": Kind("m/s", lambda total, _: total.x, "v_x"),
+        "v_y": Kind("m/s", lambda total, _: total.y, "v_y"),
+        "v_w": Kind("rad/s", lambda total, _: total.w, "v_w"),
+        "|v_x|": Kind("m/s", lambda total, _: np.abs(total.x), "abs(v_x)"),
+        "|v_w|": Kind("rad/s", lambda total, _: np.abs(total.w), "abs(v_w)"),
+        "v_x |v_x|": Kind("m^2/s^2", lambda total, _: total.x * np.abs(total.x), "v_x * abs(v_x)"),
+        "v_w |v_w|": Kind("rad^2/s^2", lambda total, _: total.w * np.abs(total.w), "v_w * abs(v_w)"),
+        "v_x v_w": Kind("m rad/s^2", lambda total, _: total.x * total.w, "v_x * v_w"),
+        "|v_x| v_w": Kind("m rad/s^2", lambda total, _: np.abs(total.x) * total.w, "abs(v_x) * v_w"),
+        "v_x |v_w|": Kind("m rad/s^2", lambda total, _: total.x * np.abs(total.w), "v_x * abs(v_w)"),
+        "roll": Kind("rad", lambda _, context: context.attitude[:, 0], "roll"),
+        "pitch": Kind("rad", lambda _, context: context.attitude[:, 1], "pitch"),
     }
     units = {"v_x": "m/s", "v_y": "m/s", "v_w": "rad/s"}
     for channel in _TURNED:
         for number, tau_s in enumerate(_CHANGES_S):
             state = (f"learned_{channel}_{number}", channel, tau_s)
-            kinds[f"change of {channel} in {tau_s:g} s"] = _Kind(
+            kinds[f"change of {channel} in {tau_s:g} s"] = Kind(
                 units[channel],
                 partial(_change, channel=channel, tau_s=tau_s),
                 f"({channel} - {state[0]})",
@@ -95,7 +95,7 @@ def _list_kinds() -> dict[str, _Kind]:
             )
     for channel in _CHANNELS:
         for tau_s in _FADES_S:
-            kinds[f"missed {channel}, forgotten in {tau_s:g} s"] = _Kind(
+            kinds[f"missed {channel}, forgotten in {tau_s:g} s"] = Kind(
                 units[channel], partial(_miss, channel=channel, tau_s=tau_s), "0.0"
             )
     return kinds
@@ -104,6 +104,11 @@ def _list_kinds() -> dict[str, _Kind]:
 _KINDS = _list_kinds()
 INPUTS: Mapping[str, str] = {name: kind.unit for name, kind in _KINDS.items()}
 """Possible inputs of a learned term, and their units."""
+
+
+def find_kind(name: str) -> Kind:
+    """The input of that name."""
+    return _KINDS[name]
 
 
 def read_inputs(total: Velocity, context: RunContext, names: Sequence[str]) -> Floats:
@@ -175,7 +180,6 @@ class ResidualTerm(AddedEffect):
         super().__init__(fixed=fixed)
         self.inputs = tuple(inputs)
         self.bands = bands
-        self.python_state = tuple(state[0] for one in self.inputs if (state := _KINDS[one.name].state))
 
     @property
     def key(self) -> tuple[object, ...]:
@@ -222,34 +226,6 @@ class ResidualTerm(AddedEffect):
         """Its clause in a sentence."""
         del vehicle, beside
         return "deviates as a learned term says, which names no cause"
-
-    def choose_python(self, kind: str) -> str | None:
-        """Its step in the exported function, whose vehicle starts at rest without an initial error."""
-        del kind
-        if not self.inputs:
-            return ""
-        used = [one for one in self.inputs if _KINDS[one.name].python != "0.0"]
-        lines = []
-        for one in used:
-            if state := _KINDS[one.name].state:
-                name, channel, tau_s = state
-                lines.append(f"{name} += ({channel} - {name}) * -math.expm1(-step_s / {tau_s!r})")
-        lines.append("learned = (  # input / scale, low and high over scale, what it adds to v_x, v_y, v_w")
-        for one in used:
-            numbers = ", ".join(
-                repr(float(number)) for number in (one.low / one.scale, one.high / one.scale, *one.adds)
-            )
-            lines.append(f"    ({_KINDS[one.name].python} / {one.scale!r}, {numbers}),  # {one.name}")
-        lines += [
-            ")",
-            "beyond = sum(max(low - z, z - high, 0.0) ** 2 for z, low, high, *_ in learned)",
-            "share = math.exp(-beyond / 2.0)",
-            *(
-                f"{channel} = {channel} + share * sum(row[0] * row[{index}] for row in learned)"
-                for index, channel in enumerate(_CHANNELS, start=3)
-            ),
-        ]
-        return "\n".join(lines)
 
 
 class InputProbe(AddedEffect):

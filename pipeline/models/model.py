@@ -180,7 +180,7 @@ class _Path:
 def _follow(effects: Sequence[Effect], timing: Timing) -> _Path:
     commanded = tuple(e for e in effects if e.place is Place.COMMAND)
     driven = tuple(cast("DriveEffect", e) for e in effects if e.place is Place.DRIVE)
-    last = max((index for index, effect in enumerate(driven) if effect.python_state), default=-1)
+    last = max((index for index, effect in enumerate(driven) if effect.has_state), default=-1)
     continues = tuple(index < last for index in range(len(driven)))
     keys: list[tuple[object, ...]] = [(timing.wheel_delay_s, *(e.key for e in commanded), "|")]
     for effect, is_before in zip(driven, continues, strict=True):

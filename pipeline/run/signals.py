@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Integers = NDArray[np.int64]
+AnyDrive = TypeVar("AnyDrive", "Commands", "Wheels")
 Signal = TypeVar("Signal", NDArray[np.float64], NDArray[np.complex128])
 
 _STEPS = 2.0**20
@@ -76,14 +77,6 @@ class DriveSeries:
 
 class Commands(DriveSeries):
     """Held commands: each value applies from its stamp to the next."""
-
-    def change_wheels(self, left: Floats, right: Floats) -> Commands:
-        """The commands with other mean wheel speeds of the sides."""
-        return replace(self, left=left, right=right)
-
-    def change_each_wheel(self, change: Callable[[Floats], Floats]) -> Commands:
-        """The commands with the speed of every wheel changed."""
-        return replace(self, **_join_wheels([change(wheel) for wheel in split_wheels(self)]))
 
 
 @dataclass(frozen=True)
@@ -151,6 +144,11 @@ def _join_wheels(wheels: Sequence[Floats]) -> dict[str, Any]:
         "right": 0.5 * (front_right + rear_right),
         "sideways": 0.25 * (front_right - front_left + rear_left - rear_right),
     }
+
+
+def change_wheels(drive: AnyDrive, change: Callable[[Floats], Floats]) -> AnyDrive:
+    """A drive with the speed of every wheel changed by a function without a state."""
+    return replace(drive, **_join_wheels([change(wheel) for wheel in split_wheels(drive)]))
 
 
 def find_fastest_wheel(drive: Drive) -> Floats:

@@ -24,6 +24,7 @@ from pipeline.simulate.facts import (
     CommandTopic,
     EffectSpec,
     Layout,
+    ParameterSpec,
     PoseTopic,
     SimulateError,
     Vehicle,
@@ -335,6 +336,7 @@ class Changes(TypedDict, total=False):
         layout: a name of `LAYOUTS`.
         program: what is driven.
         platform: a name of `PLATFORMS`; brings its vehicle and topics along.
+        written: see `Scenario`.
     """
 
     seed: int | None
@@ -343,6 +345,7 @@ class Changes(TypedDict, total=False):
     layout: str | None
     program: str | None
     platform: str | None
+    written: tuple[EffectSpec, ...]
 
 
 def list_cases() -> tuple[Case, ...]:
@@ -431,6 +434,7 @@ def make_scenario(
     layout: str | None = None,
     program: str | None = None,
     platform: str | None = None,
+    written: tuple[EffectSpec, ...] = (),
 ) -> Scenario:
     """The scenario of a named case with changes; see `Changes`."""
     scenario = Scenario() if name is None else find_case(name).scenario
@@ -451,8 +455,8 @@ def make_scenario(
         if program not in known:
             raise unknown_name("program", program, sorted(known))
         scenario = replace(scenario, program=replace(scenario.program, name=program))  # type: ignore[arg-type]
-    asked = {**scenario.effects, **_fill_usual_sizes(effects or {})}
-    resolve_effects(asked, scenario.vehicle.kind)
+    asked = {**scenario.effects, **_fill_usual_sizes(effects or {}, written)}
+    resolve_effects(asked, scenario.vehicle.kind, written)
     ground = scenario.ground
     if not {*SLOPE_EFFECTS, "grade_load"}.isdisjoint(asked) and ground == Ground():
         # On level ground these effects would leave no trace at all.
@@ -460,6 +464,7 @@ def make_scenario(
     return replace(
         scenario,
         effects=asked,
+        written=written,
         ground=ground,
         seed=scenario.seed if seed is None else seed,
         duration_s=scenario.duration_s if duration_s is None else duration_s,
@@ -467,13 +472,14 @@ def make_scenario(
 
 
 def _fill_usual_sizes(
-    effects: Mapping[str, Mapping[str, float] | float],
+    effects: Mapping[str, Mapping[str, float] | float], written: tuple[EffectSpec, ...]
 ) -> dict[str, Mapping[str, float] | float]:
     filled: dict[str, Mapping[str, float] | float] = dict(effects)
+    known = CATALOGUE | {spec.id: spec for spec in written}
     for name, given in effects.items():
-        if given == {} and name in CATALOGUE:
+        if given == {} and name in known:
             filled[name] = {
-                item.name: item.typical for item in CATALOGUE[name].parameters if not math.isnan(item.typical)
+                item.name: item.typical for item in known[name].parameters if not math.isnan(item.typical)
             }
     return filled
 

@@ -6,9 +6,9 @@ import math
 import tomllib
 import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import msgspec
 import numpy as np
@@ -158,18 +158,22 @@ class ParameterSpec:
 
 @dataclass(frozen=True)
 class EffectSpec:
-    """One effect: its id, its formula in words of the body velocity, its parameters and its vehicles."""
+    """One effect: its id, its formula in words of the body velocity, its parameters and its vehicles.
+
+    ``adds`` has formulas of what is added to ``v_x``, ``v_y`` and ``v_w``, for an effect whose physics is not
+    written in this room: arithmetic and functions of `math` over parameters and attributes of `State`.
+    """
 
     id: str
     formula: str
     parameters: tuple[ParameterSpec, ...]
     kinds: tuple[Kind, ...] = ("differential", "ackermann", "mecanum", "omni")
+    adds: Mapping[str, str] = field(default_factory=dict)
 
 
 def _read_effect(name: str, given: dict[str, Any]) -> EffectSpec:
     parameters = tuple(ParameterSpec(own, **said) for own, said in given.pop("parameters").items())
-    kinds = {"kinds": tuple(given["kinds"])} if "kinds" in given else {}
-    return EffectSpec(name, given["formula"], parameters, **kinds)
+    return EffectSpec(name, given["formula"], parameters, tuple(given.get("kinds", get_args(Kind))))
 
 
 CATALOGUE: dict[str, EffectSpec] = {
@@ -180,18 +184,22 @@ CATALOGUE: dict[str, EffectSpec] = {
 class Effects:
     """The effects of one scenario with their values: complete, checked, and neutral where not asked for."""
 
-    def __init__(self, values: Mapping[str, Mapping[str, float]]) -> None:
+    def __init__(
+        self, values: Mapping[str, Mapping[str, float]], written: tuple[EffectSpec, ...] = ()
+    ) -> None:
         self._values = {name: dict(numbers) for name, numbers in values.items()}
+        self.written = written
 
     def value(self, effect: str, parameter: str) -> float:
         """The value of a parameter; its neutral one when the effect was not asked for."""
         given = self._values.get(effect, {})
         if parameter in given:
             return given[parameter]
-        if effect not in CATALOGUE:
+        known = CATALOGUE | {spec.id: spec for spec in self.written}
+        if effect not in known:
             what = f"{effect} is not in pipeline/simulate/effects.toml"
             raise KeyError(what)
-        return next(item.neutral for item in CATALOGUE[effect].parameters if item.name == parameter)
+        return next(item.neutral for item in known[effect].parameters if item.name == parameter)
 
     def is_active(self, effect: str) -> bool:
         """Whether any parameter of the effect differs from its neutral value."""
@@ -205,27 +213,31 @@ class Effects:
         return {name: dict(numbers) for name, numbers in self._values.items()}
 
 
-def resolve_effects(asked: Mapping[str, Mapping[str, float] | float], kind: Kind) -> Effects:
+def resolve_effects(
+    asked: Mapping[str, Mapping[str, float] | float], kind: Kind, written: tuple[EffectSpec, ...] = ()
+) -> Effects:
     """Check what was asked for against the catalogue.
 
     Args:
         asked: effect id to its parameters, or to one number for an effect with one parameter.
         kind: the vehicle's kind.
+        written: effects that are not in the catalogue, by their formulas.
 
     Raises:
         SimulateError: ``unknown_effect``, ``unknown_parameter``, ``parameter_needed``, ``bad_value`` or
             ``wrong_vehicle``.
     """
     values: dict[str, dict[str, float]] = {}
+    known = CATALOGUE | {spec.id: spec for spec in written}
     for name, given in asked.items():
-        spec = CATALOGUE.get(name)
+        spec = known.get(name)
         if spec is None:
-            raise unknown_name("effect", name, sorted(CATALOGUE))
+            raise unknown_name("effect", name, sorted(known))
         if kind not in spec.kinds:
             what = f"{name} exists on {' or '.join(spec.kinds)} vehicles only, this one is {kind}"
             raise _refuse("wrong_vehicle", what, name, "Choose another vehicle or another effect")
         values[name] = _check_parameters(spec, given)
-    return Effects(values)
+    return Effects(values, tuple(spec for spec in written if spec.id in values))
 
 
 def _check_parameters(spec: EffectSpec, given: Mapping[str, float] | float) -> dict[str, float]:

@@ -84,7 +84,7 @@ def simulate_run(scenario: Scenario) -> SimulatedRun:
         SimulateError: an unknown effect, parameter or program, an impossible value, or a combination that
             makes no sense.
     """
-    effects = resolve_effects(scenario.effects, scenario.vehicle.kind)
+    effects = resolve_effects(scenario.effects, scenario.vehicle.kind, scenario.written)
     truth = _drive(scenario, effects, None)
     if effects.is_active("grade_load"):
         truth = _carry_grade(scenario, effects, truth)

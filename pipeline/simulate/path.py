@@ -15,7 +15,7 @@ from pipeline.core.rigid import (
     rotate,
 )
 from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners, steer_tyres
-from pipeline.simulate.facts import Effects, Vehicle
+from pipeline.simulate.facts import Effects, SimulateError, Vehicle
 from pipeline.simulate.programs import (
     filter_pole,
     integrate_cells,
@@ -306,6 +306,7 @@ def integrate_path(
     """
     is_local = effects.is_active("terrain_change") and math.isfinite(effects.value("terrain_change", "at_x"))
     is_pulled = any(map(effects.is_active, SLOPE_EFFECTS))
+    extra = _add_written(effects, extra)
     if extra is None and ground.hill_m == 0.0 and not is_local and not is_pulled:
         return _cross_plane(motion, drive.step_s, ground, start)
     surface = make_surface(ground, generator)
@@ -412,7 +413,7 @@ class _Forces:
         self._state = State(dt=walk.step_s)
         signals = {"v0": walk.v0, "w0": walk.w0, "left_speed": walk.left, "right_speed": walk.right}
         signals |= {"left_angle": walk.left_angle[:-1], "right_angle": walk.right_angle[:-1]}
-        signals["steering"] = walk.steering
+        signals |= {"steering": walk.steering, "turning": walk.turning}
         self._signals = {name: signal.tolist() for name, signal in signals.items()}
         self._turning = walk.turning.tolist()
 
@@ -440,6 +441,37 @@ class _Forces:
             odd = self._odd(state)
             d_x, d_y, d_w = d_x + odd[0], d_y + odd[1], d_w + odd[2]
         return d_x, d_y, d_w
+
+
+_FUNCTIONS = {"abs": abs, "min": min, "max": max, **{n: f for n, f in vars(math).items() if n[0] != "_"}}
+
+
+def _add_written(effects: Effects, extra: ExtraPhysics | None) -> ExtraPhysics | None:
+    """Odd physics with the effects that are known by their formulas alone.
+
+    Raises:
+        SimulateError: ``bad_formula``, one uses what a `State` does not have.
+    """
+    if not effects.written:
+        return extra
+    terms = []
+    for spec in effects.written:
+        numbers = {one.name: effects.value(spec.id, one.name) for one in spec.parameters}
+        for channel, formula in spec.adds.items():
+            code = compile(formula, spec.id, "eval")
+            if unknown := set(code.co_names) - {*_FUNCTIONS, *numbers, *vars(State())}:
+                what = f"{channel} += {formula} uses {', '.join(sorted(unknown))}, which is not simulated"
+                hint = f"There are: {', '.join(vars(State()))}"
+                raise SimulateError("bad_formula", what, where=spec.id, hint=hint)
+            terms.append((("v_x", "v_y", "v_w").index(channel), code, {**_FUNCTIONS, **numbers}))
+
+    def push(state: State) -> tuple[float, float, float]:
+        added = [0.0, 0.0, 0.0] if extra is None else [*extra(state)]
+        for index, code, known in terms:
+            added[index] += eval(code, {"__builtins__": {}}, {**vars(state), **known})  # noqa: S307 - a formula of the program's own catalogue
+        return added[0], added[1], added[2]
+
+    return push
 
 
 # Ground that every pass compacts: slip falls with the number of times that a place was driven over.

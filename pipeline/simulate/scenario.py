@@ -10,7 +10,7 @@ import numpy as np
 
 from pipeline.core.arrays import Flags, Floats
 from pipeline.core.rigid import quaternions_from_euler
-from pipeline.simulate.facts import VEHICLES, Layout, SimulateError, Vehicle
+from pipeline.simulate.facts import VEHICLES, EffectSpec, Layout, SimulateError, Vehicle
 
 if TYPE_CHECKING:
     from pipeline.simulate.drivetrain import Drive
@@ -162,6 +162,7 @@ class State:
         left_angle, right_angle: turned angle of the wheels [rad] (both the rear axle's on a car).
         left_speed, right_speed: wheel speeds [rad/s].
         steering: steering angle [rad], zero on a differential vehicle.
+        turning: one while the wheels turn, else zero.
     """
 
     t: float = 0.0
@@ -178,6 +179,7 @@ class State:
     left_speed: float = 0.0
     right_speed: float = 0.0
     steering: float = 0.0
+    turning: float = 0.0
 
 
 ExtraPhysics = Callable[[State], tuple[float, float, float]]
@@ -406,6 +408,7 @@ class Scenario:
     Attributes:
         vehicle: geometry.
         effects: effect id to parameters (or to one number, for an effect with one).
+        written: effects among them that this room does not have, by their formulas.
         program: what is driven.
         duration_s: length of the run.
         seed: from which all random numbers come; each source has a stream of its own, so that adding a
@@ -424,6 +427,7 @@ class Scenario:
 
     vehicle: Vehicle = VEHICLES["husky"]
     effects: Mapping[str, Mapping[str, float] | float] = field(default_factory=dict)
+    written: tuple[EffectSpec, ...] = ()
     program: Program = Program()
     duration_s: float = 300.0
     seed: int = 0

@@ -254,9 +254,7 @@ def summarize_effect(effect: Effect | type[Effect]) -> str:
     """The first sentence of an effect's page, without its name."""
     if isinstance(effect, FormulaEffect):
         return "a formula of your own"
-    kind = effect if inspect.isclass(effect) else type(effect)
-    module = inspect.getmodule(kind)
-    title = ((module.__doc__ if module else None) or "").strip().splitlines()[0]
+    title = effect.find_page().splitlines()[0]
     return title.split(": ", 1)[-1].rstrip(".")
 
 

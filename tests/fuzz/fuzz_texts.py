@@ -29,7 +29,8 @@ from fuzzing import keep_failure, run_script  # noqa: E402
 from pipeline.core import SlipError  # noqa: E402
 from pipeline.export import export_model, find_target, list_targets  # noqa: E402
 from pipeline.models import format_model, list_effects  # noqa: E402
-from pipeline.models.formula import SIGNAL_UNITS, parse_expression  # noqa: E402
+from pipeline.models.expression import parse_expression  # noqa: E402
+from pipeline.models.formula import SIGNAL_UNITS  # noqa: E402
 from pipeline.models.model_file import parse_model  # noqa: E402
 from pipeline.models.parameter import parse_unit  # noqa: E402
 from pipeline.sources import load_configuration, resolve_vehicle  # noqa: E402

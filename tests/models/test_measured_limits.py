@@ -77,6 +77,6 @@ def test_after_a_gap_a_car_goes_on_with_the_measured_steering(name: str, values:
 def test_gains_come_before_what_begins_at_the_measured_wheels(name: str) -> None:
     """A gain behind a ramp scaled the measured speed with which the ramp begins."""
     gain = find_effect(name)
-    later = [effect for effect in list_effects() if effect.place is Place.DRIVE and effect.python_state]
+    later = [effect for effect in list_effects() if effect.place is Place.DRIVE and effect.has_state]
     assert len(later) > 5
     assert all(effect.rank > gain.rank for effect in later)

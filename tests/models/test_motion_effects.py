@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import math
 import re
 from functools import cache
@@ -12,11 +11,13 @@ import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 
+from pipeline.cli.verbs_drives import list_written_effects
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.comparison import Comparison
 from pipeline.models import Effect, LinearEffect, Model, Place, Timing, list_effects
 from pipeline.models.effect import Excitation, KinematicEffect, Late
-from pipeline.models.formula import parse_expression
+from pipeline.models.expression import parse_expression
+from pipeline.models.families import check_formula
 from pipeline.models.parameter import parse_unit
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
@@ -26,7 +27,8 @@ if TYPE_CHECKING:
     from pipeline.run import MotionRun
 
 EFFECTS = list_effects()
-SIMULATED = {spec.id: spec for spec in list_simulated()}
+WRITTEN_EFFECTS = list_written_effects()
+SIMULATED = {spec.id: spec for spec in (*list_simulated(), *WRITTEN_EFFECTS)}
 KIND_OF = {"differential": "husky_a200", "ackermann": "ackermann_car", "mecanum": "youbot"}
 
 
@@ -70,7 +72,7 @@ def test_neutral_parameters_change_nothing_bit_for_bit(effect: type[Effect]) -> 
 
 @pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
 def test_the_page_names_formula_parameters_units_and_source(effect: type[Effect]) -> None:
-    page = inspect.getdoc(inspect.getmodule(effect)) or ""
+    page = effect.find_page()
     assert "Source: " in page
     assert re.search(r"^ {4}\S", page, flags=re.MULTILINE), "the page has no indented formula"
     for parameter in effect.parameters:
@@ -99,11 +101,20 @@ def test_what_it_is_confused_with_exists(effect: type[Effect]) -> None:
     assert bool(effect.equivalent_to) == bool(effect.equivalent_when)
 
 
+@pytest.mark.parametrize("effect", EFFECTS, ids=ids(EFFECTS))
+def test_its_formula_does_nothing_at_neutral_values_and_is_linear_where_it_is_added(
+    effect: type[Effect],
+) -> None:
+    check_formula(effect)
+
+
 UNITS = {
     "v0": "m/s",
     "w0": "rad/s",
     "s0": "m/s",
-    "w": "rad/s",
+    "v_x": "m/s",
+    "v_y": "m/s",
+    "v_w": "rad/s",
     "turning": "1",
     "pitch": "rad",
     "roll": "rad",
@@ -113,7 +124,7 @@ UNITS = {
     "l": "m",
     "delta": "rad",
 }
-FORMULA = re.compile(r"(v0|w0|s0|v_[xyw])\s*(\+?=)\s*([^,]+?)(?=,\s| {2}|$)", re.MULTILINE)
+FORMULA = re.compile(r"(v0|w0|s0|v_[xyw]) (\+?=) (.+)$", re.MULTILINE)
 # A change of terrain begins at a place or a moment, play remembers: no formula of a moment.
 UNWRITTEN = ("terrain_change", "steering_sensor_play")
 WRITTEN = [e for e in EFFECTS if issubclass(e, LinearEffect | KinematicEffect) and e.id not in UNWRITTEN]
@@ -144,7 +155,9 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         "v0": v0,
         "w0": w0,
         "s0": s0,
-        "w": velocity.w,
+        "v_x": velocity.x,
+        "v_y": velocity.y,
+        "v_w": velocity.w,
         "turning": find_turning(wheels, around),
         "pitch": around.attitude[:, 1],
         "roll": around.attitude[:, 0],
@@ -154,7 +167,7 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         "l": around.vehicle.wheelbase_m or 1.0,
         "delta": wheels.steering,
     }
-    page = inspect.getdoc(inspect.getmodule(effect)) or ""
+    page = effect.find_page()
     found = FORMULA.findall("\n".join(line for line in page.splitlines() if line.startswith("    ")))
     assert found, "the page has no formula that could be compared"
     if isinstance(chosen, LinearEffect):
@@ -165,12 +178,10 @@ def test_the_formula_of_the_page_is_that_of_the_code(effect: type[Effect]) -> No
         assert isinstance(chosen, KinematicEffect)
         rolled = chosen.roll(rolling, around)
         results = {"v0": rolled.v0, "s0": rolled.s0, "w0": rolled.w0}
-    for name, sign, text in found:
+    for name, _, text in found:
         expression = parse_expression(text, known, effect.id)
         assert expression.unit == parse_unit("m/s" if name in {"v0", "s0", "v_x", "v_y"} else "rad/s", "")
-        expected = np.asarray(expression.evaluate(values)) + (
-            values[name] if sign == "+=" and name in values else 0.0
-        )
+        expected = np.asarray(expression.evaluate(values))
         assert np.allclose(results[name], expected, rtol=1e-9, atol=1e-12), text
 
 
@@ -203,7 +214,7 @@ def test_a_parameter_put_into_simulated_data_comes_back(effect: type[Effect]) ->
         more, vehicle = more | {"vehicle": VEHICLES["warthog"]}, "warthog"
     # What only shows where fast turns stand beside slow ones, or across a slope, takes longer.
     duration_s = 240.0 if effect.id in {"speed_track", "understeer", "side_slope_turn"} else 100.0
-    run = simulate(hidden, duration_s=duration_s, **more)
+    run = simulate(hidden, duration_s=duration_s, written=WRITTEN_EFFECTS, **more)
     source = Input.COMMAND if effect.id in DRIVETRAIN else Input.MEASURED
     problem = Problem([run], vehicle_of(vehicle), source)
     searched = tuple(kind() for kind in EFFECTS if kind.id in names)

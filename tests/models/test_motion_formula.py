@@ -13,7 +13,8 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model
-from pipeline.models.formula import FormulaEffect, make_parameter, parse_expression
+from pipeline.models.expression import parse_expression
+from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.parameter import Unit, parse_unit
 from pipeline.run import MotionError
 

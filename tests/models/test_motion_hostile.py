@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.models.formula import FormulaEffect, make_parameter, parse_expression
+from pipeline.models.expression import parse_expression
+from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.parameter import parse_unit
 from pipeline.run import MotionError
 

@@ -15,9 +15,9 @@ import numpy as np
 
 from pipeline.core.arrays import join_parts, turn_units
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
-from pipeline.models.effects.drive_lag import TIME_CONSTANT
+from pipeline.models.families import TIME_CONSTANT, is_one_motion
 from pipeline.models.filters import lag_signal
-from pipeline.models.parameter import Conditions, Quantity
+from pipeline.models.parameter import Quantity
 from pipeline.run.signals import Rolling, RunContext, Velocity
 
 LEAST_LAG_S = 0.02
@@ -39,22 +39,12 @@ class BodyInertia(BodyEffect):
             between_runs=Spread(0.034),
         ),
     )
-    motion = "Body inertia: time constant {tau:.2f} s from wheel speed to body speed"
-    clause = "follows its wheel speeds with a time constant of {tau:.2g} s"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("lateral_skid", "drive_lag", "acceleration_limit", "heading_skew")
     equivalent_to = ("drive_lag",)
     equivalent_when = "if the run never turns, or only turns on the spot"
     late = Late.BODY
-    python_state = ("slide_x", "slide_y", "slide_w")
-    python = """
-        keep = math.exp(-step_s / {tau}) if {tau} > 0.0 else 0.0
-        slide_w = v_w + (slide_w - v_w) * keep
-        turn = slide_w * step_s
-        ahead, aside = v_x + (slide_x - v_x) * keep, v_y + (slide_y - v_y) * keep
-        slide_x = ahead * math.cos(turn) + aside * math.sin(turn)
-        slide_y = aside * math.cos(turn) - ahead * math.sin(turn)
-        v_x, v_y, v_w = slide_x, slide_y, slide_w"""
+    is_equivalent = is_one_motion
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""
@@ -69,7 +59,3 @@ class BodyInertia(BodyEffect):
         along = join_parts(rolling.v0, rolling.s0) * frame
         slide = lag_signal(along, tau, step, resets, start) * np.conj(frame)
         return Velocity(slide.real, slide.imag, w)
-
-    def is_equivalent(self, conditions: Conditions) -> bool:
-        """Encoders distinguish wheel from body; without them driving and turning in one run are needed."""
-        return not (conditions.encoders or conditions.largest.moves_both_ways)

@@ -35,10 +35,6 @@ class ClockOffset(ReportEffect):
             between_runs=Spread(0.14),
         ),
     )
-    motion = "Clock offset: poses are stamped {size:.0f} ms {way}"
-    clause = "the poses are stamped {size:.0f} ms {way}"
-    ways = ("late", "early")
-    size_in = 1e3
     needs = (Excitation.CHANGES,)
     confused_with = ("drive_lag", "body_inertia")
     equivalent_to = ("transport_delay",)

@@ -21,7 +21,7 @@ measured on the DRIVE recordings.
 
 import math
 from collections.abc import Sequence
-from typing import Self
+from typing import Self, cast
 
 import numpy as np
 
@@ -105,34 +105,11 @@ class ContactFriction(JointBody):
         {"friction": 0.11, "creep": 0.3, "k": 1.65, "gyration": 0.9},
         {"friction": 0.3, "creep": 0.5, "k": 2.5, "gyration": 1.8},
     )
-    motion = "Contact friction: coefficient {friction:.2g}, effective track {k:.3g} times nominal"
-    clause = "skids with a friction coefficient of {friction:.2g}"
     needs = (Excitation.CHANGES, Excitation.TURNING)
     confused_with = ("body_inertia", "effective_track", "lateral_skid", "turning_resistance")
     contains = ("effective_track", "body_inertia")
     companions = ("lateral_skid",)
     is_kinematic = True
-    python_state = ("body_x", "body_y", "body_w")
-    python = """
-        before, push_x, push_y, push_w, stiffness = (body_x, body_y, body_w), 0.0, 0.0, 0.0, 0.0
-        reach, inertia = B / 2.0 * math.sqrt({k} - 1.0), max({gyration}, 1e-3) ** 2
-        for aside, rolled in ((B / 2.0, v0 - w0 * B / 2.0), (-B / 2.0, v0 + w0 * B / 2.0)):
-            for ahead in (-reach, reach):
-                slip_x, slip_y = rolled - body_x + aside * body_w, -body_y - ahead * body_w
-                rolling = max({creep}, 1e-3) * math.hypot(rolled, 0.1)
-                share = 0.25 * 9.80665 / math.hypot(rolling, math.hypot(slip_x, slip_y) / {friction})
-                push_x, push_y = push_x + share * slip_x, push_y + share * slip_y
-                push_w += (ahead * slip_y - aside * slip_x) * share / (inertia * B * B / 4.0)
-                stiffness += share
-        damped = 1.0 + stiffness * step_s / 2.0
-        ahead = body_x + push_x * step_s / damped
-        aside = body_y + push_y * step_s / damped
-        body_w += push_w * step_s / (1.0 + stiffness * step_s / 2.0 * {k} / inertia)
-        turn = body_w * step_s
-        body_x = ahead * math.cos(turn) + aside * math.sin(turn)
-        body_y = aside * math.cos(turn) - ahead * math.sin(turn)
-        v_x, v_y, v_w = ((a + b) / 2.0 for a, b in zip(before, (body_x, body_y, body_w)))
-        v0, w0 = v_x, v_w"""
 
     def is_degenerate(self, conditions: Conditions) -> bool:
         """Whether it is a wider track: even wheels that skid in the fastest turn make the body no later."""
@@ -142,7 +119,7 @@ class ContactFriction(JointBody):
 
     def collapse(self) -> Effect | None:
         """An effective track of the same ratio."""
-        return EffectiveTrack().change_within(k=self.values["k"])
+        return cast("Effect", EffectiveTrack().change_within(k=self.values["k"]))
 
     def move_body(self, rolling: Rolling, context: RunContext) -> Velocity:
         """See the formula above."""

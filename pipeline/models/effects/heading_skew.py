@@ -37,9 +37,6 @@ class HeadingSkew(ReportEffect):
             one_sign=True,
         ),
     )
-    motion = "Heading skew: the heading is {size:.0f} ms {way} than the position"
-    ways = ("older", "newer")
-    size_in = 1e3
     needs = (Excitation.TURNING, Excitation.SPEED_SPREAD)
     confused_with = ("lateral_skid", "body_inertia", "icr_offset")
     late = Late.HEADING

@@ -1,66 +1,45 @@
 """ICR offset: the vehicle turns about a point ahead of or behind its reference point.
 
-    v_y += -x_icr * w
-
-w is the yaw rate of the model. x_icr [m], -0.08 to 0.24, positive ahead; a load at the back moves it back. A
-car turns about its rear axle, to -1.35 behind a base_link in its middle.
-Spin on the spot and drive curves.
+v_w is the yaw rate of the model. x_icr [m], -0.08 to 0.24, positive ahead; a load at the back moves it
+back. A car turns about its rear axle, to -1.35 behind a base_link in its middle. Spin on the spot and drive
+curves.
 
 Source: Mandow et al., IROS 2007, the longitudinal coordinate of the instantaneous centres of rotation.
 """
 
-from collections.abc import Mapping
-
-from pipeline.models.effect import (
-    Column,
-    Excitation,
-    Least,
-    LinearEffect,
-    Parameter,
-    Place,
-    Plausible,
-    Spread,
-)
-from pipeline.run.signals import Rolling, RunContext, Velocity
+from pipeline.models.families import Effect, Excitation, Least, Parameter, Place, Plausible, Spread, declare
 from pipeline.sources import Vehicle
 
 
-class IcrOffset(LinearEffect):
-    """ICR offset: the vehicle turns about a point ahead of or behind its reference point."""
+def _is_outside(effect: Effect, vehicle: Vehicle) -> bool:
+    """Whether the centre is outside of the axles for any base_link between them: a sensor position."""
+    size = vehicle.wheelbase_m or vehicle.track_width_m
+    return size is not None and abs(effect.values["x_icr"]) > size
 
-    id = "icr_offset"
-    place = Place.CENTRE
-    parameters = (
-        Parameter(
-            "x_icr",
-            "m",
-            (-2.0, 2.0),
-            0.0,
-            "centre of rotation ahead of base_link",
-            0.12,
-            least=Least(0.004, Least.MOUNTING),
-            plausible=Plausible(
-                -1.6,
-                1.6,
-                "the middle of a sedan is 1.35 m ahead of its rear axle, a mast may stand as far behind",
-            ),
-            between_runs=Spread(0.013),
+
+IcrOffset = declare(
+    "icr_offset",
+    __doc__,
+    "v_y += -x_icr * v_w",
+    Parameter(
+        "x_icr",
+        "m",
+        (-2.0, 2.0),
+        0.0,
+        "centre of rotation ahead of base_link",
+        0.12,
+        least=Least(0.004, Least.MOUNTING),
+        plausible=Plausible(
+            -1.6,
+            1.6,
+            "the middle of a sedan is 1.35 m ahead of its rear axle, a mast may stand as far behind",
         ),
-    )
-    motion = "Centre of rotation: {length} {way} base_link"
-    clause = "rotates about a point {length} {way} its reference point"
-    ways = ("ahead of", "behind")
-    needs = (Excitation.TURNING,)
-    confused_with = ("lateral_skid", "heading_skew")
-    equivalent_to = ("lever_arm",)
-    equivalent_when = "always: a pose measured at l_x = -x_icr moves in the same way"
-    python = "v_y = v_y - {x_icr} * v_w"
-
-    def is_outside(self, vehicle: Vehicle) -> bool:
-        """Whether the centre is outside of the axles for any base_link between them: a sensor position."""
-        size = vehicle.wheelbase_m or vehicle.track_width_m
-        return size is not None and abs(self.values["x_icr"]) > size
-
-    def columns(self, rolling: Rolling, velocity: Velocity, context: RunContext) -> Mapping[str, Column]:
-        """See the formula above."""
-        return {"x_icr": (0.0, -velocity.w, 0.0)}
+        between_runs=Spread(0.013),
+    ),
+    needs=(Excitation.TURNING,),
+    confused_with=("lateral_skid", "heading_skew"),
+    equivalent_to=("lever_arm",),
+    equivalent_when="always: a pose measured at l_x = -x_icr moves in the same way",
+    place=Place.CENTRE,
+    is_outside=_is_outside,
+)

@@ -31,14 +31,7 @@ class SteeringSensorPlay(KinematicEffect):
     parameters = (
         replace(SteeringPlay.parameters[0], about="half of the play between steering sensor and tyres"),
     )
-    motion = "Steering sensor play: {angle} of free travel between steering sensor and tyres"
-    clause = "has {angle} of free travel between steering sensor and tyres"
-    size_in = SteeringPlay.size_in
     needs, confused_with = SteeringPlay.needs, SteeringPlay.confused_with
-    python_state = ("behind",)
-    python = """
-        behind = min(max(behind, steering - {g}), steering + {g})
-        w0 = w0 + v0 * (math.tan(behind) - math.tan(steering)) / WHEELBASE"""
 
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""

@@ -10,13 +10,11 @@ Source: piecewise-constant slip; the deployments of Samson et al. 2024.
 """
 
 import math
-from collections.abc import Iterable
 
 import numpy as np
 
 from pipeline.models.effect import (
     NAN,
-    Effect,
     Excitation,
     KinematicEffect,
     Least,
@@ -26,7 +24,6 @@ from pipeline.models.effect import (
 )
 from pipeline.models.parameter import Conditions
 from pipeline.run.signals import Rolling, RunContext
-from pipeline.sources import Vehicle
 
 _LEAST = Least(0.08, Least.GROUND)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")
@@ -70,29 +67,6 @@ class TerrainChange(KinematicEffect):
     confused_with = ("time_drift", "wheel_radius", "effective_track")
     contains = ("effective_track", "wheel_radius", "time_drift")
     # A change point reduces any residual a little.
-
-    def describe_motion(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """What the vehicle does, with numbers."""
-        speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
-        return (
-            f"Terrain change {self._format_where()}: speed {speed:.0f} %, yaw rate {turning:.0f} % of before"
-        )
-
-    def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
-        """The effect as a clause of a sentence."""
-        speed, turning = (100.0 * self.values[name] for name in ("k_v", "k_w"))
-        return f"drives at {speed:.0f} % and turns at {turning:.0f} % of before {self._format_where()}"
-
-    def _format_where(self) -> str:
-        at_x, at_s = self.values["at_x"], self.values["at_s"]
-        return f"beyond x = {at_x:.3g} m" if math.isfinite(at_x) else f"from {at_s:.0f} s on"
-
-    def choose_python(self, kind: str) -> str | None:
-        """Its step in the exported function: at the position of the change if given, else at its time."""
-        beyond = "x > {at_x}" if math.isfinite(self.values["at_x"]) else "t >= {at_s}"
-        return f"""
-        if {beyond}:
-            v0, s0, w0 = {{k_v}} * v0, {{k_v}} * s0, {{k_w}} * w0"""
 
     def roll(self, rolling: Rolling, context: RunContext) -> Rolling:
         """See the formula above."""

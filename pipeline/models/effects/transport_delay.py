@@ -1,54 +1,53 @@
 """Transport delay: the wheels follow their command after a dead time.
 
-    Omega(t) = u(t - d)
-
 d [s], 0.05 to 0.4: network, controller period, drive. Change commands often; ramps alone show only the sum
 of delay and lag.
 
 Source: dead time of a first order plus dead time process; Astrom and Hagglund, Advanced PID Control.
 """
 
-from dataclasses import replace
+from pipeline.models.families import (
+    LEAST_DELAY_S,
+    WARTHOG_LAGS,
+    Conditions,
+    Effect,
+    Excitation,
+    Least,
+    Parameter,
+    Plausible,
+    Quantity,
+    Spread,
+    declare,
+)
 
-from pipeline.models.effect import CommandEffect, Excitation, Least, Parameter, Plausible, Spread
-from pipeline.models.parameter import LEAST_DELAY_S, WARTHOG_LAGS, Conditions, Quantity
-from pipeline.run.signals import Commands, RunContext
+
+def _has_one_clock(effect: Effect, conditions: Conditions) -> bool:
+    """Whether there is no other clock: neither encoders nor a gyro."""
+    return not (conditions.encoders or conditions.gyro)
 
 
-class TransportDelay(CommandEffect):
-    """Transport delay: the wheels follow their command after a dead time."""
-
-    id = "transport_delay"
-    rank = 40
-    parameters = (
-        Parameter(
-            "d",
-            "s",
-            (0.0, 1.0),
-            0.0,
-            "dead time from command to wheels",
-            0.2,
-            starts=(0.05, 0.15, 0.3, 0.5),
-            step=5e-3,
-            least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=1.0),
-            plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
-            between_runs=Spread(0.06, WARTHOG_LAGS),
-            quantities=(Quantity.COMMAND_DELAY,),
-        ),
-    )
-    motion = "Transport delay: dead time {d:.2f} s"
-    clause = "follows commands after a dead time of {d:.2g} s"
-    needs = (Excitation.CHANGES,)
-    confused_with = ("drive_lag", "turn_lag", "body_inertia")
-    equivalent_to = ("clock_offset",)
-    equivalent_when = "if the input is the command and there are no encoders, no gyro and no other clock"
-
-    python = ""  # the exported function reads commands with this delay
-
-    def change_commands(self, commands: Commands, context: RunContext) -> Commands:
-        """See the formula above."""
-        return replace(commands, times=commands.times + self.values["d"])
-
-    def is_equivalent(self, conditions: Conditions) -> bool:
-        """Whether there is no other clock: neither encoders nor a gyro."""
-        return not (conditions.encoders or conditions.gyro)
+TransportDelay = declare(
+    "transport_delay",
+    __doc__,
+    "Omega(t) = u(t - d)",
+    Parameter(
+        "d",
+        "s",
+        (0.0, 1.0),
+        0.0,
+        "dead time from command to wheels",
+        0.2,
+        starts=(0.05, 0.15, 0.3, 0.5),
+        step=5e-3,
+        least=Least(LEAST_DELAY_S, Least.STAMPS, sampled=1.0),
+        plausible=Plausible(0.0, 0.8, "wider than the 0.5 s after which a ros2_control drive stops"),
+        between_runs=Spread(0.06, WARTHOG_LAGS),
+        quantities=(Quantity.COMMAND_DELAY,),
+    ),
+    rank=40,
+    needs=(Excitation.CHANGES,),
+    confused_with=("drive_lag", "turn_lag", "body_inertia"),
+    equivalent_to=("clock_offset",),
+    equivalent_when="if the input is the command and there are no encoders, no gyro and no other clock",
+    is_equivalent=_has_one_clock,
+)

@@ -37,7 +37,7 @@ import numpy as np
 
 from pipeline.core.arrays import Floats
 from pipeline.models.effect import INF, Excitation, Least, Parameter, Plausible, Search
-from pipeline.models.effects.drive_lag import TIME_CONSTANT
+from pipeline.models.families import TIME_CONSTANT
 from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
@@ -66,6 +66,7 @@ class WheelServo(JointDrive):
 
     id = "wheel_servo"
     rank = 31
+    has_state = True
     kinds = ("differential",)
     parameters = (
         replace(
@@ -161,8 +162,6 @@ class WheelServo(JointDrive):
         {"tau": 0.17, "reset": 0.37, "drag": 0.08, "bound": 1.3, "no_load": 5.0, "scrub": 0.2, "creep": 0.3},
         {"tau": 0.4, "reset": 0.1, "drag": 0.05, "bound": 0.6, "no_load": 5.0, "scrub": 0.5, "creep": 0.065},
     )
-    motion = "Wheel servo: ground friction slows the wheels below their commanded speed"
-    clause = "has its wheels slowed by ground friction (time constant {tau:.2g} s)"
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
     contains = ("deadband", "drive_lag", "turn_lag", "difference_gain")
@@ -173,66 +172,6 @@ class WheelServo(JointDrive):
         "turn_acceleration_limit",
         "wheel_speed_limit",
     )
-    python_state = (
-        *("rolled_left", "rolled_right", "load_v", "load_w", "push_left", "push_right"),
-        *("more_left", "more_right", "more_v", "more_w", "imbalance"),
-    )
-    python = """
-        rate, aside, tau = 2.0 / step_s, B / 2.0, max({tau}, 0.01)
-        gain, asked, rolled = 0.85 / tau, (left * R, right * R), (rolled_left, rolled_right)
-        widest, slope = max({scrub}, 1e-6) / tau, {bound} / {no_load} if {bound} < math.inf else 0.0
-        is_driven = max(abs(left), abs(right)) * R >= 1e-6
-        pushes = (push_left, push_right) if is_driven else (0.0, 0.0)
-        near = (rolled_left + more_left, rolled_right + more_right)
-        near_v, near_w = load_v + more_v, load_w + more_w
-        most = [
-            [gain * max({bound} * (1.0 + side * imbalance) - way * slope * u, 0.0) for way in (1.0, -1.0)]
-            for u, side in zip(near, (-0.5, 0.5))
-        ]
-        grip = [
-            0.5 * ({scrub} > 0.0) / math.hypot(
-                {creep} * tau * u, 0.01 * tau,
-                math.hypot(u - near_v - way * aside * near_w, 0.75**0.5 * aside * near_w) / widest)
-            for u, way in zip(near, (-1.0, 1.0))
-        ]
-        bound = [0.0, 0.0]
-        for _ in range(3):
-            held = [
-                0.35 * rate + gain * ({drag} / math.hypot(u, 0.05) + 1.0 - abs(s)) + f
-                for u, f, s in zip(near, grip, bound)
-            ]
-            free = [
-                (0.35 * rate * u + (s * m[s < 0.0] if s else gain * c + z)) / h
-                for u, c, z, s, h, m in zip(rolled, asked, pushes, bound, held, most)
-            ]
-            firm = [f * (1.0 - f / h) for f, h in zip(grip, held)]
-            a, b, c = rate + sum(firm), aside * (firm[1] - firm[0]), aside ** 2 * (
-                rate + sum(firm) + 0.75 * sum(grip))
-            p = rate * load_v + grip[0] * free[0] + grip[1] * free[1]
-            q = aside ** 2 * rate * load_w + aside * (grip[1] * free[1] - grip[0] * free[0])
-            turn = (q * a - b * p) / (a * c - b * b)
-            ahead = (p - b * turn) / a
-            reached = [
-                u + f / h * (ahead + way * aside * turn)
-                for u, f, h, way in zip(free, grip, held, (-1.0, 1.0))
-            ]
-            pull = [gain * (c - u) + z for c, u, z in zip(asked, reached, pushes)]
-            more = [
-                s or (math.copysign(1.0, g) if abs(g) > m[g < 0.0] else 0.0)
-                for g, s, m in zip(pull, bound, most)
-            ]
-            if more == bound:
-                break
-            bound = more
-        grown = [{reset} * gain * (c - u) * step_s * is_driven for c, u in zip(asked, reached)]
-        room = [max(m[g < 0.0] - abs(g), 0.0) for g, m in zip(pull, most)]
-        grown = [max(-d, min(d, n)) if n * g > 0.0 else n for n, d, g in zip(grown, room, pull)]
-        push_left, push_right = (z + n for z, n in zip(pushes, grown))
-        more_left, more_right = (m - u for m, u in zip(reached, rolled))
-        more_v, more_w = ahead - load_v, turn - load_w
-        rolled_left, rolled_right = reached[0] + more_left, reached[1] + more_right
-        load_v, load_w = ahead + more_v, turn + more_w
-        left, right = reached[0] / R, reached[1] / R"""
 
     def list_starts(self, largest: Largest) -> list[dict[str, float]]:
         """The starts, and the same with speeds in proportion to the fastest rim where it is another one."""
