@@ -21,6 +21,7 @@ from pipeline.core import (
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
+from pipeline.results import RunDiagnosis, read_result
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -208,10 +209,10 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
-    from pipeline.estimation.verdict import has_no_pose  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import has_no_pose, read_findings  # noqa: PLC0415 - heavy
 
     named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
-    if has_no_pose(summary):
+    if has_no_pose(read_findings(summary)):
         named += " of the drivetrain, not of the ground,"
     medians = _format_medians(by_input, "median_modulus")
     if not everything:
@@ -308,10 +309,12 @@ def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.estimation.diagnosis_lines import FINDING_LABELS, choose_lines  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import FINDING_LABELS, choose_lines, list_lines  # noqa: PLC0415 - heavy
 
-    stored = mapping_in(summary, "diagnosis").get("lines") or []
-    lines = choose_lines(cast("Sequence[tuple[str, str]]", stored), everything=everything)
+    stored = mapping_in(summary, "diagnosis")
+    if not stored:
+        return []
+    lines = choose_lines(list_lines(read_result(stored, RunDiagnosis)), everything=everything)
     described: list[str] = []
     label = ""
     for name, text in lines:

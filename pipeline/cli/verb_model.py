@@ -427,7 +427,7 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
         format_recordings,
         parameters_as_json,
     )
-    from pipeline.estimation.ladder import describe_step, format_ladder  # noqa: PLC0415 - heavy
+    from pipeline.words.errors import describe_step, format_ladder  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
@@ -447,7 +447,7 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.ladder import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
+    from pipeline.words.errors import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
     lines = list(format_heads("held-out error of"))
     for name, item in rows:

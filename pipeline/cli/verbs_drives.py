@@ -28,11 +28,12 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
-    from pipeline.estimation import Recording, RunDiagnosis
+    from pipeline.estimation import Recording
     from pipeline.fleet.forecast import Forecast
     from pipeline.job import Options
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
+    from pipeline.results import RunDiagnosis
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 

@@ -25,12 +25,12 @@ from pipeline.core import CONFIDENCE, JSON_DIGITS, SlipError, finite_or_none
 from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, robust_spreads, student_quantile
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
-from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.model import Model, Timing
+from pipeline.results.reading import ERRORS_OVER_2S, read_error
 from pipeline.run import MotionError
 from pipeline.run.heading import MeasuredDrive
 from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally

@@ -11,7 +11,6 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
 from pipeline.core.untrusted import read_bounded
-from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
 from pipeline.fleet.deployments import (
@@ -49,6 +48,7 @@ from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material,
 from pipeline.job.prediction import fit_results
 from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.store import Store
+from pipeline.words.effects import CAUSE_NAMES
 
 _EFFECT = "effect"
 

@@ -373,6 +373,13 @@ MANOEUVRES: Mapping[Excitation, str] = {
 }
 
 
+def name_term(name: str) -> str:
+    """An effect by its term in place of its id: `lateral centre of rotation`."""
+    known = {effect.id: effect.motion or effect.__doc__ or "" for effect in list_effects()}
+    term = known.get(name, "").partition(":")[0] or name.replace("_", " ")
+    return f"{term[:1].lower()}{term[1:]}"
+
+
 def suggest_manoeuvre(*effects: Effect) -> str:
     """Manoeuvres that excite effects."""
     needs = dict.fromkeys(need for effect in effects for need in effect.needs)

@@ -20,7 +20,6 @@ from pipeline.estimation import (
     diagnose_runs,
     load_recording,
 )
-from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
@@ -31,6 +30,7 @@ from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
+from pipeline.results import Errors, read_result, to_json
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -46,6 +46,10 @@ from pipeline.simulate import (
     Recording as Recorded,
 )
 from pipeline.sources import Vehicle, find_preset
+from pipeline.words.diagnosis import describe, list_lines
+from pipeline.words.effects import describe_separation
+from pipeline.words.errors import describe_structure
+from pipeline.words.objects import diagnosis_as_json
 
 _SCENE = Scenario(
     duration_s=120.0, seed=7, disturbance=Disturbance(0.02, 0.03), pose=PoseSensor(drift_m=0.005)
@@ -78,8 +82,8 @@ def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
     track = named["effective_track"].parameters["k"]
     assert track.low < 1.8 < track.high
     assert named["drive_lag"].parameters["tau"].value == pytest.approx(0.4, abs=0.02)
-    assert named["drive_lag"].path == "wheels"
-    assert named["effective_track"].path == "measured"
+    assert named["drive_lag"].found_on == "wheels"
+    assert named["effective_track"].found_on == "measured"
 
 
 def test_what_a_planner_would_not_feel_has_no_name(tmp_path: Path) -> None:
@@ -88,10 +92,10 @@ def test_what_a_planner_would_not_feel_has_no_name(tmp_path: Path) -> None:
     diagnosis = _diagnose(quiet, tmp_path, inputs=("measured",))
     found = diagnosis.runs[0]
     assert [effect.id for effect in found.effects] == ["effective_track"]
-    assert all("icr_offset" not in str(rung["effects"]) for rung in found.ladder)
-    (run,) = diagnosis.to_json()
+    assert all("icr_offset" not in rung.effects for rung in found.ladder)
+    run = diagnosis_as_json(diagnosis.runs[0])
     assert "icr_offset" not in str(run["model"])
-    assert "icr_offset" not in describe(diagnosis)
+    assert "icr_offset" not in describe(diagnosis.runs)
 
 
 _CAR = replace(
@@ -114,7 +118,7 @@ def test_a_gyro_does_not_turn_one_effect_into_another(
     hidden: str, size: float, way: str, imu: Imu | None, tmp_path: Path
 ) -> None:
     found = _diagnose(replace(_CAR, effects={hidden: size}, imu=imu), tmp_path).runs[0]
-    assert [(effect.id, effect.path) for effect in found.effects] == [(hidden, way)]
+    assert [(effect.id, effect.found_on) for effect in found.effects] == [(hidden, way)]
     (value,) = found.effects[0].parameters.values()
     assert value.value == pytest.approx(size, rel=0.15)
 
@@ -157,14 +161,14 @@ def test_an_old_heading_is_found_against_the_gyro_and_rated_with_the_position_as
     assert named.id == "heading_skew"
     assert named.parameters["d"].value == pytest.approx(0.1, abs=0.02)
     # The heading that is compared is the gyro's: what falls is the error of the position.
-    assert run.ladder[-1]["t_mrmse_m"] < 0.9 * run.ladder[0]["t_mrmse_m"]  # type: ignore[operator]
+    assert run.ladder[-1].t_mrmse_m < 0.9 * run.ladder[0].t_mrmse_m
 
 
 def test_driven_straight_only_turning_is_said_to_be_unobservable(tmp_path: Path) -> None:
     scenario = replace(_SCENE, effects={"effective_track": 1.8}, program=Program("straight"))
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
-    hidden = {item.id: item for item in run.unobservable}
+    hidden = run.unobservable_why
     assert "effective_track" in hidden
     assert "turn" in hidden["effective_track"].manoeuvre
 
@@ -174,15 +178,15 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
     assert "turning_resistance" in run.undecided[0].candidates
-    assert run.undecided[0].separate_by
+    assert describe_separation(run.undecided[0])
     # In the place of the others it is known.
-    known = run.undecided[0].numbers["turning_resistance"]["k"]
+    known = run.undecided[0].parameters["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
     lines = [" ".join(text.split()) for _, text in list_lines(run)]
     assert any(line.startswith("turning_resistance k = 0.2") for line in lines)
     assert "This log does not decide between" in lines[0]
     assert "turning resistance" in lines[0]
-    held = run.find_held(run.undecided[0])
+    held = run.undecided[0].in_model
     assert run.proposal is not None
     write_model(run.proposal, tmp_path / "model.toml")
     assert read_model(tmp_path / "model.toml").undecided == [list(run.undecided[0].candidates)]
@@ -195,7 +199,7 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     scenario = replace(_SCENE, effects={"wheel_radius": 0.0}, disturbance=Disturbance())
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
-    assert "not_moving" in {finding["id"] for finding in run.findings}
+    assert "not_moving" in {finding.id for finding in run.findings}
     told = describe(Diagnosis((run,)))
     assert "No effect can be estimated." in told
     assert told.lower().count("the vehicle does not move") == 1
@@ -215,7 +219,7 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     assert left.formula is not None
     # The model that is written is the model of the ladder, without the formula.
     assert run.proposal is not None
-    assert list(run.proposal.model.ids) == run.ladder[-1]["effects"]
+    assert run.proposal.model.ids == run.ladder[-1].effects
     assert not any(isinstance(effect, FormulaEffect) for effect in run.proposal.model)
     model = tmp_path / "model.toml"
     model.write_text(f'format = 1\n[vehicle]\npreset = "husky_a200"\n\n{left.formula}', encoding="utf-8")
@@ -224,8 +228,8 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     # What it is said to bring is what the model has with it.
     problem = Problem([load_recording(recording, vehicle)], vehicle, Input(run.input))
     whole = judge_whole(problem, run.proposal.model + formula.effect("unexplained"))
-    assert left.reached == errors_as_json(whole.errors)
-    before, after = (one["velocity_rms"][0] for one in (run.ladder[-1], left.reached))  # type: ignore[index]
+    assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
+    before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]
     assert "would remain over 2 s" in describe(Diagnosis((run,)))
 
@@ -238,9 +242,9 @@ def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tm
     left = run.unexplained
     assert left is not None
     assert "w" in left.channels
-    assert "no term that was tried predicts it" in left.where
+    assert "no term that was tried predicts it" in describe_structure(left)
     assert left.formula is None
-    assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
+    assert run.noise_floor.velocity_rms[2] < 0.5 * run.ladder[-1].velocity_rms[2]
 
 
 def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
@@ -288,9 +292,9 @@ def test_a_diagnosis_is_the_same_each_time_on_one_core_or_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording, vehicle = _record(replace(_SCENE, effects={"lateral_skid": 0.1}), tmp_path)
-    first = diagnose_runs([recording], vehicle).to_json()
+    first = [to_json(one) for one in diagnose_runs([recording], vehicle).runs]
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
-    assert diagnose_runs([recording], vehicle).to_json() == first
+    assert [to_json(one) for one in diagnose_runs([recording], vehicle).runs] == first
 
 
 @pytest.mark.long

@@ -8,23 +8,15 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.estimation import (
-    Comparison,
-    Errors,
-    Input,
-    Problem,
-    RunDiagnosis,
-    diagnose_runs,
-    fit_model,
-    load_recording,
-)
+from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.plausibility import find_implausible
-from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model, Timing, find_effect
+from pipeline.results import RunDiagnosis
+from pipeline.words.verdict import format_verdict
 
 if TYPE_CHECKING:
     from pipeline.run import MotionRun
@@ -131,7 +123,7 @@ def test_every_recording_is_looked_at() -> None:
 
 @pytest.mark.parametrize("name", sorted(_FAULTS))
 def test_known_faults_are_found_and_said(asked: Asked, name: str) -> None:
-    found = {finding["id"] for finding in asked.diagnose(name, "measured").findings}
+    found = {finding.id for finding in asked.diagnose(name, "measured").findings}
     assert _FAULTS[name] <= found
 
 
@@ -159,7 +151,7 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
         values = {key: value.value for key, value in effect.parameters.items()}
         assert find_implausible(find_effect(effect.id)().change(**values)) is None
     considered = {name for item in run.undecided for name in item.candidates}
-    assert set(run.ladder[-1]["effects"]) <= {*named, *considered}
+    assert set(run.ladder[-1].effects) <= {*named, *considered}
     # Contact friction contains the track, and the model has either where the log does not decide.
     assert run.proposal is not None
     (has_track,) = (e for e in run.proposal.model.effects if e.id in {"contact_friction", "effective_track"})
@@ -193,7 +185,7 @@ def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str,
 def test_on_ice_the_rest_is_said_to_be_unexplained(asked: Asked, source: str) -> None:
     """What is left lasts for a second (correlation .25 to .33), too little to call it a structure."""
     run = asked.diagnose("warthog_wheels_ice_2024_7_30_16h30s21", source)
-    verdict = format_verdict(run.to_json())
+    verdict = format_verdict(run)
     assert "times the noise floor" in verdict
     assert "no known effect explains the rest" in verdict.casefold()
     assert run.explained_share < 0.9

@@ -229,9 +229,9 @@ def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
     run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
     problem = Problem([run], HUSKY, Input.MEASURED)
     for rung in climb(problem, model_of("effective_track", "icr_offset")).steps:
-        noise = summarize_disturbance(rung.fitted.fits[0], "")["pose_noise"]
-        assert noise[0] == pytest.approx(0.03, rel=0.15)  # type: ignore[index, call-overload]
-        assert noise[1] == pytest.approx(0.03, rel=0.25)  # type: ignore[index, call-overload]
+        noise = summarize_disturbance(rung.fitted.fits[0]).pose_noise
+        assert noise[0] == pytest.approx(0.03, rel=0.15)
+        assert noise[1] == pytest.approx(0.03, rel=0.25)
 
 
 def test_motion_that_lasts_is_reported_as_such() -> None:

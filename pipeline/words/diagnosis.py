@@ -7,44 +7,63 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from typing import cast
 
-from pipeline.core import INPUT_WORDS, format_angle, format_length, format_part, format_share, mark_finding
-from pipeline.core.untrusted import mapping_in, number_in
-from pipeline.estimation.ambiguity import DETECTED_SHARE, Undecided
-from pipeline.estimation.diagnosis import (
-    CAUSE,
-    Diagnosis,
-    Json,
+from pipeline.core import (
+    INPUT_WORDS,
+    format_angle,
+    format_length,
+    format_part,
+    format_share,
+    mark_finding,
+    suffix_unit,
+)
+from pipeline.models.catalogue import list_effects, name_term
+from pipeline.models.effect import Excitation
+from pipeline.results import (
+    Errors,
+    Learned,
     Named,
     RunDiagnosis,
+    Step,
+    Undecided,
+    Unexplained,
     Value,
-    format_numbers,
     split_determined,
 )
-from pipeline.estimation.error_regions import (
+from pipeline.results.reading import (
     ABOVE_FLOOR,
     BREVITY,
-    format_enough,
-    format_errors,
-    format_remaining_error,
-)
-from pipeline.estimation.ladder import ERRORS_OVER_2S, format_rises
-from pipeline.estimation.verdict import (
-    CAUSE_NAMES,
     CHANGE,
+    DETECTED_SHARE,
+    ERRORS_OVER_2S,
     SEARCH_CUT,
-    format_verdict,
+    format_rises,
     is_small,
     list_added,
     measure_excess,
-    name_effect,
-    name_group,
     split_main,
 )
-from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Excitation
 from pipeline.run.windows import HORIZON_S
+from pipeline.words.effects import (
+    CAUSE_NAMES,
+    describe_cause,
+    describe_motion,
+    describe_separation,
+    format_numbers,
+    format_with_range,
+    name_group,
+    suggest_drive,
+)
+from pipeline.words.errors import (
+    describe_lead,
+    describe_moments,
+    describe_need,
+    describe_region,
+    describe_unexplained,
+    format_remaining_error,
+    format_step,
+)
+from pipeline.words.verdict import format_verdict
 
 Row = tuple[str, str]
 
@@ -65,7 +84,6 @@ _UNOBSERVABLE_SHOWN = 8
 """Unobservable effects that are listed: more would fill a screen."""
 _DETECTABLE_SHOWN = 5
 """Detection limits that are listed, the smallest ones."""
-_CHANNELS = {"x": "forward motion", "y": "lateral motion", "w": "yaw rate"}
 _VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
 _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
 """Inputs of formulas in words."""
@@ -75,35 +93,24 @@ FINDING_LABELS = ("findings", "further", "notes")
 """Labels of the findings: severe ones shown by default, other severe ones, and those of severity info."""
 
 
-def describe(diagnosis: Diagnosis, following: str = "", *, everything: bool = False) -> str:
+def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: bool = False) -> str:
     """A diagnosis as plain text; the common part of runs that were judged together appears once.
 
     Args:
-        diagnosis: of the runs.
+        runs: of one run, or of all that were judged together.
         following: command suggested as the next step, where effects were identified.
         everything: show all sections, not only verdict, main effects and remaining error.
     """
-    first, *others = diagnosis.runs
+    first, *others = runs
     heads = [first.run, *(run.run for run in others)]
-    heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason)}"
+    heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason or '')}"
     lines = list_lines(first)
     for run in others:
         lines += _list_findings(run, prefix=f"{run.run}: ")
-    return _write(heads, lines, following if first.effects else "", everything=everything)
-
-
-def format_stored(stored: Mapping[str, object], following: str = "", *, everything: bool = False) -> str:
-    """The text of `describe` for one run whose JSON object was stored with its `list_lines`."""
-    head = f"{stored['run']}    {_name_input(str(stored['input']), str(stored.get('input_reason') or ''))}"
-    lines = cast("Sequence[Row]", stored["lines"])
-    return _write([head], lines, following if stored["effects"] else "", everything=everything)
-
-
-def _write(heads: Sequence[str], lines: Sequence[Row], following: str, *, everything: bool) -> str:
     rows = format_lines(choose_lines(lines, everything=everything))
-    return "".join(
-        f"{line}\n" for line in [*heads, *rows, *([f"next      {following}"] if following else [])]
-    )
+    if following and first.effects:
+        rows.append(f"next      {following}")
+    return "".join(f"{line}\n" for line in [*heads, *rows])
 
 
 def format_lines(lines: Sequence[Row]) -> list[str]:
@@ -134,7 +141,7 @@ def _name_input(source: str, reason: str) -> str:
 
 def list_lines(run: RunDiagnosis) -> list[Row]:
     """Label and text of every line after the head; a line without a label continues the section above."""
-    verdict = format_verdict(run.to_json())
+    verdict = format_verdict(run)
     findings = _list_findings(run, verdict)
     lines = [(VERDICT, verdict)]
     if not run.ladder:
@@ -145,28 +152,30 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     short = [effect for effect in main if len(effect.shown) <= _MOST_IN_LINE]
     width = max((len(_format_values(effect)) for effect in short), default=0)
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
-    effects += [text for item in felt for text in _format_ambiguous(item, run, falls)]
-    folded = [name_effect(effect.id) for effect in minor]
+    effects += [text for item in felt for text in _format_ambiguous(item, falls)]
+    folded = [name_term(effect.id) for effect in minor]
     # Commas separate the effects of this list, so alternatives are joined by `or` alone.
     folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
     if folded:
         effects.append(f"{len(folded)} smaller effect{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
     lines += _label("effects", effects)
     lines += _label("remaining", _format_remaining(run))
-    lines += _label("learned", [] if run.learned.get("kept") else [format_learned_share(run.learned)])
+    lines += _label(
+        "learned", [] if run.learned is None or run.learned.kept else [format_learned_share(run.learned)]
+    )
     lines += findings
     others = [text for one in minor for text in _format_effect(one, run, falls)]
-    others += [text for item in small for text in _format_ambiguous(item, run, falls)]
+    others += [text for item in small for text in _format_ambiguous(item, falls)]
     lines += _label("smaller", others)
-    lines += _label("open", [*(effect.motion for effect in unknown), _format_unknown(run)])
+    lines += _label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)])
     lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
     lines += _label("clocks", [_format_encoders(run)])
     lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
-    lines += _label("error", [f"{format_errors(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"])
-    lines += _label("where", [region.sentence for region in run.where[:_WHERE_SHOWN]])
-    lines += _label("when", [one.sentence for one in run.when])
+    lines += _label("error", [f"{format_step(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"])
+    lines += _label("where", [describe_region(one) for one in run.where[:_WHERE_SHOWN] if one.id])
+    lines += _label("when", [describe_moments(one) for one in run.when])
     lines += _label("budget", [_format_budget(run)])
-    lines += _label("data", [format_enough(run.effects, run.findings)])
+    lines += _label("data", [describe_need(run)])
     lines += _label("unseen", _format_unobservable(run))
     return [*lines, *_label("limits", [_format_detectable(run)])]
 
@@ -197,7 +206,7 @@ def _format_unknown(run: RunDiagnosis) -> str:
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
     """Groups with an effect that removes a tenth of the error or with none in the model; smaller groups."""
-    small = [item for item in run.undecided if is_small(run.find_held(item) or "", run.ladder)]
+    small = [item for item in run.undecided if is_small(item.in_model, run.ladder)]
     return [item for item in run.undecided if item not in small], small
 
 
@@ -205,7 +214,7 @@ def _format_effect(
     effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
 ) -> Iterator[str]:
     """The motion due to an effect, then its id with values, error reductions and qualifications."""
-    yield effect.motion
+    yield describe_motion(effect, run)
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["corrected before the fit"] if effect.corrected else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
@@ -231,32 +240,32 @@ def _pad_id(name: str) -> str:
     return f"{name + '  ':<20}"
 
 
-def _format_ambiguous(item: Undecided, run: RunDiagnosis, falls: Mapping[str, str]) -> Iterator[str]:
-    held = run.find_held(item)
+def _format_ambiguous(item: Undecided, falls: Mapping[str, str]) -> Iterator[str]:
     yield f"Undecided: {name_group(item.candidates)}"
     for name in item.candidates:
-        if numbers := split_determined(item.numbers.get(name, {}))[0]:
-            notes = [falls.get(name, ""), "(in the model)"] if name == held else []
+        if numbers := split_determined(item.parameters.get(name, {}))[0]:
+            notes = [falls.get(name, ""), "(in the model)"] if name == item.in_model else []
             yield from _describe_numbers(name, numbers, notes, _format_all(numbers))
-    yield f"{_INDENT}to separate them: {item.separate_by}"
+    yield f"{_INDENT}to separate them: {describe_separation(item)}"
 
 
 def _format_remaining(run: RunDiagnosis) -> list[str]:
     """The remaining error relative to the noise floor, and its structure."""
-    error, floor = (one.get("t_mrmse_m") for one in (run.ladder[-1], run.noise_floor))
-    text = format_remaining_error(error, floor, run.explained_share) if len(run.ladder) > 1 else ""
-    rows = [text.removeprefix("remaining error ")]
-    turn, least = (one.get("r_mrmse_rad") for one in (run.ladder[-1], run.noise_floor))
-    if len(run.ladder) > 1 and isinstance(turn, float) and isinstance(least, float):
-        row = f"{format_angle(turn)} in heading, noise floor {format_angle(least)}"
-        rows += [row] if turn >= ABOVE_FLOOR * least > 0.0 else []
-    if run.learned.get("kept"):
+    last, floor = run.ladder[-1], run.noise_floor or Errors()
+    rows = []
+    if len(run.ladder) > 1:
+        text = format_remaining_error(last.t_mrmse_m, floor.t_mrmse_m, run.explained_share)
+        rows.append(text.removeprefix("remaining error "))
+        if last.r_mrmse_rad >= ABOVE_FLOOR * floor.r_mrmse_rad > 0.0:
+            turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
+            rows.append(f"{turn} in heading, noise floor {least}")
+    if run.learned is not None and run.learned.kept:
         rows.append(format_learned_share(run.learned))
-    if run.unexplained is None:
-        return [*rows, "" if run.effects else run.lead, *_suggest_next_steps(run)]
-    rest = run.unexplained.to_json()
-    rows.append(format_unexplained(rest))
-    rows += [f"suggested term: {line}" for line in _list_formula(run.unexplained.formula or "")]
+    rest = run.unexplained
+    if rest is None:
+        return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
+    rows.append(describe_unexplained(rest))
+    rows += [f"suggested term: {line}" for line in _list_formula(rest.formula or "")]
     return [*rows, format_suggestion(rest), *_suggest_next_steps(run)]
 
 
@@ -271,31 +280,19 @@ def _list_formula(text: str) -> Iterator[str]:
             yield ", ".join([line.replace('"', ""), *known])
 
 
-def format_unexplained(rest: Mapping[str, object]) -> str:
-    """The structure of the residual that no effect explains: its share of the residual, and its dependence.
-
-    A formula is compared with the whole residual, all else with that of one channel.
-    """
-    share = number_in(rest, "share")
-    channel = "" if rest.get("formula") else f" {_CHANNELS.get(str(rest.get('channel')), 'motion')}"
-    what = f"{'part' if share is None else format_share(share)} of the residual{channel}"
-    return f"{what} has a structure that the model does not explain: {rest.get('where', '')}"
-
-
-def format_suggestion(rest: Mapping[str, object]) -> str:
+def format_suggestion(rest: Unexplained) -> str:
     """What a suggested formula would bring; empty without one."""
-    reached = mapping_in(rest, "with_formula")
-    if not reached:
+    if rest.with_formula is None:
         return ""
-    remaining = format_errors(reached)
+    remaining = format_step(rest.with_formula)
     return f"no model holds it until you add it (`slip serve`): {remaining} would remain over {HORIZON_S:g} s"
 
 
 def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     """Suggested steps where no known effect explains the remaining error."""
-    if measure_excess(run.to_json()) < ABOVE_FLOOR:
+    if measure_excess(run) < ABOVE_FLOOR:
         return []
-    noted = {one.get("id") for one in run.findings}
+    noted = {one.id for one in run.findings}
     if CHANGE in noted:
         causes = "load, tyres, battery, controller or terrain"
         return [
@@ -305,41 +302,42 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
         return ["next steps: diagnose the run again with a larger --budget"]
     if BREVITY in noted:
         return ["next steps: drive longer, with turns and speeds of both signs"]
-    steps = ["see what `slip plan` proposes"] if run.undecided or run.unobservable else []
+    steps = ["see what `slip plan` proposes"] if run.undecided or run.unobservable_why else []
     steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
     how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
     return [f"next steps: {'; '.join(steps)}, {how}"]
 
 
-def format_learned_share(learned: Mapping[str, object]) -> str:
+def format_learned_share(learned: Learned) -> str:
     """The share that a learned term explains beyond the physics, or why it does not help; else empty."""
-    if not learned.get("kept"):
-        return f"a learned term does not help: {learned['reason']}" if learned.get("reason") else ""
-    shares = cast("Mapping[str, Mapping[str, float] | None]", learned["explained_share"])
+    if not learned.kept:
+        return f"a learned term does not help: {learned.reason}" if learned.reason else ""
     # Below the noise floor a share is of nothing.
-    known = {ERRORS_OVER_2S[name][0]: one for name, one in shares.items() if one and max(one.values()) < 1.0}
+    known = {
+        ERRORS_OVER_2S[name][0]: one
+        for name, one in learned.explained_share.items()
+        if one is not None and one.physics < 1.0 and one.with_learned < 1.0
+    }
     if not known:
         return ""
-    removed = [f"{format_share(one['physics'])} of the {words} error" for words, one in known.items()]
-    with_learned = " and ".join(format_share(one["with_learned"]) for one in known.values())
+    removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
+    with_learned = " and ".join(format_share(one.with_learned) for one in known.values())
     beyond = f"with a function learned from the data, which names no cause, {with_learned}"
     return f"above the noise floor the effects remove {' and '.join(removed)}; {beyond}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:
-    """Possible causes of an effect."""
-    if effect.sentence != effect.motion:
-        # The motion stands above, under `effects`.
-        cause = effect.sentence.removeprefix(effect.motion).removeprefix(CAUSE).removeprefix("; ")
+    """Possible causes of an effect; its motion stands above, under `effects`."""
+    if cause := describe_cause(effect):
         yield f"{effect.id}: {cause}"
 
 
 def _format_range(effect: Named) -> Iterator[str]:
     """The expected range of values in another run on this ground, where it is known."""
     ends = [
-        f"{name} {value.another_run[0]:.3g} to {value.another_run[1]:.3g}{value.suffix}"
+        f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
         for name, value in effect.parameters.items()
-        if math.isfinite(value.another_run[0])
+        if math.isfinite(value.another_run.low)
     ]
     if ends:
         yield f"expected range between runs: {effect.id} {', '.join(ends)}"
@@ -347,18 +345,19 @@ def _format_range(effect: Named) -> Iterator[str]:
 
 def _format_encoders(run: RunDiagnosis) -> str:
     """How late the encoders are in the fit, beyond what was corrected against the gyro before."""
-    late = number_in(run.timing, "wheel_delay_s")
-    corrected = any(one.get("id") == "wheels_delay" for one in run.findings)
+    late = run.timing.wheel_delay_s
+    corrected = any(one.id == "wheels_delay" for one in run.findings)
     beyond = " beyond the delay corrected before the fit" if corrected else ""
     return f"estimated encoder delay {late * 1e3:.0f} ms{beyond}" if late else ""
 
 
 def _format_budget(run: RunDiagnosis) -> str:
     """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
-    for budget in run.budgets if run.effects else ():
+    for budget in run.budget if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
             parts = [
-                f"{CAUSE_NAMES.get(one.name, one.name)} {format_part(one.share)}" for one in budget.shares
+                f"{CAUSE_NAMES.get(one.effect, one.effect)} {format_part(one.share)}"
+                for _, one in budget.causes
             ]
             signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
@@ -372,7 +371,7 @@ def _format_values(effect: Named) -> str:
 
 def _format_all(numbers: Mapping[str, Value]) -> str:
     """Values by parameter, with their ranges between runs where these are much wider."""
-    return ", ".join(f"{name} = {value.format_with_range()}" for name, value in numbers.items())
+    return ", ".join(f"{name} = {format_with_range(value)}" for name, value in numbers.items())
 
 
 def _list_falls(run: RunDiagnosis) -> dict[str, str]:
@@ -387,13 +386,13 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     return falls
 
 
-def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str) -> str | None:
+def _format_fall(before: Step, after: Step, key: str) -> str | None:
     """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
-    values = [step.get(key) for step in (before, after)]
-    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
-    texts = [render(value) for value in values if isinstance(value, int | float)]
-    if len(texts) < len(values):
+    old, new = getattr(before, key), getattr(after, key)
+    if not math.isfinite(old + new):
         return None
+    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
+    texts = [render(value) for value in (old, new)]
     if texts[0] == texts[1]:
         return ""
     (number, unit), (_, other) = (text.split() for text in texts)
@@ -402,15 +401,16 @@ def _format_fall(before: Mapping[str, Json], after: Mapping[str, Json], key: str
 
 
 def _format_unobservable(run: RunDiagnosis) -> list[str]:
-    hidden = [item.id for item in run.unobservable]
+    hidden = list(run.unobservable_why)
     if not hidden:
         return []
     shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
     others = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
-    manoeuvres = dict.fromkeys(part for item in run.unobservable for part in item.manoeuvre.split("; "))
+    manoeuvres = dict.fromkeys(part for name in hidden for part in suggest_drive(name).split("; "))
     advice = "; ".join(list(manoeuvres)[:3])
     # Only a rehearsal shows what a drive reaches within the limits of the site and the robot.
-    if any(Excitation.SLOPE not in find_effect(name).needs for name in hidden):
+    needs = [kind.needs for kind in list_effects() if kind.id in hidden]
+    if any(Excitation.SLOPE not in one for one in needs):
         advice += "; `slip plan` says whether its room and time are enough"
     return [
         f"not observable in this log: {shown}{others}",
@@ -420,12 +420,16 @@ def _format_unobservable(run: RunDiagnosis) -> list[str]:
 
 def _format_detectable(run: RunDiagnosis) -> str:
     """Detection limits of effects that were not identified, the smallest first."""
-    usual = {one.id: find_effect(one.id)().parameter(one.parameter) for one in run.detectable}
-    sharpest = sorted(run.detectable, key=lambda one: one.size / usual[one.id].usual_size)
+    known = {kind.id: kind for kind in list_effects()}
+    usual = {one.id: known[one.id]().parameter(one.parameter) for one in run.detectable if one.id in known}
+    sharpest = sorted(
+        (one for one in run.detectable if one.id in usual),
+        key=lambda one: one.size / usual[one.id].usual_size,
+    )
     shown = [
-        f"{name_effect(one.id)} {format_share(one.size)}"
+        f"{name_term(one.id)} {format_share(one.size)}"
         if one.unit == "1"
-        else f"{name_effect(one.id)} {one.size:.2g} {one.unit}"
+        else f"{name_term(one.id)} {one.size:.2g} {one.unit}"
         for one in sharpest[:_DETECTABLE_SHOWN]
     ]
     return f"detection limits ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
@@ -433,7 +437,7 @@ def _format_detectable(run: RunDiagnosis) -> str:
 
 def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> list[Row]:
     """The findings of a run, except those stated in the verdict: the severe ones, then the notes."""
-    texts = Counter((str(finding.get("severity")), str(finding["text"])) for finding in run.findings)
+    texts = Counter((finding.severity, finding.text) for finding in run.findings)
     severe: list[str] = []
     notes: list[str] = []
     for (severity, text), count in sorted(texts.items(), key=lambda one: one[0][0] != "error"):
