@@ -15,7 +15,7 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import number_in, objects_in
 from pipeline.estimation.comparison import choose_input
-from pipeline.estimation.estimates import format_parameters, list_parameters
+from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
@@ -30,7 +30,7 @@ from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
-from pipeline.words.errors import format_ladder
+from pipeline.words.models import format_ladder, format_parameters
 
 if TYPE_CHECKING:
     from pipeline.api import Run

@@ -264,18 +264,6 @@ def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -
     )
 
 
-def format_refusals(refusals: Mapping[str, str]) -> str:
-    """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
-
-    Args:
-        refusals: reasons by id, at least one.
-    """
-    reasons = list(dict.fromkeys(refusals.values()))
-    said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
-    verb = "is" if len(refusals) == 1 else "are"
-    return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
-
-
 def _count_numbers(effect: Effect) -> int:
     return sum(bool(np.isfinite(value)) for value in effect.values.values())
 

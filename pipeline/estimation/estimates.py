@@ -22,8 +22,6 @@ from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import (
-    AT_BOUND,
-    UNDETERMINED,
     Parameter,
     cut_interval,
     is_of_one_run,
@@ -291,43 +289,6 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
         {"parameters": [one.label, other.label], "correlation": _round(value)}
         for one, other, value in estimates.list_correlated()
     ]
-
-
-def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
-    """Corrections to and exclusions of poses; empty where there are none."""
-    lines = []
-    for run in runs:
-        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
-        if spread > 0.0:
-            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s: corrected")
-        if outlier_s > 0.0:
-            lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
-    return lines
-
-
-def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Parameters with intervals, one per line."""
-    lines = []
-    for label, entry in parameters.items():
-        rows = entry.get("runs")
-        for row in rows if isinstance(rows, list) else [entry]:
-            unit = "" if entry["unit"] == "1" else entry["unit"]
-            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
-            if row.get("low") is not None:
-                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
-            elif row.get("fitted"):
-                text += UNDETERMINED
-            marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
-            marks += ["not observable in these runs"] * (row.get("observable") is False)
-            text += "".join(f"  ({mark})" for mark in marks)
-            if "run" in row:
-                text += f"  run {row['run']}"
-            lines.append(text.rstrip())
-    return lines
-
-
-def _show(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else "-"
 
 
 def _round(value: float) -> float | None:

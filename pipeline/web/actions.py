@@ -25,7 +25,7 @@ from pipeline.estimation import (
     State,
     choose_input,
 )
-from pipeline.estimation.additions import explain_refusal, explain_refusals, format_refusals
+from pipeline.estimation.additions import explain_refusal, explain_refusals
 from pipeline.estimation.apportion import apportion
 from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
@@ -53,6 +53,7 @@ from pipeline.web.session import (
     switch_off,
 )
 from pipeline.words.errors import describe_region
+from pipeline.words.models import format_refusals
 
 _MOST_RUNS = 6
 _MOST_FITS = 60

@@ -12,12 +12,10 @@ from pipeline.core import (
     format_length,
     format_share,
 )
-from pipeline.results.reading import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE, format_rises
+from pipeline.results.reading import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE
 from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
-    from pipeline.estimation.folds import Errors as MeasuredErrors
-    from pipeline.estimation.ladder import Ladder, LadderStep
     from pipeline.results import Errors, Moments, Region, RunDiagnosis, Span, Unexplained
 
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
@@ -201,55 +199,3 @@ def describe_need(run: RunDiagnosis) -> str:
         text = f"the last {format_share(need.idle_share)} of the drive"
         sentences.append(f"{text} narrowed no interval by more than a tenth")
     return "; ".join(sentences)
-
-
-_HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
-_HEAD_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
-
-
-def format_ladder(ladder: Ladder, floor: MeasuredErrors | None = None) -> list[str]:
-    """The ladder as a text table."""
-    heads, units = format_heads("held-out error of")
-    lines = [f"{heads}{'removed':>9}", units]
-    for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
-        below = ladder.steps[max(number - 1, 0)]
-        added = ", ".join(name for name in step.effects if name not in below.effects)
-        removed = "" if share is None else f"{format_share(share, 0):>9}"
-        lines.append(f"{'ideal' if number == 0 else f'+ {added}':<30}{_columns(step.errors)}{removed}")
-        rises = format_rises(below.errors, step.errors)
-        lines += [f"  ! {rises}"] if rises else []
-    if floor is not None:
-        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
-    if ladder.idle:
-        verb = "does" if len(ladder.idle) == 1 else "do"
-        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
-    return lines
-
-
-def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
-    """Change of the 2 s errors of the whole model, and the objection to it, if any."""
-    old, new = before.errors, after.errors
-    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
-    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
-    word = "added" if set(after.effects) > set(before.effects) else "changed"
-    line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    note = refusal or format_rises(old, new)
-    return [line, f"  ! {note}: {word} as requested"] if note else [line]
-
-
-def format_measured_errors(name: str, errors: MeasuredErrors) -> str:
-    """One row of errors."""
-    return f"{name:<30}{_columns(errors)}"
-
-
-def format_heads(name: str) -> tuple[str, str]:
-    """The headers of the error columns, and their units."""
-    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _HEAD_UNITS))
-    return f"{name:<30}{heads}", f"{'':<30}{units}"
-
-
-def _columns(errors: MeasuredErrors) -> str:
-    x, y, turn = errors.velocity_rms
-    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
-    values.append((math.degrees(errors.r_mrmse_rad), 2))
-    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)

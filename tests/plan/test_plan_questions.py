@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from motion_runs import simulate
+from msgspec.structs import replace
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 from verbs import run_verb
