@@ -345,7 +345,7 @@ class Diagnosis:
         return self._draw()
 
     def __repr__(self) -> str:
-        return "\n".join(words.format_lines(words.choose_lines(self._lines, everything=False)))
+        return "\n".join(words.format_lines(self._lines))
 
     def _repr_html_(self) -> str:
         sentences = dict(self.effects.select("effect", "sentence").iter_rows())

@@ -291,7 +291,7 @@ def format_plan(
         return [f"no open question{what}"]
     lines = []
     for one in made.promises:
-        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
+        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"±{one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.format_rest():
         lines.append(f"then         {rest}")

@@ -18,13 +18,13 @@ from pipeline.estimation.context import Context
 from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.folds import Errors, number_predictions
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import CHANCE, LadderStep, judge_whole, lowers_errors, raises_errors
+from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
 from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model
 from pipeline.models.catalogue import explain_idle
 from pipeline.models.learned_term import LEARNED
-from pipeline.results.reading import format_rises, list_rises
+from pipeline.results.reading import CHANCE, format_rises, list_rises
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:

@@ -20,14 +20,10 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
-from pipeline.results.reading import ERRORS_OVER_2S, as_written, list_rises
+from pipeline.results.reading import CHANCE, ERRORS_OVER_2S, as_written, list_rises
 
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
-# Two fits of one model differ by as much on other folds: a step may raise one error by this share.
-CHANCE = 1e-2
-"""Relative change of an error over 2 s below which it is chance: the smallest relevant one, as
-`LEAST_GAIN`."""
 _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
 _LEAST_SQUARE = 1e-24

@@ -26,7 +26,7 @@ from pipeline.estimation.folds import (
     number_predictions,
     score,
 )
-from pipeline.estimation.ladder import CHANCE, Judgement, LadderStep, find_share_removed, judge_whole
+from pipeline.estimation.ladder import Judgement, LadderStep, find_share_removed, judge_whole
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.state import State
@@ -44,7 +44,7 @@ from pipeline.models.learned_term import (
 )
 from pipeline.models.model import Model
 from pipeline.results import Learned, LearnedShare
-from pipeline.results.reading import ABOVE_FLOOR, ERRORS_OVER_2S, format_rises, list_rises, read_error
+from pipeline.results.reading import ABOVE_FLOOR, CHANCE, ERRORS_OVER_2S, format_rises, list_rises, read_error
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:

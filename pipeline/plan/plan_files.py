@@ -269,7 +269,7 @@ def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedA
 
 
 def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
-    text = f"+- {answer.goal:.2g} after {answer.decided_after_s:g} s"
+    text = f"±{answer.goal:.2g} after {answer.decided_after_s:g} s"
     label = answer.question.partition(" ")[0]
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
@@ -278,7 +278,7 @@ def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAns
                 return CheckedAnswer(
                     answer.question,
                     text,
-                    f"{value.value:.3g} +- {half:.2g}",
+                    f"{value.value:.3g} ±{half:.2g}",
                     kept=half <= answer.goal,
                 )
     return CheckedAnswer(answer.question, text, "not found", kept=False)

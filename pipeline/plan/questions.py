@@ -186,7 +186,7 @@ class Answerable:
         else:
             bound = float(self.bound(weight))
             enough = bound <= self.question.goal
-            what = f"+- {measured:.2g}, up to {bound:.2g}"
+            what = f"±{measured:.2g}, up to {bound:.2g}"
         if enough and (lacking := self.list_lacking(weight)):
             return f"{what}, without {enumerate_texts(lacking)}"
         return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what

@@ -41,7 +41,7 @@ from pipeline.report.sections_why import (
 )
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
 from pipeline.results.reading import has_no_pose, read_findings
-from pipeline.words.errors import describe_region, describe_structure, format_step, name_region, name_span
+from pipeline.words.errors import describe_regions, describe_structure, format_step, name_span
 
 _MOST_REGIONS = 2
 _SPARK_BINS, _SPARK_HEIGHT = 150, 28
@@ -199,11 +199,8 @@ def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
     """Regions of the ideal model's error, as on the screen: each with its part of the error."""
     if report.is_refused:
         return []
-    return [
-        (name, describe_region(one).removeprefix(f"{name}: "))
-        for one in report.diagnosis.where[:most]
-        if (name := name_region(one))
-    ]
+    parted = (text.partition(": ") for text in describe_regions(report.diagnosis.where)[:most])
+    return [(region, part) for region, _, part in parted]
 
 
 def view_what_now(page: Page) -> dict[str, object]:

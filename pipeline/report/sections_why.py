@@ -79,25 +79,14 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     if segments is not None:
         gaps = int(segments) - 1
         strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
-    held = _held_share(report)
-    if held is not None:
-        strip.append(
-            ("good", "no held poses")
-            if held == 0
-            else ("note", f"{format_known_share(held)} of the poses held")
-        )
-    strip.extend(count_serious(list_findings(report)).items())
+    findings = list_findings(report)
+    repeated = next((number_in(one, "value") for one in findings if one.get("id") == "held_poses"), None)
+    if repeated is not None:
+        strip.append(("note", f"{format_known_share(repeated)} of the poses repeated"))
+    elif report.number("held_poses") == 0:
+        strip.append(("good", "no repeated poses"))
+    strip.extend(count_serious(findings).items())
     return strip
-
-
-def _held_share(report: RunReport) -> float | None:
-    """Share of held poses; the summary contains the share or, as an integer, the count."""
-    held, poses = report.summary.get("held_poses"), report.table("poses")
-    if isinstance(held, float):
-        return held
-    if isinstance(held, int) and (poses is not None or held == 0):
-        return held / poses.height if poses is not None else 0.0
-    return None
 
 
 def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:

@@ -61,9 +61,10 @@ def render_trend(trend: Trend) -> str:
         [picture for *_, pictures in groups for picture in pictures],
         title="Trends",
         facts=[
-            f"{len(parameters)} parameters of {len(vehicles)} vehicle{'s' * (len(vehicles) != 1)}",
+            f"{len(parameters)} parameter{'s' * (len(parameters) != 1)} of "
+            f"{len(vehicles)} vehicle{'s' * (len(vehicles) != 1)}",
             f"{len(series)} series of {len(names)} group{'s' * (len(names) != 1)}",
-            f"{len(keys)} runs",
+            f"{len(keys)} run{'s' * (len(keys) != 1)}",
             f"{len(alerts)} alert{'s' * (len(alerts) != 1)}",
         ],
         alerts=[alert.text for alert in alerts],

@@ -351,6 +351,7 @@ class Finding(msgspec.Struct, frozen=True, omit_defaults=True):
         where: what it is about.
         severity: `error`, `warning` or `info`.
         value: its number.
+        t_start, t_end: of an incident [s].
         parameter, time, before, after: of a number that changes so long after the start of the run [s].
     """
 
@@ -359,6 +360,8 @@ class Finding(msgspec.Struct, frozen=True, omit_defaults=True):
     where: str | None = None
     severity: str = ""
     value: object = None
+    t_start: float | None = None
+    t_end: float | None = None
     parameter: str | None = None
     time: float | None = None
     before: float | None = None

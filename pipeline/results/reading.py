@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 from pipeline.core import JSON_DIGITS, format_share, round_digits
-from pipeline.core.untrusted import objects_in
+from pipeline.core.untrusted import number_in, objects_in
 from pipeline.recording import FAULTS
 from pipeline.results import Errors, Finding, RunDiagnosis, Step
 from pipeline.run.signals import GROUND_UNOBSERVABLE
@@ -26,6 +26,10 @@ ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("headin
 _TEXTS = ("id", "text", "where", "severity")
 NOTHING = 1e-3
 """Relative increase below which an error counts as unchanged: rounding of fits."""
+# Two fits of one model differ by as much on other folds: a step may raise one error by this share.
+CHANCE = 1e-2
+"""Relative change of an error over 2 s below which it is chance: the smallest relevant one, as
+`LEAST_GAIN`."""
 FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
 """Findings of which one makes every fit meaningless: no effect is named."""
 CHANGE = "changing_number"
@@ -47,7 +51,12 @@ _MAIN_SHARE = 0.1
 def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
     """The ``findings`` of a run's JSON object."""
     return tuple(
-        Finding(**{name: str(one.get(name) or "") for name in _TEXTS}, value=one.get("value"))  # type: ignore[arg-type]
+        Finding(
+            **{name: str(one.get(name) or "") for name in _TEXTS},  # type: ignore[arg-type]
+            value=one.get("value"),
+            t_start=number_in(one, "t_start"),
+            t_end=number_in(one, "t_end"),
+        )
         for one in objects_in(content, "findings")
     )
 

@@ -21,6 +21,7 @@ from pipeline.models.catalogue import list_effects, name_term
 from pipeline.models.effect import Excitation
 from pipeline.results import (
     Errors,
+    Finding,
     Learned,
     Named,
     RunDiagnosis,
@@ -33,6 +34,7 @@ from pipeline.results import (
 from pipeline.results.reading import (
     ABOVE_FLOOR,
     BREVITY,
+    CHANCE,
     CHANGE,
     DETECTED_SHARE,
     ERRORS_OVER_2S,
@@ -58,7 +60,7 @@ from pipeline.words.errors import (
     describe_lead,
     describe_moments,
     describe_need,
-    describe_region,
+    describe_regions,
     describe_unexplained,
     format_remaining_error,
     format_step,
@@ -68,8 +70,6 @@ from pipeline.words.verdict import format_verdict
 Row = tuple[str, str]
 
 VERDICT = "verdict"
-_SHORT = (VERDICT, "effects", "remaining", "findings")
-"""Labels shown by default; the others are shown with `--all`."""
 _LABEL = 10
 """Columns of a label on a screen, with the space after it."""
 _INDENT = "    "
@@ -87,10 +87,13 @@ _DETECTABLE_SHOWN = 5
 _VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
 _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
 """Inputs of formulas in words."""
-_FINDINGS_SHOWN = 4
-"""Distinct severe findings that are shown by default; the others are counted, and shown with `--all`."""
-FINDING_LABELS = ("findings", "further", "notes")
-"""Labels of the findings: severe ones shown by default, other severe ones, and those of severity info."""
+_FINDINGS_SHOWN = 3
+"""Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
+_EFFECTS_SHOWN = 5
+"""Effects with a line by default."""
+_RANK = {"error": 0, "warning": 1, "info": 3}
+_LONGEST_TERM = 70
+"""Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
 
 
 def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: bool = False) -> str:
@@ -102,12 +105,10 @@ def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: b
         everything: show all sections, not only verdict, main effects and remaining error.
     """
     first, *others = runs
-    heads = [first.run, *(run.run for run in others)]
+    heads = [run.run for run in runs]
     heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason or '')}"
-    lines = list_lines(first)
-    for run in others:
-        lines += _list_findings(run, prefix=f"{run.run}: ")
-    rows = format_lines(choose_lines(lines, everything=everything))
+    lines = list_lines(first, others, everything=everything)
+    rows = format_lines(lines)
     if following and first.effects:
         rows.append(f"next      {following}")
     return "".join(f"{line}\n" for line in [*heads, *rows])
@@ -118,34 +119,92 @@ def format_lines(lines: Sequence[Row]) -> list[str]:
     return [text if label == VERDICT else f"{label:<{_LABEL - 1}} {text}".rstrip() for label, text in lines]
 
 
-_FOLDED = " (--all)"
-"""End of a summary line, which is omitted where its details are shown."""
-
-
-def choose_lines(lines: Sequence[Row], *, everything: bool) -> list[Row]:
-    """The lines of `list_lines` that are shown."""
-    chosen: list[Row] = []
-    part = ""
-    for label, text in lines:
-        part = label or part
-        if text.endswith(_FOLDED) and everything:
-            continue
-        if everything or part in _SHORT:
-            chosen.append((label, text))
-    return chosen
-
-
 def _name_input(source: str, reason: str) -> str:
     return f"{INPUT_WORDS[source]}{f' ({reason})' if reason else ''}"
 
 
-def list_lines(run: RunDiagnosis) -> list[Row]:
-    """Label and text of every line after the head; a line without a label continues the section above."""
+def list_lines(
+    run: RunDiagnosis, others: Sequence[RunDiagnosis] = (), *, everything: bool = False
+) -> list[Row]:
+    """Label and text of every line after the head; a line without a label continues the section above.
+
+    Args:
+        run: what was found.
+        others: in the runs that were judged together with it.
+        everything: all sections, not only verdict, main effects, what they do not explain, and findings.
+    """
     verdict = format_verdict(run)
-    findings = _list_findings(run, verdict)
+    findings = list_findings(
+        {one.run: one.findings for one in (run, *others)}, verdict, everything=everything
+    )
     lines = [(VERDICT, verdict)]
     if not run.ladder:
         return [*lines, *findings]
+    if everything:
+        return [*lines, *_list_all(run, findings)]
+    return [*lines, *_label("effects", _list_main(run)), *_label("remaining", _list_rest(run)), *findings]
+
+
+def _list_main(run: RunDiagnosis) -> list[str]:
+    """A line for each of the main effects: its term, value, the error that it lowers most, and its id."""
+    main, minor, _ = _split_effects(run)
+    felt, small = _split_ambiguous(run)
+    undecided = {item.in_model for item in felt}
+    shown = [effect for effect in main if effect.id not in undecided]
+    folded = len(shown[_EFFECTS_SHOWN:]) + len(minor) + len(small)
+    falls = {
+        name: _format_largest_fall(before, after)
+        for before, after in pairwise(run.ladder)
+        for name in list_added(before, after)
+    }
+    rows = [
+        (
+            name_term(effect.id),
+            _format_short(effect),
+            "corrected before the fit" if effect.corrected else falls.get(effect.id, ""),
+            effect.id,
+        )
+        for effect in shown[:_EFFECTS_SHOWN]
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    texts = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)) for row in rows]
+    for item in felt:
+        texts.append(f"Undecided: {name_group(item.candidates)}")
+        texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
+    if folded:
+        texts.append(f"{folded} smaller effect{'s' * (folded > 1)} (--all)")
+    return texts
+
+
+def _format_short(effect: Named) -> str:
+    """The value of an effect, or how many it has."""
+    if effect.by_run:
+        return "one offset a run"
+    return format_numbers(effect.shown) if len(effect.shown) == 1 else f"{len(effect.shown)} numbers"
+
+
+def _format_largest_fall(before: Step, after: Step) -> str:
+    """The error over 2 s that falls most, before and after a step."""
+    shares = {key: getattr(after, key) / old for key in ERRORS_OVER_2S if (old := getattr(before, key)) > 0.0}
+    largest = min(shares, key=shares.__getitem__, default=None)
+    return "" if largest is None else _format_fall(before, after, largest) or _UNCHANGED
+
+
+def _list_rest(run: RunDiagnosis) -> list[str]:
+    """What the effects do not explain, and a suggested term."""
+    rest = run.unexplained
+    if rest is None:
+        return []
+    return [describe_unexplained(rest), *_list_terms(rest), format_suggestion(rest)]
+
+
+def _list_terms(rest: Unexplained) -> list[str]:
+    terms = [line for line in _list_formula(rest.formula or "") if len(line) <= _LONGEST_TERM]
+    return [f"suggested term: {line}" for line in terms]
+
+
+def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
+    """All sections after the verdict."""
     main, minor, unknown = _split_effects(run)
     felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
@@ -153,31 +212,27 @@ def list_lines(run: RunDiagnosis) -> list[Row]:
     width = max((len(_format_values(effect)) for effect in short), default=0)
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _format_ambiguous(item, falls)]
-    folded = [name_term(effect.id) for effect in minor]
-    # Commas separate the effects of this list, so alternatives are joined by `or` alone.
-    folded += [name_group(item.candidates).replace(", ", " or ") for item in small]
-    if folded:
-        effects.append(f"{len(folded)} smaller effect{'s' * (len(folded) > 1)}: {', '.join(folded)}{_FOLDED}")
-    lines += _label("effects", effects)
-    lines += _label("remaining", _format_remaining(run))
-    lines += _label(
-        "learned", [] if run.learned is None or run.learned.kept else [format_learned_share(run.learned)]
-    )
-    lines += findings
     others = [text for one in minor for text in _format_effect(one, run, falls)]
     others += [text for item in small for text in _format_ambiguous(item, falls)]
-    lines += _label("smaller", others)
-    lines += _label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)])
-    lines += _label("causes", [text for effect in run.effects for text in _format_causes(effect)])
-    lines += _label("clocks", [_format_encoders(run)])
-    lines += _label("ranges", [text for effect in run.effects for text in _format_range(effect)])
-    lines += _label("error", [f"{format_step(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"])
-    lines += _label("where", [describe_region(one) for one in run.where[:_WHERE_SHOWN] if one.id])
-    lines += _label("when", [describe_moments(one) for one in run.when])
-    lines += _label("budget", [_format_budget(run)])
-    lines += _label("data", [describe_need(run)])
-    lines += _label("unseen", _format_unobservable(run))
-    return [*lines, *_label("limits", [_format_detectable(run)])]
+    learned = run.learned
+    return [
+        *_label("effects", effects),
+        *_label("remaining", _format_remaining(run)),
+        *_label("learned", [] if learned is None or learned.kept else [format_learned_share(learned)]),
+        *findings,
+        *_label("smaller", others),
+        *_label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)]),
+        *_label("causes", [text for effect in run.effects for text in _format_causes(effect)]),
+        *_label("clocks", [_format_encoders(run)]),
+        *_label("ranges", [text for effect in run.effects for text in _format_range(effect)]),
+        *_label("error", [f"{format_step(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"]),
+        *_label("where", describe_regions(run.where)[:_WHERE_SHOWN]),
+        *_label("when", [describe_moments(one) for one in run.when]),
+        *_label("budget", [_format_budget(run)]),
+        *_label("data", [describe_need(run)]),
+        *_label("unseen", _format_unobservable(run)),
+        *_label("limits", [_format_detectable(run)]),
+    ]
 
 
 def _label(label: str, texts: Sequence[str]) -> list[Row]:
@@ -265,7 +320,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     if rest is None:
         return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
     rows.append(describe_unexplained(rest))
-    rows += [f"suggested term: {line}" for line in _list_formula(rest.formula or "")]
+    rows += _list_terms(rest)
     return [*rows, format_suggestion(rest), *_suggest_next_steps(run)]
 
 
@@ -379,7 +434,7 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
         falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
-        visible, rises = ", ".join(filter(None, falling)), format_rises(before, after)
+        visible, rises = ", ".join(filter(None, falling)), format_rises(before, after, CHANCE)
         text = f"{visible} ({rises})" if visible and rises else visible or rises
         for name in list_added(before, after):
             falls[name] = text or (_UNCHANGED if falling else "")
@@ -435,18 +490,51 @@ def _format_detectable(run: RunDiagnosis) -> str:
     return f"detection limits ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
 
 
-def _list_findings(run: RunDiagnosis, verdict: str = "", prefix: str = "") -> list[Row]:
-    """The findings of a run, except those stated in the verdict: the severe ones, then the notes."""
-    texts = Counter((finding.severity, finding.text) for finding in run.findings)
-    severe: list[str] = []
-    notes: list[str] = []
-    for (severity, text), count in sorted(texts.items(), key=lambda one: one[0][0] != "error"):
-        if text.casefold() not in verdict.casefold():
-            # Repeated findings are listed once, with their count.
-            times = f" ({count} times)" if count > 1 else ""
-            marked = f"{mark_finding(severity)}{prefix}{text}{times}"
-            (notes if severity == "info" else severe).append(marked)
-    shown, further = severe[:_FINDINGS_SHOWN], severe[_FINDINGS_SHOWN:]
-    folded = [f"   {len(further)} more{_FOLDED}"] if further else []
-    parts = zip(FINDING_LABELS, ([*shown, *folded], further, notes), strict=True)
-    return [row for label, part in parts for row in _label(label, part)]
+def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everything: bool) -> list[Row]:
+    """The findings of runs, except those stated in the verdict: each once, the severe ones first.
+
+    Args:
+        runs: findings by the name of the run.
+        verdict: on them.
+        everything: also notes, and more than three.
+    """
+    told: dict[tuple[str, str], list[str]] = {}
+    for run, findings in runs.items():
+        for key in _join_incidents(findings):
+            if key[1].casefold() not in verdict.casefold():
+                told.setdefault(key, []).append(run)
+    texts: list[str] = []
+    notes = 0
+    for (severity, text), where in sorted(told.items(), key=lambda one: _RANK.get(one[0][0], 2)):
+        is_note = severity == "info"
+        notes += is_note
+        if everything or not is_note:
+            which = f"{where[0]}: " if len(runs) > 1 and len(where) == 1 else ""
+            count = f" ({len(where)} runs)" if len(where) > 1 else ""
+            texts.append(f"{mark_finding(severity)}{which}{text}{count}")
+    if not everything and len(texts) > _FINDINGS_SHOWN:
+        rest = len(texts) - _FINDINGS_SHOWN + notes
+        texts = [*texts[:_FINDINGS_SHOWN], f"   {rest} more (--all)"]
+    return _label("findings", texts)
+
+
+def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Severity and text of every finding, of incidents of one kind and of repeated ones only once."""
+    incidents: dict[str, list[Finding]] = {}
+    for one in findings:
+        if one.severity != "info" and one.t_start is not None and one.t_end is not None:
+            incidents.setdefault(one.id, []).append(one)
+    timed = [(alike[0].severity, _format_timed(alike)) for alike in incidents.values()]
+    joined = {one for alike in incidents.values() for one in map(id, alike)}
+    plain = Counter((one.severity, one.text) for one in findings if id(one) not in joined)
+    return timed + [
+        (severity, f"{text} ({count} times)" if count > 1 else text)
+        for (severity, text), count in plain.items()
+    ]
+
+
+def _format_timed(alike: Sequence[Finding]) -> str:
+    """Number of incidents of one kind, and the longest of them."""
+    longest = max(alike, key=lambda one: (one.t_end or 0.0) - (one.t_start or 0.0))
+    many = f"{len(alike)} incidents, the longest " if len(alike) > 1 else ""
+    return f"{many}from {longest.t_start:.1f} to {longest.t_end:.1f} s: {longest.text}"

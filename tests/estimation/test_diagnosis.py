@@ -182,7 +182,7 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     # In the place of the others it is known.
     known = run.undecided[0].parameters["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
-    lines = [" ".join(text.split()) for _, text in list_lines(run)]
+    lines = [" ".join(text.split()) for _, text in list_lines(run, everything=True)]
     assert any(line.startswith("turning_resistance k = 0.2") for line in lines)
     assert "This log does not decide between" in lines[0]
     assert "turning resistance" in lines[0]

@@ -29,7 +29,7 @@ from pipeline.results import (
     Value,
 )
 from pipeline.sources import list_presets
-from pipeline.words.diagnosis import choose_lines, list_lines
+from pipeline.words.diagnosis import list_lines
 from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import format_verdict
 
@@ -182,9 +182,7 @@ def test_lines_of_a_diagnosis(check_golden: Check) -> None:
     left = Unexplained("lasting", 0.98, "w", ("w",), "command", sizes={"w": 0.19})
     bare = replace(run, effects=(), ladder=run.ladder[:1], unexplained=left, findings=(), timing=Delays())
     parts = [
-        "\n".join(
-            f"{label:<10}{text}" for label, text in choose_lines(list_lines(one), everything=everything)
-        )
+        "\n".join(f"{label:<10}{text}" for label, text in list_lines(one, everything=everything))
         for one in (run, bare)
         for everything in (False, True)
     ]

@@ -111,8 +111,7 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.open(workbench.address)
         chrome.wait(SHOWN)
         named = (
-            "[...document.querySelectorAll('.proposals li')].filter((entry) =>"
-            " entry.textContent.includes('identified by the diagnosis')).map((entry) => entry.dataset.effect)"
+            "[...document.querySelectorAll('.proposals li[data-named]')].map((entry) => entry.dataset.effect)"
         )
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
         manifest = Store(tmp_path / "out").manifest("field/late")
