@@ -58,7 +58,6 @@ _MATTERS = 2.0
 _SPANS = 3
 """Number of spans in a sentence."""
 _UNITS = {"x": "m/s", "y": "m/s", "w": "rad/s"}
-_CHANNELS = {"x": "forward motion", "y": "lateral motion", "w": "yaw rate"}
 
 
 def format_step(errors: Errors) -> str:
@@ -73,7 +72,7 @@ def name_region(region: Region) -> str:
 
 def describe_region(region: Region) -> str:
     """Region, its share of the error and its share of the time."""
-    return describe_regions([region])[0]
+    return next(iter(describe_regions([region])), "")
 
 
 def describe_regions(regions: Sequence[Region]) -> list[str]:
@@ -140,7 +139,7 @@ def format_remaining_error(error_m: float, floor_m: float, explained: float) -> 
 def describe_structure(rest: Unexplained) -> str:
     """On what the structure of the residual depends."""
     if rest.kind == "formula":
-        return f"a formula removes {format_share(rest.share, 0)} of the {ERROR_WORDS[rest.channel]}"
+        return f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
     if rest.kind == "learned":
         matters = (
             f"; {rest.of} matters {rest.times:.0f} times as much as any other"
@@ -165,15 +164,10 @@ def describe_structure(rest: Unexplained) -> str:
 
 
 def describe_unexplained(rest: Unexplained) -> str:
-    """The structure of the residual that no effect explains: its share of the residual, and its dependence.
-
-    A formula is compared with the whole residual, all else with that of one channel.
-    """
-    if rest.kind == "lasting":
-        return describe_structure(rest)
-    channel = "" if rest.formula else f" {_CHANNELS[rest.channel]}"
-    what = f"{format_share(rest.share)} of the residual{channel}"
-    return f"{what} has a structure that the model does not explain: {describe_structure(rest)}"
+    """The structure of the residual that no effect explains, by what describes it."""
+    if rest.kind == "region":
+        return f"the {ERROR_WORDS[rest.channel]} is not spread evenly: {describe_structure(rest)}"
+    return describe_structure(rest) or f"{format_share(rest.share)} of the residual has an unknown structure"
 
 
 def describe_lead(run: RunDiagnosis) -> str:

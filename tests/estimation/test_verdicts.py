@@ -42,6 +42,6 @@ def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) 
     diagnosis = _diagnose(replace(_HUSKY, effects=patch, duration_s=150.0), tmp_path)
     (run,) = diagnosis.runs
     assert run.unexplained is not None
-    assert "from 0 to 30 s: 90 % of the yaw error in 20 % of the time" in describe_structure(run.unexplained)
+    assert "from 0 to 30 s (20 % of the time): 90 % of the yaw error" in describe_structure(run.unexplained)
     assert describe_structure(run.unexplained) in describe(diagnosis.runs)
     assert not any(claim in f"{describe(diagnosis.runs)} {diagnosis_as_json(run)}" for claim in _CLAIMS)
