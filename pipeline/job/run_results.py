@@ -176,11 +176,18 @@ def read_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
 
 
 def read_stored_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
-    """The diagnosis in the results of a run, also one of an earlier version; None without a readable one."""
+    """The diagnosis in the results of a run, also one of an earlier version.
+
+    Returns:
+        None if there is none, or one of a version that this one cannot read.
+
+    Raises:
+        StoreError: it is damaged.
+    """
     if DIAGNOSIS not in manifest.files:
         return None
     with suppress(msgspec.ValidationError):
-        return read_result(read_object(manifest.path(DIAGNOSIS)), RunDiagnosis)
+        return read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
     return None
 
 

@@ -7,7 +7,7 @@ import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,14 +18,14 @@ from pipeline.core.untrusted import mapping_in, objects_in, read_object, resolve
 from pipeline.job import INPUTS
 from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.job.run_results import (
+    DIAGNOSIS,
     UPLOADS,
     diagnose_stored,
     find_diagnosis,
     keep_diagnosis,
     read_recording,
-    read_stored_diagnosis,
 )
-from pipeline.results import RunDiagnosis
+from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import find_refusal, read_findings
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock
@@ -166,8 +166,13 @@ def find_file(results: Path, run: str, name: str) -> Path:
 
 
 def read_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
-    """The stored diagnosis of a run; None if it has not been diagnosed."""
-    return read_stored_diagnosis(manifest) or find_diagnosis(results, manifest)
+    """The stored diagnosis of a run; None if it has not been diagnosed, or if that cannot be read."""
+    if DIAGNOSIS not in manifest.files:
+        return find_diagnosis(results, manifest)
+    content = read_json(manifest.path(DIAGNOSIS))
+    with suppress(msgspec.ValidationError):
+        return read_result(content, RunDiagnosis) if content else None
+    return None
 
 
 def write_diagnosis(results: Path, manifest: Manifest) -> None:
