@@ -81,7 +81,7 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     write_model(proposal, path)
     file = read_model(path)
     check_written(told, file, describe(diagnosis.runs, everything=True))
-    check_page(told, describe(diagnosis.runs))
+    check_page(told, describe(diagnosis.runs), describe(diagnosis.runs, everything=True))
     own = check_model_verbs(
         told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
     )
@@ -95,14 +95,14 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     assert hash_results(results) == before
 
 
-def check_page(told: Json, screen: str) -> None:
+def check_page(told: Json, screen: str, everything: str) -> None:
     """The report counts the smaller effects as the screen does, and says the same of what remains."""
     report = RunReport({"run": told["run"]}, diagnosis=read_result(told, RunDiagnosis))
-    page, shown = render_report(report), " ".join(screen.split())
+    page, shown, whole = render_report(report), *(" ".join(text.split()) for text in (screen, everything))
     assert re.findall(r"and (\d+) smaller effect", page) == re.findall(r"(\d+) smaller effect", shown)
     remaining = format_remaining(report)
     assert remaining in page
-    assert remaining.replace("remaining error ", "remaining ") in shown
+    assert remaining.replace("remaining error ", "remaining ") in whole
 
 
 def list_numbers(told: Json) -> list[tuple[str, str, Json]]:
