@@ -225,17 +225,17 @@ class Run:
             budget: CPU time that a search may take, for example ``60s``.
         """
         is_plain = not others and input == "both" and model is None and budget is None
-        found = find_diagnosis(self._store.root, self.manifest) if is_plain else None
-        if found is None:
+        diagnosis = find_diagnosis(self._store.root, self.manifest) if is_plain else None
+        if diagnosis is None:
             with threadpool_limits(1):
-                found = diagnose_stored(
+                diagnosis = diagnose_stored(
                     [run.manifest for run in (self, *others)],
                     INPUTS if input == "both" else (input,),
                     None if model is None else take_file(model).model,
                     vehicle_of,
                     None if budget is None else parse_budget(budget),
                 )
-        return Diagnosis(found, read_choices(self.manifest), lambda: self._draw(found))
+        return Diagnosis(diagnosis, read_choices(self.manifest), lambda: self._draw(diagnosis))
 
     def compare_models(
         self,
@@ -314,10 +314,10 @@ class Diagnosis:
     """
 
     def __init__(
-        self, found: RunDiagnosis, choices: Content, draw: Callable[[], dict[str, ShownFigure]]
+        self, diagnosis: RunDiagnosis, choices: Content, draw: Callable[[], dict[str, ShownFigure]]
     ) -> None:
-        self._found, self._choices, self._draw = found, choices, draw
-        self._lines = words.list_lines(found)
+        self._diagnosis, self._choices, self._draw = diagnosis, choices, draw
+        self._lines = words.list_lines(diagnosis)
         content = self.to_json()
         self.verdict = str(content["verdict"])
         effects = {str(one["id"]): one for one in objects_in(content, "effects")}
@@ -333,12 +333,12 @@ class Diagnosis:
              for name, one in effects.items() for key in mapping_in(one, "parameters")}
         )  # fmt: skip
         self.ladder = tabulate_ladder(content)
-        file = read_diagnosed_model(found)
+        file = read_diagnosed_model(diagnosis)
         self.model = None if file is None else Model.of(file)
 
     def to_json(self) -> dict[str, object]:
         """The object of one run of `slip diagnose --json`."""
-        return {**diagnosis_as_json(self._found), **self._choices}
+        return {**diagnosis_as_json(self._diagnosis), **self._choices}
 
     def figures(self) -> dict[str, ShownFigure]:
         """The figures of the run with the model that was named, by id: ladder, residuals, budget, ..."""
@@ -355,7 +355,7 @@ class Diagnosis:
             part = label or part
             if part in {"remaining", "findings"}:
                 notes.append(f"{part}: {text}")
-        title = f"{self._found.run}: {', '.join(self.effects['effect']) or 'no significant effect'}"
+        title = f"{self._diagnosis.run}: {', '.join(self.effects['effect']) or 'no significant effect'}"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
         )

@@ -165,7 +165,7 @@ def summarize(
         else summarize_learned(learned, ground.ideal.errors, ground.floor),
         where=tuple(pick_regions(regions, residual, windows.noise)),
         when=() if judgement is None else find_moments(judgement),
-        by_way=_summarize_paths(paths, source, judgements.get("measured")),
+        by_path=_summarize_paths(paths, source, judgements.get("measured")),
         disturbance=residual_structure.summarize_disturbance(body.outcome.final),
         concentrated=region,
         model=None if proposal is None else format_model(proposal),
@@ -288,7 +288,7 @@ def _name(
             dict.fromkeys((*effect.confused_with, *_list_trading(effect, context, judgement)))
         ),
         corrected=was_aligned(effect, context),
-        found_on=path.path,
+        path=path.path,
         selection_frequency=math.nan if judged is None else judged.frequency,
         moves=None if judgement is None else measure_moves(judgement.fitted, effect),
         growth=thin_growth(

@@ -455,7 +455,7 @@ def summarize_learned(step: LearnedStep, ideal: Errors, floor: Errors) -> Learne
     """The gain of a learned term as a result."""
     reached = step.held_out.pooled
     return Learned(
-        kept=not step.refusal,
+        helps=not step.refusal,
         reason=step.refusal or None,
         t_mrmse_m=reached.t_mrmse_m,
         r_mrmse_rad=reached.r_mrmse_rad,

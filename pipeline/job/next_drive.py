@@ -305,16 +305,16 @@ def study(
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
     from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
 
-    found = diagnose_runs(recordings, vehicle, notify=notify)
-    diagnosis = found.runs[0]
-    if found.proposal is None:
+    joint = diagnose_runs(recordings, vehicle, notify=notify)
+    diagnosis = joint.runs[0]
+    if joint.proposal is None:
         why = find_refusal(diagnosis.findings) or "the log cannot be judged"
         what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
     # Terms outside the catalogue are specific to this run's terrain.
     catalogue = {effect.id for effect in list_effects()}
-    named = [effect for effect in found.proposal.model.effects if effect.id in catalogue]
+    named = [effect for effect in joint.proposal.model.effects if effect.id in catalogue]
     runs = [load_recording(recording, vehicle) for recording in recordings]
     if terrain is None or known is None:
         return Studied(diagnosis, learn(runs, vehicle, named))

@@ -246,7 +246,7 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
         steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
-        if diagnosis.learned is not None and diagnosis.learned.kept:
+        if diagnosis.learned is not None and diagnosis.learned.helps:
             learn = f"slip model add model.toml learned_term --on {name}"
             steps.append(("Put a learned term on top of it", learn))
     if diagnosis.undecided or diagnosis.unobservable_why:

@@ -30,7 +30,7 @@ class RunReport:
     Attributes:
         summary: the JSON object of one run of ``slip analyze --json``.
         tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
-        diagnosis: what was found; empty without one.
+        diagnosis: of the run; empty without one.
         motion: a model of the run; None without one.
         peers: median slip moduli [m/s] of comparable runs by input; empty without any.
         catalogue: relative address of the page over all runs; empty without one.
@@ -85,8 +85,8 @@ class RunReport:
         """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
         from pipeline.results.reading import split_main  # noqa: PLC0415 - heavy
 
-        found = self.diagnosis
-        return split_main(found.effects, found.ladder, lambda one: (one.id, one.corrected))
+        diagnosis = self.diagnosis
+        return split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
 
     @property
     def refusal(self) -> str:

@@ -183,11 +183,11 @@ _HEAD = (
 
 def format_remaining(report: RunReport) -> str:
     """Format the error of the model relative to the noise floor; empty if unknown."""
-    found = report.diagnosis
-    if len(found.ladder) < 2 or found.noise_floor is None:  # noqa: PLR2004 - without an effect nothing remains
+    diagnosis = report.diagnosis
+    if len(diagnosis.ladder) < 2 or diagnosis.noise_floor is None:  # noqa: PLR2004 - without an effect nothing remains
         return ""
     return format_remaining_error(
-        found.ladder[-1].t_mrmse_m, found.noise_floor.t_mrmse_m, found.explained_share
+        diagnosis.ladder[-1].t_mrmse_m, diagnosis.noise_floor.t_mrmse_m, diagnosis.explained_share
     )
 
 
@@ -245,7 +245,7 @@ def _list_parameters(effect: Named) -> list[list[str | Cell]]:
     """One row per parameter: value, interval, and in the first row the gain of the effect."""
     notes = [f"same as {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     gain = _format_gain(effect.gain)
-    without = Cell(gain, small=_PATHS.get(effect.found_on, "")) if gain else ""
+    without = Cell(gain, small=_PATHS.get(effect.path, "")) if gain else ""
     rows: list[list[str | Cell]] = []
     for key, value in effect.parameters.items():
         shown = "" if value.unit in {"1", ""} else set_squares(value.unit)
@@ -281,21 +281,21 @@ def _format_gain(gain: float) -> str:
 
 def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     """What this log does not determine, and what no effect of the catalogue explains, with its formula."""
-    found = report.diagnosis
+    diagnosis = report.diagnosis
     for names, advice in report.undecided:
         yield "undecided", f"{names}: {advice}", ""
-    if found.unexplained is not None:
-        suggested = format_suggestion(found.unexplained)
+    if diagnosis.unexplained is not None:
+        suggested = format_suggestion(diagnosis.unexplained)
         example = f"; suggested term: {suggested}" if suggested else ""
-        formula = found.unexplained.formula or ""
-        yield "unexplained", f"{describe_unexplained(found.unexplained)}{example}", formula
-    if found.learned is not None and (beyond := format_learned_share(found.learned)):
+        formula = diagnosis.unexplained.formula or ""
+        yield "unexplained", f"{describe_unexplained(diagnosis.unexplained)}{example}", formula
+    if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
         yield "beyond the effects", beyond, ""
-    if found.unobservable_why:
-        yield "not observable in this log", ", ".join(found.unobservable_why), ""
+    if diagnosis.unobservable_why:
+        yield "not observable in this log", ", ".join(diagnosis.unobservable_why), ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}
-    for finding in found.findings:
+    for finding in diagnosis.findings:
         if finding.text not in known:
             yield "finding", finding.text, ""
-    if found.disturbance is not None and found.unexplained is None:
-        yield "residual", describe_rest(found), ""
+    if diagnosis.disturbance is not None and diagnosis.unexplained is None:
+        yield "residual", describe_rest(diagnosis), ""

@@ -116,7 +116,7 @@ class Growth(msgspec.Struct, frozen=True):
     parameters: dict[str, Narrowing] = {}
 
 
-class Named(msgspec.Struct, frozen=True):
+class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     """An effect that is missing from the model.
 
     Attributes:
@@ -126,7 +126,7 @@ class Named(msgspec.Struct, frozen=True):
         equivalent_to: ids of equivalent effects.
         confused_with: effects that look alike at first order.
         corrected: whether it is a clock corrected before any fit, which the written model does not contain.
-        found_on: path on which it was identified: `command`, `measured` or `wheels`.
+        path: path on which it was identified: `command`, `measured` or `wheels`.
         selection_frequency: share of resampled recordings in which its gain reaches the threshold.
         moves: its change of predictions over 2 s; None where the model does not contain it.
         growth: its evidence and intervals by driving time; None where the model does not contain it.
@@ -140,7 +140,7 @@ class Named(msgspec.Struct, frozen=True):
     equivalent_to: tuple[str, ...] = ()
     confused_with: tuple[str, ...] = ()
     corrected: bool = False
-    found_on: str = ""
+    path: str = ""
     selection_frequency: float = math.nan
     moves: Moves | None = None
     growth: Growth | None = None
@@ -310,7 +310,7 @@ class PathLadder(msgspec.Struct, frozen=True):
     noise_floor: Errors | None = None
 
 
-class Unexplained(msgspec.Struct, frozen=True):
+class Unexplained(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     """Structure of the residual that no catalogued effect explains.
 
     Attributes:
@@ -319,7 +319,7 @@ class Unexplained(msgspec.Struct, frozen=True):
             residual's variance that is correlated for longer than noise and random motion.
         channel: x, y or w.
         channels: every channel with structure.
-        found_on: path of the search that identified it.
+        path: path of the search that identified it.
         quantity: `position` or `heading`, of which a learned term removes the share.
         of, times: input that a learned term depends on most, and how many times as much as on any other.
         sizes: RMS of lasting motion by channel [m/s, rad/s].
@@ -332,7 +332,7 @@ class Unexplained(msgspec.Struct, frozen=True):
     share: float = math.nan
     channel: str = "x"
     channels: tuple[str, ...] = ()
-    found_on: str = ""
+    path: str = ""
     quantity: str = ""
     of: str = ""
     times: float = 0.0
@@ -378,7 +378,7 @@ class Delays(msgspec.Struct, frozen=True):
 
 
 class Disturbance(msgspec.Struct, frozen=True):
-    """What is left of x, y, w.
+    """The residual of x, y, w.
 
     Attributes:
         rms: of the residual [m/s, m/s, rad/s].
@@ -422,7 +422,7 @@ class SlipBudget(msgspec.Struct, frozen=True):
         unit: of the total.
         stretches: number of ten-second stretches used for the intervals.
         shares: of the effects, the largest first; with disturbance and localization noise they add up to one.
-        disturbance, localization_noise: shares of what is left.
+        disturbance, localization_noise: shares of the rest.
     """
 
     input: str
@@ -437,8 +437,8 @@ class SlipBudget(msgspec.Struct, frozen=True):
     @property
     def causes(self) -> list[tuple[str, Share]]:
         """Every cause with its kind: `effect`, `disturbance` or `localization_noise`."""
-        left = {"disturbance": self.disturbance, "localization_noise": self.localization_noise}
-        rest = [(kind, replace(one, effect=kind)) for kind, one in left.items() if one is not None]
+        remaining = {"disturbance": self.disturbance, "localization_noise": self.localization_noise}
+        rest = [(kind, replace(one, effect=kind)) for kind, one in remaining.items() if one is not None]
         return [("effect", one) for one in self.shares] + rest
 
 
@@ -449,18 +449,18 @@ class LearnedShare(msgspec.Struct, frozen=True):
     with_learned: float = math.nan
 
 
-class Learned(msgspec.Struct, frozen=True):
+class Learned(msgspec.Struct, frozen=True, rename={"helps": "kept"}):
     """Gain of a learned term beyond the effects.
 
     Attributes:
-        kept: whether it helps.
+        helps: whether it does.
         reason: why it does not; None where it does.
         t_mrmse_m, r_mrmse_rad: errors over 2 s with it.
         explained_share: by error.
         term: the term, as a table of model files; None where it does not help.
     """
 
-    kept: bool = False
+    helps: bool = False
     reason: str | None = None
     t_mrmse_m: float = math.nan
     r_mrmse_rad: float = math.nan
@@ -512,7 +512,7 @@ class DataNeed(msgspec.Struct, frozen=True):
     idle_share: float = 0.0
 
 
-class RunDiagnosis(msgspec.Struct, frozen=True):
+class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     """Effects missing from the model of one run, or of several runs of one vehicle together.
 
     Attributes:
@@ -534,8 +534,8 @@ class RunDiagnosis(msgspec.Struct, frozen=True):
         where: the few regions with most of the error of the ideal model.
         when: the times with half of the error that the model leaves.
         timing: delays, and the source of the heading.
-        by_way: separate ladders of the drivetrain and of the ground, where there are encoders.
-        disturbance: what is left.
+        by_path: separate ladders of the drivetrain and of the ground, where there are encoders.
+        disturbance: the residual.
         concentrated: the region with most of the error of the final model; None where it is spread evenly.
         model: model file with the identified effects, fitted, as text; None where no model could be judged.
         budget: causes of the slip and of the 2 s errors of the ideal model, for each input.
@@ -561,7 +561,7 @@ class RunDiagnosis(msgspec.Struct, frozen=True):
     where: tuple[Region, ...] = ()
     when: tuple[Moments, ...] = ()
     timing: Delays = Delays()
-    by_way: dict[str, PathLadder] = {}
+    by_path: dict[str, PathLadder] = {}
     disturbance: Disturbance | None = None
     concentrated: Region | None = None
     model: str | None = None

@@ -218,7 +218,7 @@ def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
     return [
         *_label("effects", effects),
         *_label("remaining", _format_remaining(run)),
-        *_label("learned", [] if learned is None or learned.kept else [format_learned_share(learned)]),
+        *_label("learned", [] if learned is None or learned.helps else [format_learned_share(learned)]),
         *findings,
         *_label("smaller", others),
         *_label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)]),
@@ -314,7 +314,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
         if last.r_mrmse_rad >= ABOVE_FLOOR * floor.r_mrmse_rad > 0.0:
             turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
             rows.append(f"{turn} in heading, noise floor {least}")
-    if run.learned is not None and run.learned.kept:
+    if run.learned is not None and run.learned.helps:
         rows.append(format_learned_share(run.learned))
     rest = run.unexplained
     if rest is None:
@@ -365,7 +365,7 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
 
 def format_learned_share(learned: Learned) -> str:
     """The share that a learned term explains beyond the physics, or why it does not help; else empty."""
-    if not learned.kept:
+    if not learned.helps:
         return f"a learned term does not help: {learned.reason}" if learned.reason else ""
     # Below the noise floor a share is of nothing.
     known = {
@@ -498,14 +498,14 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
         verdict: on them.
         everything: also notes, and more than three.
     """
-    told: dict[tuple[str, str], list[str]] = {}
+    by_text: dict[tuple[str, str], list[str]] = {}
     for run, findings in runs.items():
         for key in _join_incidents(findings):
             if key[1].casefold() not in verdict.casefold():
-                told.setdefault(key, []).append(run)
+                by_text.setdefault(key, []).append(run)
     texts: list[str] = []
     notes = 0
-    for (severity, text), where in sorted(told.items(), key=lambda one: _RANK.get(one[0][0], 2)):
+    for (severity, text), where in sorted(by_text.items(), key=lambda one: _RANK.get(one[0][0], 2)):
         is_note = severity == "info"
         notes += is_note
         if everything or not is_note:

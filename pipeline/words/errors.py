@@ -151,7 +151,7 @@ def describe_structure(rest: Unexplained) -> str:
             f"depends most on {rest.of}{matters}"
         )
     if rest.kind == "lasting":
-        whose = "the wheels' " if rest.found_on == "wheels" else "the "
+        whose = "the wheels' " if rest.path == "wheels" else "the "
         sizes = {
             f"{whose}{ERROR_WORDS[one]}": f"({size:.2g} {_UNITS[one]})" for one, size in rest.sizes.items()
         }

@@ -111,7 +111,7 @@ results = Path("results")
 (name,) = Store(results).runs()
 manifest = Store(results).manifest(name)
 write_diagnosis(results, manifest)
-print(json.dumps(read_diagnosis(results, manifest)))
+print(json.dumps(diagnosis_as_json(read_diagnosis(results, manifest))))
 """
     said = run_in(trap, [sys.executable, "-c", program])
     assert json.loads(said)

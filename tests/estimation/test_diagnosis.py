@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from msgspec.structs import astuple
 
 from pipeline.core import NORMAL_95
 from pipeline.estimation import (
@@ -83,8 +84,8 @@ def test_what_is_missing_is_named_with_its_size(skidding: Diagnosis) -> None:
     track = named["effective_track"].parameters["k"]
     assert track.low < 1.8 < track.high
     assert named["drive_lag"].parameters["tau"].value == pytest.approx(0.4, abs=0.02)
-    assert named["drive_lag"].found_on == "wheels"
-    assert named["effective_track"].found_on == "measured"
+    assert named["drive_lag"].path == "wheels"
+    assert named["effective_track"].path == "measured"
 
 
 def test_what_a_planner_would_not_feel_has_no_name(tmp_path: Path) -> None:
@@ -119,7 +120,7 @@ def test_a_gyro_does_not_turn_one_effect_into_another(
     hidden: str, size: float, way: str, imu: Imu | None, tmp_path: Path
 ) -> None:
     found = _diagnose(replace(_CAR, effects={hidden: size}, imu=imu), tmp_path).runs[0]
-    assert [(effect.id, effect.found_on) for effect in found.effects] == [(hidden, way)]
+    assert [(effect.id, effect.path) for effect in found.effects] == [(hidden, way)]
     (value,) = found.effects[0].parameters.values()
     assert value.value == pytest.approx(size, rel=0.15)
 
@@ -314,12 +315,12 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
 
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
-    low, high = expect_another_run(track, 1.8, 1.78, 1.83)
+    low, high = astuple(expect_another_run(track, 1.8, 1.78, 1.83))
     assert low == pytest.approx(1.8 - np.hypot(0.02, NORMAL_95 * 2.0**0.5 * track.spread.size))
     assert high == pytest.approx(1.8 + np.hypot(0.03, NORMAL_95 * 2.0**0.5 * track.spread.size))
     lag = find_effect("drive_lag")().parameter("tau")
-    assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
-    assert not np.isfinite(expect_another_run(track, 1.8, math.nan, math.nan)).any()
+    assert expect_another_run(lag, 0.1, 0.09, 0.11).low == lag.bounds[0]
+    assert not np.isfinite(astuple(expect_another_run(track, 1.8, math.nan, math.nan))).any()
     for effect, is_known in (
         (find_effect("effective_track")(k=1.8), True),
         (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),
@@ -328,4 +329,4 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         items = [Estimate(one, 0.75, 0.15, 0.07, at_bound=False, observable=True) for one in free]
         values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())
-        assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())
+        assert all(np.isfinite(astuple(value.another_run)).all() == is_known for value in values.values())

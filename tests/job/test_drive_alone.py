@@ -29,6 +29,7 @@ from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, messages, simulate_run, write_log
 from pipeline.sources import find_preset
 from pipeline.store import Manifest, Store
+from pipeline.words.objects import diagnosis_as_json
 from pipeline.words.verdict import NO_GROUND
 
 CASES = Path(__file__).parents[3] / "shared" / "cases" / "logs"
@@ -69,7 +70,9 @@ class Analyzed:
 
     @property
     def diagnosis(self) -> dict[str, Any]:
-        return cast("dict[str, Any]", read_diagnosis(self.manifest))
+        diagnosis = read_diagnosis(self.manifest)
+        assert diagnosis is not None
+        return diagnosis_as_json(diagnosis)
 
     @property
     def named(self) -> dict[str, dict[str, Any]]:

@@ -204,8 +204,8 @@ def name_input(scene: Scene) -> str:
 
 
 def _find_ladder(scene: Scene) -> tuple[Sequence[Step], Errors | None]:
-    motion, found = scene.report.motion, scene.report.diagnosis
-    return (found.ladder, found.noise_floor) if motion is None else (motion.ladder, motion.floor)
+    motion, diagnosis = scene.report.motion, scene.report.diagnosis
+    return (diagnosis.ladder, diagnosis.noise_floor) if motion is None else (motion.ladder, motion.floor)
 
 
 def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
