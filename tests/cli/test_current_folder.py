@@ -106,6 +106,7 @@ sys.path.pop(0)
 import json
 from pathlib import Path
 from pipeline.store import Store
+from pipeline.words.objects import diagnosis_as_json
 from pipeline.web.stored_runs import read_diagnosis, write_diagnosis
 results = Path("results")
 (name,) = Store(results).runs()

@@ -99,7 +99,7 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     step = learn_beyond(judged)
     assert step is not None
     told = summarize_learned(step, judged.ideal.errors, judged.floor)
-    assert not told.kept
+    assert not told.helps
     assert told.reason == "the remaining error is at the noise floor"
     assert told.term is None
 

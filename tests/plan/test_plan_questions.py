@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+import msgspec
 import numpy as np
 import pytest
 from motion_runs import simulate
-from msgspec.structs import replace
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 from verbs import run_verb
@@ -126,9 +127,11 @@ def test_promises_are_checked_against_what_came_out() -> None:
     assert [one.kept for one in still.kept] == [False, False, False]
     # Beside what is named a rival may not be seen: that decides; with nothing named it does not.
     hidden = {"b": Unobservable("collinear with what was named")}
-    told = check_plan(promised, replace(_diagnose(("a",)), unobservable_why=hidden)).kept[0]
+    told = check_plan(promised, msgspec.structs.replace(_diagnose(("a",)), unobservable_why=hidden)).kept[0]
     assert (told.kept, told.measured) == (True, "a")
-    assert not check_plan(promised, replace(_diagnose(), unobservable_why=hidden)).kept[0].kept
+    assert (
+        not check_plan(promised, msgspec.structs.replace(_diagnose(), unobservable_why=hidden)).kept[0].kept
+    )
 
 
 def _run(*arguments: str | Path, code: int = 0) -> str:
