@@ -39,7 +39,8 @@ from pipeline.job.stored_fits import ERRORS, RunReading
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import load_motion_run, read_model_text
+from pipeline.report.motion_view import load_motion_run
+from pipeline.results.reading import read_model
 from pipeline.run import MotionRun, load_run
 from pipeline.run.windows import cut_run
 from pipeline.simulate import Disturbance, Program, Scenario, find_vehicle, simulate_run
@@ -74,8 +75,7 @@ def diagnose(scene: Scenario, name: str) -> tuple[MotionRun, Model | None]:
     vehicle = vehicle_of(made.scenario.vehicle.name)
     tables = tables_of(made, vehicle)
     run = load_run(tables, vehicle, name=name)
-    (found,) = diagnose_runs([Recording(name, tables)], vehicle).to_json()
-    file = read_model_text(found)
+    file = diagnose_runs([Recording(name, tables)], vehicle).proposal
     return run, None if file is None else file.model
 
 
@@ -272,7 +272,7 @@ def play_real(results: Path) -> None:
     logs: list[float] = []
     for manifest in store.survey().manifests:
         diagnosis = find_diagnosis(store.root, manifest)
-        file = None if diagnosis is None else read_model_text(diagnosis)
+        file = None if diagnosis is None else read_model(diagnosis)
         if file is None:
             continue
         vehicle = load_vehicle(manifest)

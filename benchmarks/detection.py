@@ -20,8 +20,9 @@ from game.play import parse_seeds
 from measuring import add_row, read_rows
 from plan_game import record
 
-from pipeline.estimation import RunDiagnosis, diagnose_runs
+from pipeline.estimation import diagnose_runs
 from pipeline.models import find_effect
+from pipeline.results import RunDiagnosis
 from pipeline.simulate import Scenario
 
 SHARES = (0.25, 0.5, 1.0, 2.0)

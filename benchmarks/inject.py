@@ -34,8 +34,8 @@ from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
 if TYPE_CHECKING:
-    from pipeline.estimation.diagnosis import Named, Value
     from pipeline.logs import LogData
+    from pipeline.results import Named, Value
     from pipeline.sources import Vehicle
     from pipeline.sources.candidates import Sources
     from pipeline.sources.configuration import Configuration
@@ -125,20 +125,21 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
         inputs = ("command", "measured") if both else ("measured",)
-        told = diagnose_runs([recording], vehicle, inputs=inputs).runs[0]
+        found = diagnose_runs([recording], vehicle, inputs=inputs)
+        (told,) = found.runs
     findings = (*recording.list_findings(), *told.findings)
     estimates = {
         f"{one.effect}.{one.parameter}": (one.value, _SURE * one.standard_error)
-        for one in sorted(told.estimates, key=lambda one: one.input)
+        for one in sorted(found.estimates, key=lambda one: one.input)
     }
     return Answer(
         _list_numbers(told.effects),
-        {str(one["id"]): cast("float | None", one.get("value")) for one in findings},
+        {one.id: cast("float | None", one.value) for one in findings},
         tuple(name for item in told.undecided for name in item.candidates),
-        tuple(item.id for item in told.unobservable),
+        tuple(told.unobservable_why),
         estimates,
         {f"{one.id}.{one.parameter}": one.size for one in told.detectable},
-        _list_values(pair for item in told.undecided for pair in item.numbers.items()),
+        _list_values(pair for item in told.undecided for pair in item.parameters.items()),
     )
 
 

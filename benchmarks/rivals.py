@@ -51,7 +51,8 @@ from pipeline.job.run_results import find_diagnosis, load_vehicle
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models
-from pipeline.report.motion_view import load_motion_run, read_model_text
+from pipeline.report.motion_view import load_motion_run
+from pipeline.results.reading import read_model
 from pipeline.store import Manifest, Store
 
 NAMED, IDEAL, TREES, BEYOND = "named physics", "ideal", "learned_trees", "named + trees"
@@ -96,7 +97,7 @@ class Recording:
     def __init__(self, manifest: Manifest, store: Store, source: Input, *, learns: bool) -> None:
         self.name = Path(manifest.run).name
         found = find_diagnosis(store.root, manifest)
-        file = None if found is None else read_model_text(found)
+        file = None if found is None else read_model(found)
         if file is None or not file.model.effects:
             what = "no effect is named: it did not move, or nothing could be judged"
             raise SlipError("not_diagnosed", what, where=self.name, hint="Take another one.")

@@ -22,8 +22,9 @@ from measuring import add_row, read_rows
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.running_log import list_passing, list_stated, measure_t
+from pipeline.job.running_log import list_passing, list_stated
 from pipeline.job.watch import measure_cpu
+from pipeline.results import RunDiagnosis, read_result, to_json
 
 Content = Mapping[str, object]
 _Ends = tuple[float, float, float]
@@ -68,20 +69,15 @@ def look(log: Path, out: Path) -> dict[str, object]:
     begin, spent = time.perf_counter(), measure_cpu()
     try:
         outcome = analyze_log(log, Options(out=out, report=False, diagnosis=True))
-        diagnosis = cast("Content", outcome.summary.get("diagnosis") or {})
+        diagnosis, problem = read_result(outcome.summary["diagnosis"], RunDiagnosis), None
     except SlipError as error:
-        diagnosis = {"error": str(error)}
-    kept = ("id", "clause", "corrected", "parameters", "equivalent_to", "selection_frequency")
-    effects = [
-        {**{key: one[key] for key in kept}, "growth": {"evidence": {"t": [measure_t(one)]}}}
-        for one in cast("list[Content]", diagnosis.get("effects") or [])
-    ]
+        diagnosis, problem = RunDiagnosis(), str(error)
     return {
-        "effects": effects,
-        "undecided": [one["candidates"] for one in cast("list[Content]", diagnosis.get("undecided") or [])],
+        "effects": to_json(RunDiagnosis(effects=diagnosis.effects))["effects"],
+        "undecided": [list(one.candidates) for one in diagnosis.undecided],
         "cpu_s": round(measure_cpu() - spent, 2),
         "wall_s": round(time.perf_counter() - begin, 2),
-        "error": diagnosis.get("error"),
+        "error": problem,
     }
 
 
@@ -93,7 +89,8 @@ def judge(record: Content) -> Iterator[dict[str, object]]:
         final |= dict.fromkeys(cast("list[str]", one["equivalent_to"]), one)
     before: list[str] = []
     for here in running:
-        for stated in list_stated(here, before):
+        seen = read_result({"effects": here["effects"]}, RunDiagnosis)
+        for stated in list_stated(seen, before):
             found = cast("Mapping[str, Content]", final.get(stated.id, {}).get("parameters", {}))
             ends = [
                 (number["low"], cast("Content", found[name])["value"], number["high"])
@@ -109,7 +106,7 @@ def judge(record: Content) -> Iterator[dict[str, object]]:
                     for low, value, high in cast("list[tuple[float, float, float]]", ends)
                 ],
             }
-        before = list_passing(here)
+        before = list_passing(seen)
 
 
 def describe(records: list[Content]) -> list[str]:

@@ -40,6 +40,7 @@ from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.store import Store
+from pipeline.words.objects import diagnosis_as_json
 
 RECORDED = "recordings"
 _TRUTH, _RESULTS, _ANSWERS = "truth.json", "results", "answers"
@@ -139,7 +140,7 @@ def diagnose(case: Case, root: Path, inputs: Sequence[str] = INPUTS) -> tuple[li
     begin = time.process_time()
     try:
         answer = diagnose_runs([recording for _, recording in read], read[0][0], inputs=inputs)
-        told = json.loads(json.dumps(answer.to_json()))
+        told = json.loads(json.dumps([diagnosis_as_json(run) for run in answer.runs]))
     except SlipError as error:
         told = [{"error": error.code, "effects": [], "undecided": [], "unobservable": []}]
     return told, time.process_time() - begin

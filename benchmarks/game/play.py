@@ -42,6 +42,7 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.sources import Vehicle
+from pipeline.words.objects import diagnosis_as_json
 
 Json = Mapping[str, Any]
 Outcome = Literal["scored", "failed", "timeout"]
@@ -205,7 +206,8 @@ def _ask(logs: Sequence[Path], watch: Watch) -> tuple[Vehicle, Recording, Sequen
         loaded = [_load(log) for log in logs]
     (vehicle, recording), *_ = loaded
     with watch.measure("diagnosis"):
-        told = diagnose_runs([one for _, one in loaded], vehicle).to_json()
+        found = diagnose_runs([one for _, one in loaded], vehicle)
+        told = [diagnosis_as_json(run) for run in found.runs]
     return vehicle, recording, told
 
 

@@ -26,8 +26,6 @@ from pipeline.batch.recordings import list_named
 from pipeline.core import SlipError, format_recorded
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.estimation import parse_budget
-from pipeline.estimation.diagnosis_lines import choose_lines, format_lines
-from pipeline.estimation.ladder import ERRORS_OVER_2S
 from pipeline.job import INPUTS, Options
 from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, open_run, update_datasets
 from pipeline.job.check import Check as RunsCheck
@@ -35,14 +33,19 @@ from pipeline.job.check import check_as_json, check_runs, keep_baseline, read_li
 from pipeline.job.check_sides import Baseline, read_baseline
 from pipeline.job.check_text import format_junit, format_markdown, list_lines
 from pipeline.job.keys import Owner, find_run
-from pipeline.job.run_results import LINES, diagnose_stored, find_diagnosis, find_peers, load_vehicle
+from pipeline.job.run_results import diagnose_stored, find_diagnosis, find_peers, load_vehicle, read_choices
 from pipeline.job.stored_fits import Against, contest_models, read_runs
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report import format_distance
-from pipeline.report.motion_view import read_model_text, view_diagnosis
+from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
+from pipeline.results import RunDiagnosis, read_result
+from pipeline.results.reading import ERRORS_OVER_2S
+from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.store import Manifest, Store
+from pipeline.words import diagnosis as words
+from pipeline.words.objects import diagnosis_as_json
 from schemas import contract_of
 
 if TYPE_CHECKING:
@@ -202,7 +205,7 @@ class Run:
 
     def figures(self) -> dict[str, ShownFigure]:
         """The figures of its report by id."""
-        return self._draw(mapping_in(self.summary, "diagnosis"))
+        return self._draw(read_result(mapping_in(self.summary, "diagnosis"), RunDiagnosis))
 
     def diagnose(
         self,
@@ -222,17 +225,17 @@ class Run:
             budget: CPU time that a search may take, for example ``60s``.
         """
         is_plain = not others and input == "both" and model is None and budget is None
-        content = find_diagnosis(self._store.root, self.manifest) if is_plain else None
-        if content is None:
+        diagnosis = find_diagnosis(self._store.root, self.manifest) if is_plain else None
+        if diagnosis is None:
             with threadpool_limits(1):
-                content = diagnose_stored(
+                diagnosis = diagnose_stored(
                     [run.manifest for run in (self, *others)],
                     INPUTS if input == "both" else (input,),
                     None if model is None else take_file(model).model,
                     vehicle_of,
                     None if budget is None else parse_budget(budget),
                 )
-        return Diagnosis(content, lambda: self._draw(content))
+        return Diagnosis(diagnosis, read_choices(self.manifest), lambda: self._draw(diagnosis))
 
     def compare_models(
         self,
@@ -272,7 +275,7 @@ class Run:
             ]
         )
 
-    def _draw(self, diagnosis: Content) -> dict[str, ShownFigure]:
+    def _draw(self, diagnosis: RunDiagnosis) -> dict[str, ShownFigure]:
         tables = {name: self.manifest.read(name) for name in self.tables}
         motion = view_diagnosis(tables, self.vehicle, diagnosis)
         peers = find_peers(self._store, dict(self.manifest.read_json(SUMMARY)))
@@ -310,9 +313,12 @@ class Diagnosis:
         model: the model with these effects; None where nothing could be judged.
     """
 
-    def __init__(self, content: Content, draw: Callable[[], dict[str, ShownFigure]]) -> None:
-        self._content, self._draw = content, draw
-        self._lines = cast("Sequence[tuple[str, str]]", content[LINES])
+    def __init__(
+        self, diagnosis: RunDiagnosis, choices: Content, draw: Callable[[], dict[str, ShownFigure]]
+    ) -> None:
+        self._diagnosis, self._choices, self._draw = diagnosis, choices, draw
+        self._lines = words.list_lines(diagnosis)
+        content = self.to_json()
         self.verdict = str(content["verdict"])
         effects = {str(one["id"]): one for one in objects_in(content, "effects")}
         self.effects = pl.DataFrame(
@@ -327,19 +333,19 @@ class Diagnosis:
              for name, one in effects.items() for key in mapping_in(one, "parameters")}
         )  # fmt: skip
         self.ladder = tabulate_ladder(content)
-        file = read_model_text(content)
+        file = read_diagnosed_model(diagnosis)
         self.model = None if file is None else Model.of(file)
 
     def to_json(self) -> dict[str, object]:
         """The object of one run of `slip diagnose --json`."""
-        return {key: value for key, value in self._content.items() if key != LINES}
+        return {**diagnosis_as_json(self._diagnosis), **self._choices}
 
     def figures(self) -> dict[str, ShownFigure]:
         """The figures of the run with the model that was named, by id: ladder, residuals, budget, ..."""
         return self._draw()
 
     def __repr__(self) -> str:
-        return "\n".join(format_lines(choose_lines(self._lines, everything=False)))
+        return "\n".join(words.format_lines(self._lines))
 
     def _repr_html_(self) -> str:
         sentences = dict(self.effects.select("effect", "sentence").iter_rows())
@@ -349,7 +355,7 @@ class Diagnosis:
             part = label or part
             if part in {"remaining", "findings"}:
                 notes.append(f"{part}: {text}")
-        title = f"{self._content['run']}: {', '.join(self.effects['effect']) or 'no significant effect'}"
+        title = f"{self._diagnosis.run}: {', '.join(self.effects['effect']) or 'no significant effect'}"
         return write_html(
             title, self.parameters.with_columns(sentence=pl.Series(texts, dtype=pl.String)), notes
         )
@@ -460,7 +466,7 @@ class Check:
         keep_baseline(self._checked, Path(path))
 
     def __repr__(self) -> str:
-        return "\n".join(format_lines(self._lines))
+        return "\n".join(words.format_lines(self._lines))
 
     def _repr_html_(self) -> str:
         shown = self.numbers.select("number", "unit", "status", "before", "after", "p")

@@ -15,9 +15,8 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import number_in, objects_in
 from pipeline.estimation.comparison import choose_input
-from pipeline.estimation.estimates import format_parameters, list_parameters
+from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.ladder import format_ladder
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
 from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs
@@ -27,9 +26,11 @@ from pipeline.models.catalogue import refuse_taken
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
+from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
+from pipeline.words.models import format_ladder, format_parameters
 
 if TYPE_CHECKING:
     from pipeline.api import Run
@@ -279,9 +280,13 @@ class Fit:
         """The keys of `slip model fit --json` that are the fit's own: not those of files and priors."""
         return self._fit.to_json()
 
+    def _as_diagnosis(self) -> RunDiagnosis:
+        content = self.to_json()
+        return read_result({key: content[key] for key in ("input", "ladder", "noise_floor")}, RunDiagnosis)
+
     def figures(self) -> dict[str, ShownFigure]:
         """The ladder as a chart."""
-        return show_figures(RunReport({}, diagnosis=self.to_json()))
+        return show_figures(RunReport({}, diagnosis=self._as_diagnosis()))
 
     def __repr__(self) -> str:
         return "\n".join([repr(self.model), *format_ladder(self._fit.after.ladder, self._fit.floor)])

@@ -16,11 +16,11 @@ from pipeline.core import (
     format_interval,
     format_recorded,
     format_share,
-    mark_finding,
 )
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
+from pipeline.results import RunDiagnosis, read_result
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -208,10 +208,10 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
-    from pipeline.estimation.verdict import has_no_pose  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import has_no_pose, read_findings  # noqa: PLC0415 - heavy
 
     named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
-    if has_no_pose(summary):
+    if has_no_pose(read_findings(summary)):
         named += " of the drivetrain, not of the ground,"
     medians = _format_medians(by_input, "median_modulus")
     if not everything:
@@ -243,7 +243,7 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
 
 def _format_medians(by_input: Mapping[str, object], key: str) -> str:
     parts = (
-        f"{_number(mapping_in(by_input, name), key)} m/s {words}"
+        f"{_number(mapping_in(by_input, name), key, 2)} m/s {words}"
         for name, words in INPUT_WORDS.items()
         if name in by_input
     )
@@ -268,56 +268,28 @@ def _format_topics(summary: Summary) -> list[str]:
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
     """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    findings = objects_in(summary, "findings")
-    known = {str(finding["text"]) for finding in findings}
-    own = objects_in(mapping_in(summary, "diagnosis"), "findings")
-    findings = [*findings, *(finding for finding in own if str(finding["text"]) not in known)]
-    incidents: dict[str, list[Mapping[str, object]]] = {}
-    rows, notes = [], []
-    for finding in findings:
-        if (text := str(finding["text"])).casefold() in verdict.casefold():
-            continue
-        if finding["severity"] == "info":
-            notes.append(f"   {text}")
-        elif finding.get("t_end") is not None:
-            incidents.setdefault(str(finding["id"]), []).append(finding)
-        else:
-            rows.append(f"{mark_finding(finding['severity'])}{text}")
-    marks = {name: mark_finding(alike[0]["severity"]) for name, alike in incidents.items()}
-    rows = [*(f"{marks[name]}{_format_timed(alike)}" for name, alike in incidents.items()), *rows]
-    if everything:
-        rows += notes
-    elif len(rows) > _SHOWN:
-        rest = len(rows) - _SHOWN + len(notes)
-        rows = [*rows[:_SHOWN], f"   {rest} more (--all)"]
-    return [_row("" if number else "findings", row) for number, row in enumerate(rows)]
+    from pipeline.results.reading import read_findings  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import list_findings  # noqa: PLC0415 - heavy
 
-
-def _format_timed(timed: Sequence[Mapping[str, object]]) -> str:
-    """Number of incidents of one kind, and the longest of them."""
-
-    def read(one: Mapping[str, object]) -> tuple[float, float]:
-        start, end = cast("float", one["t_start"]), cast("float", one["t_end"])
-        return start, end
-
-    longest = max(timed, key=lambda one: read(one)[1] - read(one)[0])
-    start, end = read(longest)
-    many = f"{len(timed)} incidents, the longest " if len(timed) > 1 else ""
-    return f"{many}from {start:.1f} to {end:.1f} s: {longest['text']}"
+    findings = read_findings(summary)
+    known = {finding.text for finding in findings}
+    own = [one for one in read_findings(mapping_in(summary, "diagnosis")) if one.text not in known]
+    return [_row(*row) for row in list_findings({"": [*findings, *own]}, verdict, everything=everything)]
 
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.estimation.diagnosis_lines import FINDING_LABELS, choose_lines  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import VERDICT, list_lines  # noqa: PLC0415 - heavy
 
-    stored = mapping_in(summary, "diagnosis").get("lines") or []
-    lines = choose_lines(cast("Sequence[tuple[str, str]]", stored), everything=everything)
+    stored = mapping_in(summary, "diagnosis")
+    if not stored:
+        return []
     described: list[str] = []
-    label = ""
-    for name, text in lines:
-        label = name or label
-        if label not in ("verdict", *FINDING_LABELS):
-            described.append(_row(name, text))
+    part = ""
+    for label, text in list_lines(read_result(stored, RunDiagnosis), everything=everything):
+        part = label or part
+        if part not in {VERDICT, "findings"}:
+            described.append(_row(label, text))
     return described
 
 

@@ -128,9 +128,10 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
         trust_code: trust the Python that the model file names, now and later.
         json: print one JSON object.
     """
-    from pipeline.estimation.estimates import format_parameters, list_parameters  # noqa: PLC0415 - heavy
+    from pipeline.estimation.estimates import list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export import export_model  # noqa: PLC0415
     from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
+    from pipeline.words.models import format_parameters  # noqa: PLC0415 - heavy
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -385,8 +386,8 @@ def _change(
 
 
 def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
-    from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
+    from pipeline.words.models import format_refusals  # noqa: PLC0415 - heavy
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
     hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
@@ -421,13 +422,14 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 
 def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
-    from pipeline.estimation.additions import format_refusals  # noqa: PLC0415 - heavy
-    from pipeline.estimation.estimates import (  # noqa: PLC0415 - heavy
+    from pipeline.estimation.estimates import parameters_as_json  # noqa: PLC0415 - heavy
+    from pipeline.words.models import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+        describe_step,
+        format_ladder,
         format_parameters,
         format_recordings,
-        parameters_as_json,
+        format_refusals,
     )
-    from pipeline.estimation.ladder import describe_step, format_ladder  # noqa: PLC0415 - heavy
 
     old, new, chosen = fit.before, fit.after, fit.chosen
     runs = ", ".join(new.problem.names)
@@ -447,7 +449,7 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.estimation.ladder import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
+    from pipeline.words.models import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
     lines = list(format_heads("held-out error of"))
     for name, item in rows:

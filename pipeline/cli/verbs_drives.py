@@ -28,11 +28,12 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
-    from pipeline.estimation import Recording, RunDiagnosis
+    from pipeline.estimation import Recording
     from pipeline.fleet.forecast import Forecast
     from pipeline.job import Options
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
+    from pipeline.results import RunDiagnosis
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
     from pipeline.sources import Vehicle
@@ -292,7 +293,7 @@ def format_plan(
         return [f"no open question{what}"]
     lines = []
     for one in made.promises:
-        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"+- {one.expected:.2g}"
+        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"±{one.expected:.2g}"
         lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
     if rest := made.format_rest():
         lines.append(f"then         {rest}")

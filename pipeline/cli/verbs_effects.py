@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from pipeline.job.keys import Owner
     from pipeline.models import Model, ModelFile
     from pipeline.models.effect import Effect
+    from pipeline.results import RunDiagnosis
     from pipeline.sources import Vehicle
     from pipeline.store import Manifest
 
@@ -79,6 +80,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     options = build_options(choices)
     from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models import check_target  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import describe  # noqa: PLC0415 - heavy
 
     if apply is not None:
         check_target(apply)
@@ -117,13 +119,13 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
         said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
         for answer in answers:
-            names = " ".join(shlex.quote(str(run["run"])) for run in answer.runs)
+            names = " ".join(shlex.quote(run.run) for run in answer.runs)
             following = (
                 f"slip diagnose {names}{said} --apply model.toml"
                 if apply is None
                 else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
             )
-            print_lines(answer.describe(following, everything=everything).splitlines())
+            print_lines(describe(answer.runs, following, everything=everything).splitlines())
     return _end(answers, errors, lossy=lossy, quiet=quiet)
 
 
@@ -181,13 +183,13 @@ class _Answer:
     """The diagnosis of runs that were judged together, made now or read from the results.
 
     Attributes:
-        runs: as JSON objects, with the topics and the vehicle that were chosen.
-        describe: its text, with the command that goes on from it.
+        runs: what was found in each.
+        opened: where each comes from.
         proposal: the model to write; None where nothing could be judged.
     """
 
-    runs: list[dict[str, object]]
-    describe: Callable[..., str]
+    runs: Sequence[RunDiagnosis]
+    opened: Sequence[_Opened]
     proposal: ModelFile | None
 
 
@@ -195,48 +197,37 @@ def _answer(
     search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
 ) -> _Answer:
     """The result of a search, or with ``keeps`` the stored result of an earlier one."""
-    from pipeline.estimation.diagnosis_lines import describe  # noqa: PLC0415 - heavy
+    from pipeline.job.run_results import find_diagnosis  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
 
-    if keeps and (stored := _read_stored(results, opened[0].manifest)) is not None:
-        return stored
+    if keeps and (stored := find_diagnosis(results, opened[0].manifest)) is not None:
+        return _Answer([stored], opened, read_model(stored))
     diagnosis = search()
     if keeps:
         _keep(results, opened[0].manifest, diagnosis, quiet=quiet)
-    runs = [{**run.to_json(), **one.choices} for run, one in zip(diagnosis.runs, opened, strict=True)]
-    proposals = (run.proposal for run in diagnosis.runs)
-    return _Answer(runs, partial(describe, diagnosis), next(filter(None, proposals), None))
-
-
-def _read_stored(results: Path, manifest: Manifest) -> _Answer | None:
-    """The stored answer for a run; None if there is none."""
-    from pipeline.estimation.diagnosis_lines import format_stored  # noqa: PLC0415 - heavy
-    from pipeline.job.run_results import LINES, find_diagnosis  # noqa: PLC0415
-    from pipeline.models.model_file import parse_model  # noqa: PLC0415
-
-    stored = find_diagnosis(results, manifest)
-    if stored is None:
-        return None
-    text = stored.get("model")
-    proposal = parse_model(text, results / manifest.run) if isinstance(text, str) else None
-    shown = {key: value for key, value in stored.items() if key != LINES}
-    return _Answer([shown], partial(format_stored, stored), proposal)
+    return _Answer(diagnosis.runs, opened, diagnosis.proposal)
 
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
     """Store an answer with the results; if they cannot be written, only print a note."""
-    from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
-    from pipeline.job.run_results import LINES, keep_diagnosis  # noqa: PLC0415
+    from pipeline.job.run_results import keep_diagnosis  # noqa: PLC0415 - heavy
 
     (run,) = diagnosis.runs
     try:
-        keep_diagnosis(results, manifest, {**run.to_json(), LINES: list_lines(run)})
+        keep_diagnosis(results, manifest, run)
     except (OSError, SlipError) as error:
         if not quiet:
             print_note(f"slip: the diagnosis was not saved: {error}")
 
 
 def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
-    return [run for answer in answers for run in answer.runs]
+    from pipeline.words.objects import diagnosis_as_json  # noqa: PLC0415 - heavy
+
+    return [
+        {**diagnosis_as_json(run), **one.choices}
+        for answer in answers
+        for run, one in zip(answer.runs, answer.opened, strict=True)
+    ]
 
 
 def _agree(
@@ -275,24 +266,24 @@ def _judge(
 
 def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequence[str], quiet: bool) -> int:
     """Return the exit code, and print a note if nothing else explains why it is not 0."""
-    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
 
     if lossy and not quiet:
         print_note(f"logs with losses: {', '.join(lossy)} (slip inspect {lossy[0]} lists them)")
-    is_excluded = any(find_refusal(run) for answer in answers for run in answer.runs)
+    is_excluded = any(find_refusal(run.findings) for answer in answers for run in answer.runs)
     return exit_code(errors, lossy=bool(lossy) or is_excluded)
 
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[str, str]]:
     """Write the proposed model; the error of there being none, as a JSON object."""
-    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
 
     if not answers:  # the errors were said
         return []
     proposal = next((one.proposal for one in answers if one.proposal is not None), None)
     if proposal is None:
-        refusals = [find_refusal(run) for answer in answers for run in answer.runs]
+        refusals = [find_refusal(run.findings) for answer in answers for run in answer.runs]
         what = f"no model can be proposed: {next(filter(None, refusals), 'nothing could be judged')}"
         error = SlipError("nothing_to_apply", what, where=str(path), hint="See the findings.")
         print_error(error)
@@ -409,13 +400,11 @@ def export(  # noqa: D417 - the results folder documents itself
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
     """The model of the run's diagnosis, and its input; None if there is none."""
-    from pipeline.job.run_results import DIAGNOSIS  # noqa: PLC0415 - heavy
-    from pipeline.report.motion_view import read_model_text  # noqa: PLC0415 - heavy
+    from pipeline.job.run_results import read_stored_diagnosis  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
 
-    if DIAGNOSIS not in manifest.files:
+    diagnosis = read_stored_diagnosis(manifest)
+    file = None if diagnosis is None else read_model(diagnosis)
+    if diagnosis is None or file is None:
         return None, None
-    diagnosis = manifest.read_json(DIAGNOSIS)
-    named_on = diagnosis.get("input")
-    usable = named_on if named_on in {"command", "measured"} else None
-    file = read_model_text(diagnosis)
-    return (None if file is None else file.model), usable
+    return file.model, diagnosis.input or None

@@ -76,7 +76,6 @@ def check(  # noqa: D417 - the arguments document themselves
     """
     _require_target(to, file, json=json)
     _require_runs(after)
-    from pipeline.estimation.diagnosis_lines import format_lines  # noqa: PLC0415 - heavy
     from pipeline.job.check import (  # noqa: PLC0415 - heavy
         check_as_json,
         check_runs,
@@ -86,6 +85,7 @@ def check(  # noqa: D417 - the arguments document themselves
     from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
     from pipeline.models import write_text  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import format_lines  # noqa: PLC0415 - heavy
 
     bounds = None if limits is None else read_limits(limits)
     options = build_options(Choices(results=results))

@@ -197,6 +197,13 @@ def format_angle(radians: float) -> str:
     return f"{text} degree{'s' * (text != '1')}"
 
 
+def format_errors(metres: float, radians: float) -> str:
+    """Errors of position and heading as text: `1.06 m and 55 degrees`; one that is NaN is left out."""
+    sizes = [format_length(metres)] if math.isfinite(metres) else []
+    sizes += [format_angle(radians)] if math.isfinite(radians) else []
+    return " and ".join(sizes) or "by an unknown amount"
+
+
 def format_duration(seconds: float) -> str:
     """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
     if seconds < _MINUTE:

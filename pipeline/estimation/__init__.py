@@ -12,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
+import msgspec
 from threadpoolctl import threadpool_limits
 
 from pipeline.core.compute import Budget, usual_budget
@@ -21,7 +22,7 @@ from pipeline.estimation.comparison import Comparison, Input, InputChoice, choos
 from pipeline.estimation.conclude import Explored
 from pipeline.estimation.context import Context, DiagnosisError, prepare
 from pipeline.estimation.decision import Search
-from pipeline.estimation.diagnosis import Diagnosis, Named, RunDiagnosis, Value
+from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.encoder_scale import find_encoder_scale
 from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
 from pipeline.estimation.intervals import Estimates, estimate_intervals
@@ -37,9 +38,10 @@ from pipeline.estimation.problem import (
 )
 from pipeline.estimation.state import Free, State
 from pipeline.estimation.unexplained import search_formula
-from pipeline.estimation.verdict import FATAL
 from pipeline.models import Effect, Model
 from pipeline.models.effect import Place
+from pipeline.results import Finding, Named, RunDiagnosis, Value
+from pipeline.results.reading import find_refusal, read_findings
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
 
@@ -84,13 +86,10 @@ class Recording:
     path: str = ""
     length_scale_m: float = 1.0
 
-    def list_findings(self) -> list[dict[str, object]]:
-        """Findings of the stages: id, text, where, severity and value."""
+    def list_findings(self) -> tuple[Finding, ...]:
+        """Findings of the stages."""
         table = self.tables.get("findings")
-        if table is None or table.is_empty():
-            return []
-        columns = [name for name in ("id", "text", "where", "severity", "value") if name in table.columns]
-        return table.select(columns).to_dicts()
+        return () if table is None else read_findings({"findings": table.to_dicts()})
 
 
 def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
@@ -124,7 +123,7 @@ def diagnose_runs(
     Raises:
         DiagnosisError: ``too_short`` or ``no_input``.
     """
-    fatal = [f for recording in recordings for f in recording.list_findings() if f["id"] in FATAL]
+    fatal = any(find_refusal(recording.list_findings()) for recording in recordings)
     leading = "command" if "command" in inputs else "measured"
     if fatal:
         return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
@@ -145,11 +144,12 @@ def diagnose_runs(
     misread = find_encoder_scale(judged.runs[0])
     if misread is None:
         return judged
-    return Diagnosis(
-        tuple(
-            replace(run, findings=(misread.report(), *run.findings))
-            for run in judge(misread.correct(runs)).runs
-        )
+    again = judge(misread.correct(runs))
+    return replace(
+        again,
+        runs=tuple(
+            msgspec.structs.replace(run, findings=(misread.report(), *run.findings)) for run in again.runs
+        ),
     )
 
 
@@ -181,7 +181,7 @@ def _explore_part(context: Context, search: Search, path: str, start: State) -> 
         outcome, formula = search_formula(search, outcome, sideways=sideways)
     unobservable, detectable = find_unobservable(search, outcome)
     undecided = tuple(find_undecided(search, outcome))
-    return Explored(path, search, outcome, formula, undecided, tuple(unobservable), tuple(detectable))
+    return Explored(path, search, outcome, formula, undecided, unobservable, tuple(detectable))
 
 
 def _conclude(
@@ -191,12 +191,11 @@ def _conclude(
     paths: Sequence[Explored],
     clocks: Clocks,
 ) -> Diagnosis:
-    common: RunDiagnosis = conclude.summarize(
-        context, chosen.source, paths, clocks, recordings[0].length_scale_m
+    whole, delays = conclude.summarize(context, chosen.source, paths, clocks, recordings[0].length_scale_m)
+    (common,) = whole.runs
+    common = msgspec.structs.replace(common, input_reason=chosen.reason)
+    runs = tuple(
+        conclude.of_run(common, recording, number, delays[number], context)
+        for number, recording in enumerate(recordings)
     )
-    common = replace(common, input_reason=chosen.reason)
-    return Diagnosis(
-        tuple(
-            conclude.of_run(common, recording, number, context) for number, recording in enumerate(recordings)
-        )
-    )
+    return replace(whole, runs=runs)

@@ -18,20 +18,13 @@ from pipeline.estimation.context import Context
 from pipeline.estimation.decision import LEAST_T, measure_t
 from pipeline.estimation.folds import Errors, number_predictions
 from pipeline.estimation.intervals import estimate_intervals
-from pipeline.estimation.ladder import (
-    CHANCE,
-    LadderStep,
-    format_rises,
-    judge_whole,
-    list_rises,
-    lowers_errors,
-    raises_errors,
-)
+from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
 from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.model_fit import Fitted
 from pipeline.models import Model
 from pipeline.models.catalogue import explain_idle
 from pipeline.models.learned_term import LEARNED
+from pipeline.results.reading import CHANCE, format_rises, list_rises
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
@@ -269,18 +262,6 @@ def explain_interval(effect: Effect, intervals: Mapping[str, Interval | None]) -
         f"the 95 % interval of {parameter.name}, {low:.3g} to {_format_value(high, parameter)}, "
         f"includes {at} (no effect)"
     )
-
-
-def format_refusals(refusals: Mapping[str, str]) -> str:
-    """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
-
-    Args:
-        refusals: reasons by id, at least one.
-    """
-    reasons = list(dict.fromkeys(refusals.values()))
-    said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
-    verb = "is" if len(refusals) == 1 else "are"
-    return f"{', '.join(refusals)} {verb} not supported by the data ({said})"
 
 
 def _count_numbers(effect: Effect) -> int:

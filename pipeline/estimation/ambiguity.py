@@ -3,23 +3,24 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from pipeline.core.arrays import Floats, Ints
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.decision import LEAST_T, STABLE_T, Search, SearchResult
-from pipeline.estimation.diagnosis import Value
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import PartFit, whiten_columns
 from pipeline.estimation.intervals import estimate_part
-from pipeline.models.catalogue import find_late_effect, list_effects, suggest_manoeuvre
+from pipeline.models.catalogue import find_late_effect, list_effects
 from pipeline.models.effect import Effect, Late, find_late
 from pipeline.models.parameter import LEAST_DELAY_S
 from pipeline.models.parameter import Search as HowSearched
+from pipeline.results import Delays, Detectable, Undecided, Unobservable, Value
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 
@@ -31,23 +32,6 @@ if TYPE_CHECKING:
 
 DETECTED = LEAST_T + 1.3
 """Size of an effect [standard errors] that is named in nine of ten logs."""
-DETECTED_SHARE = 90
-"""Share of logs with an effect of that size in which it is named [percent]."""
-
-
-@dataclass(frozen=True)
-class Undecided:
-    """Effects of which one acts, but the log does not determine which.
-
-    Attributes:
-        candidates: ids, the chosen one first.
-        separate_by: manoeuvre that distinguishes them.
-        numbers: values of each one in place of the others, in the first run, by id and parameter.
-    """
-
-    candidates: tuple[str, ...]
-    separate_by: str
-    numbers: Mapping[str, Mapping[str, Value]] = field(default_factory=dict)
 
 
 def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]:
@@ -71,11 +55,10 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
         if names:
             numbers = {name: _read_numbers(outcome.final, name)}
             numbers |= {other: _read_numbers(fit, other) for other, fit in rivals.items()}
-            rest = [candidates[one]() for one in names]
-            yield Undecided((name, *names), suggest_manoeuvre(effect, *rest), numbers)
+            yield Undecided((name, *names), numbers)
 
 
-def _read_numbers(fit: PartFit, name: str) -> Mapping[str, Value]:
+def _read_numbers(fit: PartFit, name: str) -> dict[str, Value]:
     """Values of an effect of a model in the first run, with their intervals."""
     return list_first_run(fit.state, estimate_part(fit))[name]
 
@@ -84,7 +67,7 @@ def take_judged(items: Iterable[Undecided], judgement: Judgement) -> list[Undeci
     """The same groups, with the values and intervals of a judged model for the effects in it."""
     estimated = list_first_run(judgement.fitted.state, judgement.estimates)
     return [
-        replace(item, numbers={name: estimated.get(name, numbers) for name, numbers in item.numbers.items()})
+        replace(item, parameters={name: estimated.get(name, old) for name, old in item.parameters.items()})
         for item in items
     ]
 
@@ -101,20 +84,20 @@ class Clocks:
 
     Attributes:
         effects: delays of poses and of heading, as far as they are significant.
-        timing: of every run, with the keys of the JSON output.
+        timing: of every run.
         undecided: a late heading whose position may be late, too.
     """
 
     effects: tuple[Effect, ...]
-    timing: tuple[Mapping[str, float | str | None], ...]
+    timing: tuple[Delays, ...]
     undecided: tuple[Undecided, ...] = ()
 
-    def list_runs(self, fitted: Fitted | None) -> list[Mapping[str, float | str | None]]:
+    def list_runs(self, fitted: Fitted | None) -> list[Delays]:
         """`timing`, with the delays of the encoders in the fit of the written model, if there is one."""
         if fitted is None:
             return list(self.timing)
         return [
-            row if row["wheel_delay_s"] is None else {**row, "wheel_delay_s": round(delay.wheel_delay_s, 4)}
+            row if row.wheel_delay_s is None else replace(row, wheel_delay_s=round(delay.wheel_delay_s, 4))
             for row, delay in zip(self.timing, fitted.state.timing, strict=True)
         ]
 
@@ -132,12 +115,12 @@ def read_clocks(context: Context, state: State, source: Input) -> Clocks:
         skews.append(heading_delay)
         certain.append(_is_late(run))
         rows.append(
-            {
-                "heading": "gyro" if run.gyro_fit is not None else "pose",
-                "pose_delay_s": round(late, 4),
-                "yaw_delay_s": None if run.gyro_fit is None else round(yaw, 4),
-                "wheel_delay_s": round(timing.wheel_delay_s, 4) if source is Input.MEASURED else None,
-            }
+            Delays(
+                heading="gyro" if run.gyro_fit is not None else "pose",
+                pose_delay_s=round(late, 4),
+                yaw_delay_s=None if run.gyro_fit is None else round(yaw, 4),
+                wheel_delay_s=round(timing.wheel_delay_s, 4) if source is Input.MEASURED else None,
+            )
         )
     late_effects: list[Effect] = []
     late, heading_delay = float(np.mean(positions)), float(np.mean(skews))
@@ -152,8 +135,7 @@ def read_clocks(context: Context, state: State, source: Input) -> Clocks:
         if context.has_gyro and not context.largest.moves_both_ways:
             # The gyro gives the heading delay; relating it to the position clock needs driving and turning.
             skew = find_late_effect(Late.HEADING)()
-            pair = Undecided((clock.id, skew.id), suggest_manoeuvre(clock, skew))
-            return Clocks(tuple(late_effects), tuple(rows), (pair,))
+            return Clocks(tuple(late_effects), tuple(rows), (Undecided((clock.id, skew.id)),))
         late_effects.append(clock)
     return Clocks(tuple(late_effects), tuple(rows))
 
@@ -183,38 +165,9 @@ def list_equivalents(effect: Effect, context: Context) -> tuple[str, ...]:
     return effect.equivalent_to if effect.is_equivalent(context.conditions) else ()
 
 
-@dataclass(frozen=True)
-class Unobservable:
-    """An effect that is not observable in this log.
-
-    Attributes:
-        id: id of the effect.
-        reason: the run does not excite it, or it is collinear with a named effect.
-        manoeuvre: manoeuvre that makes it observable.
-    """
-
-    id: str
-    reason: Literal["no excitation", "collinear with what was named"]
-    manoeuvre: str
-
-
-@dataclass(frozen=True)
-class Detectable:
-    """Detection threshold of an effect that was not named in this log.
-
-    Attributes:
-        id: id of the effect.
-        parameter, unit: its parameter.
-        size: threshold, as a distance from the neutral value of the parameter.
-    """
-
-    id: str
-    parameter: str
-    unit: str
-    size: float
-
-
-def find_unobservable(search: Search, outcome: SearchResult) -> tuple[list[Unobservable], list[Detectable]]:
+def find_unobservable(
+    search: Search, outcome: SearchResult
+) -> tuple[dict[str, Unobservable], list[Detectable]]:
     """Candidates that would not be named in this log at their typical size, nor if they show only once.
 
     Returns:
@@ -224,7 +177,7 @@ def find_unobservable(search: Search, outcome: SearchResult) -> tuple[list[Unobs
     own = fit.white.columns
     basis = np.linalg.qr(own / (np.linalg.norm(own, axis=0) + 1e-12))[0] if own.size else own
     unit = part.unit[fit.white.rows]
-    unobservable, seen = list[Unobservable](), list[Detectable]()
+    unobservable, seen = dict[str, Unobservable](), list[Detectable]()
     for candidate in search.candidates:
         if candidate.id in fit.ids or not candidate().acts_in(fit.ids):
             continue
@@ -235,10 +188,8 @@ def find_unobservable(search: Search, outcome: SearchResult) -> tuple[list[Unobs
         if _is_seen(beside, unit):
             seen += _find_detectable(usual, math.sqrt(float(beside @ beside)))
             continue
-        reason: Literal["no excitation", "collinear with what was named"] = (
-            "collinear with what was named" if _is_seen(column, unit) else "no excitation"
-        )
-        unobservable.append(Unobservable(candidate.id, reason, suggest_manoeuvre(candidate())))
+        reason = "collinear with what was named" if _is_seen(column, unit) else "no excitation"
+        unobservable[candidate.id] = Unobservable(reason)
     return unobservable, seen
 
 

@@ -13,29 +13,18 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations
-from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.core import (
-    FEWEST_OF_SPREAD,
-    JSON_DIGITS,
-    enumerate_texts,
-    finite_or_none,
-    format_share,
-    pick_finite,
-)
+from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
-from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
+from pipeline.results import Moments, Share, SlipBudget, Span
+from pipeline.results.reading import ABOVE_FLOOR
 from pipeline.run.windows import HORIZON_S
 
-if TYPE_CHECKING:
-    from pipeline.estimation.diagnosis import Json
-
-Kind = Literal["effect", "disturbance", "localization_noise"]
 Subset = frozenset[str]
 
 QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
@@ -43,72 +32,6 @@ QUANTITIES = {"slip": "m^2/s^2", "position": "m^2", "heading": "rad^2"}
 
 _ALL_ORDERS = 5
 """Largest number of effects for which all orders are used: 120 orders of 32 sets."""
-
-
-@dataclass(frozen=True)
-class Share:
-    """Share of one cause in a mean square.
-
-    Attributes:
-        name: id of the effect, `disturbance` or `localization_noise`.
-        kind: which of these.
-        share: of the whole; below zero for an effect that increases the held-out error.
-        low, high: 95 % interval over stretches of ten seconds, with the model's parameters held fixed; NaN
-            with fewer than three.
-        alone: share that the effect removes from the ideal model by itself; NaN where it is no effect.
-        last: share that it removes after all others. Both equal the share of an effect independent of the
-            others; their difference is shared with others.
-    """
-
-    name: str
-    kind: Kind
-    share: float
-    low: float
-    high: float
-    alone: float = math.nan
-    last: float = math.nan
-
-    def pick(self, *others: str) -> dict[str, Json]:
-        """The share with its interval, and others of its numbers, as JSON and tables hold them."""
-        return {**pick_finite(self, "share", "low", "high", *others, digits=JSON_DIGITS)}
-
-
-@dataclass(frozen=True)
-class SlipBudget:
-    """A mean square and its apportionment by cause.
-
-    Attributes:
-        input: `command` or `measured`, from which the model predicts.
-        quantity: one of `QUANTITIES`.
-        total: held-out mean square of the ideal model, in `unit`.
-        unit: of the total.
-        shares: effects, the largest first, then disturbance and localization noise; they add up to one.
-        stretches: number of ten-second stretches used for the intervals.
-    """
-
-    input: str
-    quantity: str
-    total: float
-    unit: str
-    shares: tuple[Share, ...]
-    stretches: int
-
-    def to_json(self) -> dict[str, Json]:
-        """The keys of `slip compare --causes` for one run, for each input and quantity."""
-        rest: dict[str, Json] = {share.kind: share.pick() for share in self.shares if share.kind != "effect"}
-        return {
-            "input": self.input,
-            "quantity": self.quantity,
-            "total": finite_or_none(self.total, JSON_DIGITS),
-            "unit": self.unit,
-            "stretches": self.stretches,
-            "shares": [
-                {"effect": share.name, **share.pick("alone", "last")}
-                for share in self.shares
-                if share.kind == "effect"
-            ],
-            **rest,
-        }
 
 
 def apportion(judgement: Judgement, *, length_scale_m: float = 1.0) -> tuple[SlipBudget, ...]:
@@ -248,18 +171,17 @@ def _make_budget(source: str, quantity: str, split: Split, floor: float, column:
         return float(part.sum()) / max(float(whole.sum()), 1e-300)
 
     shares = [
-        Share(name, "effect", *bound(part[:, column]), ratio(split.alone[name][:, column]),
+        Share(name, *bound(part[:, column]), ratio(split.alone[name][:, column]),
               ratio(split.last[name][:, column]))
         for name, part in split.parts.items()
     ]  # fmt: skip
     shares.sort(key=lambda one: -one.share)
     # The noise floor is one value for all stretches: its share of the residual is assumed equal in each.
     noise = min(floor / max(float(rest.sum()), 1e-300), 1.0)
-    shares.append(Share("disturbance", "disturbance", *bound(rest, 1.0 - noise)))
-    shares.append(Share("localization_noise", "localization_noise", *bound(rest, noise)))
     return SlipBudget(
-        source, quantity, float(whole.sum()), QUANTITIES[quantity], tuple(shares), int(there.sum())
-    )
+        source, quantity, float(whole.sum()), QUANTITIES[quantity], int(there.sum()), tuple(shares),
+        Share("disturbance", *bound(rest, 1.0 - noise)), Share("localization_noise", *bound(rest, noise)),
+    )  # fmt: skip
 
 
 def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
@@ -286,49 +208,6 @@ def jackknife_ratio(part: Floats, whole: Floats) -> tuple[float, float]:
     return ratio, student_quantile(0.95, count - 1) * error
 
 
-@dataclass(frozen=True)
-class Moments:
-    """The times of a run in which half of the squared error of the 2 s predictions of a model arises.
-
-    Attributes:
-        run: number of the run.
-        quantity: `position` or `heading`.
-        time_share: of the predictions.
-        spans: start and end [s], and share of the squared error; the largest share first.
-    """
-
-    run: int
-    quantity: str
-    time_share: float
-    spans: tuple[tuple[float, float, float], ...]
-
-    @property
-    def sentence(self) -> str:
-        """Sentence: the share of the time, and the spans with the largest shares."""
-        return (
-            f"half of the remaining squared {self.quantity} error over {HORIZON_S:g} s arises in "
-            f"{format_share(self.time_share, 0)} of the time; largest parts: "
-            f"{enumerate_texts([_name_span(*span) for span in self.spans[:_SPANS]])}"
-        )
-
-    def to_json(self) -> dict[str, Json]:
-        """Keys `quantity`, `time_share`, `spans` and `text`."""
-        spans: list[Json] = [
-            {"t_start": start, "t_end": end, "share": round(share, 4), "text": _name_span(start, end, share)}
-            for start, end, share in self.spans
-        ]
-        share = finite_or_none(self.time_share, JSON_DIGITS)
-        return {"quantity": self.quantity, "time_share": share, "spans": spans, "text": self.sentence}
-
-
-_SPANS = 3
-"""Number of spans in a sentence."""
-
-
-def _name_span(start: float, end: float, share: float) -> str:
-    return f"{start:.0f} to {end:.0f} s ({format_share(share, 0)})"
-
-
 def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
     """When half of the squared held-out error of each run arises, where it is above the noise floor."""
     moments, floor, reached = list[Moments](), judgement.floor, judgement.whole.held_out
@@ -342,7 +221,8 @@ def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
             square = errors[number] ** 2
             known = np.isfinite(square)
             if known.any() and float(square[known].mean()) > (ABOVE_FLOOR * least) ** 2:
-                moments.append(Moments(number, quantity, *_find_half(stretch[known], square[known])))
+                share, spans = _find_half(stretch[known], square[known])
+                moments.append(Moments(quantity, share, tuple(Span(*span) for span in spans), number))
     return tuple(moments)
 
 

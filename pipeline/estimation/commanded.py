@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pipeline import results
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, SlipError
 from pipeline.core.arrays import (
     Floats,
@@ -56,16 +57,10 @@ class CommandedTurn:
     deviation: float
     multiplier: float
 
-    @property
-    def interval(self) -> tuple[float, float]:
-        """Its 95 % interval."""
+    def as_result(self) -> results.CommandedTurn:
+        """The share with its 95 % interval."""
         factor = math.exp(NORMAL_95 * self.deviation)
-        return self.share / factor, self.share * factor
-
-    def to_json(self) -> dict[str, float]:
-        """The key `commanded_turn` of a diagnosis."""
-        low, high = self.interval
-        return {"share": self.share, "low": low, "high": high, "controller_multiplier": self.multiplier}
+        return results.CommandedTurn(self.share, self.share / factor, self.share * factor, self.multiplier)
 
 
 def measure_commanded_turn(run: MotionRun, vehicle: Vehicle) -> CommandedTurn | None:

@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, cast
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+from msgspec.structs import replace
 
 from pipeline.estimation import unexplained as residual_structure
 from pipeline.estimation.ambiguity import (
     Clocks,
-    Detectable,
-    Undecided,
-    Unobservable,
     join_classes,
     list_equivalents,
     take_judged,
@@ -23,33 +21,38 @@ from pipeline.estimation.apportion import apportion, find_moments
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.constancy import find_change
-from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Unexplained
-from pipeline.estimation.error_regions import (
-    ABOVE_FLOOR,
-    Curve,
-    Growth,
-    find_main_region,
-    map_errors,
-    narrow_intervals,
-    pick_regions,
-)
+from pipeline.estimation.diagnosis import Diagnosis
+from pipeline.estimation.driving_need import Curve, measure_need, narrow_intervals, thin_growth
+from pipeline.estimation.error_regions import find_main_region, is_narrow, map_errors, pick_regions
 from pipeline.estimation.estimates import (
     list_by_run,
     list_estimates,
     note_brevity,
     note_cut,
     note_grounds,
-    restore,
-    restore_known,
     was_aligned,
 )
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, list_order, note_fit
-from pipeline.estimation.learned_step import learn_beyond, learned_as_json
+from pipeline.estimation.learned_step import learn_beyond, summarize_learned
 from pipeline.estimation.plausibility import measure_moves
-from pipeline.models import Effect, Model, ModelFile, find_effect
+from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.catalogue import find_late_effect
 from pipeline.models.effect import Late
+from pipeline.results import (
+    Delays,
+    Detectable,
+    Errors,
+    Named,
+    PathLadder,
+    Region,
+    RunDiagnosis,
+    Step,
+    Undecided,
+    Unexplained,
+    Unobservable,
+    read_result,
+)
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
@@ -58,7 +61,6 @@ if TYPE_CHECKING:
     from pipeline.estimation import Recording
     from pipeline.estimation.context import Context
     from pipeline.estimation.decision import Judged, Search, SearchResult
-    from pipeline.estimation.error_regions import Region
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.problem import Problem
     from pipeline.models.formula import FormulaEffect
@@ -85,7 +87,7 @@ class Explored:
     outcome: SearchResult
     formula: FormulaEffect | None
     undecided: tuple[Undecided, ...]
-    unobservable: tuple[Unobservable, ...]
+    unobservable: Mapping[str, Unobservable]
     detectable: tuple[Detectable, ...]
 
     def judge(self, effect: Effect) -> Judged | None:
@@ -99,14 +101,18 @@ def refuse(recording: Recording, source: str, recordings: Sequence[Recording]) -
         recording.name,
         source,
         joint=tuple(one.name for one in recordings),
-        findings=tuple(cast("Mapping[str, Json]", f) for f in recording.list_findings()),
+        findings=recording.list_findings(),
     )
 
 
 def summarize(
     context: Context, source: Input, paths: Sequence[Explored], clocks: Clocks, length_scale_m: float
-) -> RunDiagnosis:
-    """The common diagnosis of runs that were judged together."""
+) -> tuple[Diagnosis, Sequence[Delays]]:
+    """The common diagnosis of runs that were judged together.
+
+    Returns:
+        It as the only run of a diagnosis, and the delays of each run.
+    """
     body = paths[0]
     taken = _gather(paths, clocks, context)
     known = frozenset().union(*(path.search.given for path in paths))
@@ -116,59 +122,61 @@ def summarize(
     judgement = judgements.get(source.value)
     open_ids = {item.candidates[0] for item in undecided}
     added = [e for e in taken if not e.searched_as & open_ids and e.id not in known]
-    named = _order(_name_all(added, context, paths, judgement), judgement)
+    widths = {} if judgement is None else narrow_intervals(judgement.fitted)
+    named = _order(tuple(_name(one, context, paths, judgement, widths) for one in added), judgement)
     if judgement is not None:
         undecided = take_judged(undecided, judgement)
     # What the wheels leave is a matter of the ground, wherever the model starts.
     ground = judgements.get(body.path, judgement)
     learned = None if ground is None else learn_beyond(ground)
     region = _find_region(context, judgement)
-    lead = "" if region is None else f"the remaining error is not spread evenly: {region.sentence}"
-    unexplained = _find_unexplained(paths, ground, learned, region)
     windows, start = context.problem.whole, body.outcome.start.state
     residual = windows.find_residuals(start)
     regions = map_errors(windows, residual, windows.find_places())
     hidden = {name for item in undecided for name in item.candidates}.union(
         *({effect.id, *effect.searched_as, *effect.contains} for effect in taken)
     )
-    unobservable = {u.id: u for path in paths for u in path.unobservable if u.id not in hidden}
+    unobservable = {n: one for path in paths for n, one in path.unobservable.items() if n not in hidden}
     last = None if judgement is None else judgement.ladder.explained_shares(judgement.floor)[-1]
-    return RunDiagnosis(
-        run="",
+    proposal = None if judgement is None else note_fit(_begin(judgement, undecided), judgement)
+    ids = () if proposal is None else proposal.model.ids
+    common = RunDiagnosis(
         input=source.value,
         joint=tuple(run.name for run in context.runs),
+        vehicle=context.vehicle,
         effects=named,
-        undecided=tuple(undecided),
-        unobservable=tuple(unobservable.values()),
+        undecided=tuple(
+            replace(item, in_model=next((name for name in item.candidates if name in ids), None))
+            for item in undecided
+        ),
+        unobservable_why=unobservable,
         detectable=tuple(one for path in paths for one in path.detectable if one.id not in hidden),
-        unexplained=unexplained,
+        unexplained=_find_unexplained(paths, ground, learned, region),
         findings=(
             *note_cut(body.search.budget),
             *note_grounds(context),
             *(() if judgement is None else find_change(judgement)),
         ),
-        ladder=() if judgement is None else tuple(_list_steps(judgement)),
-        noise_floor={} if judgement is None else cast("Mapping[str, Json]", errors_as_json(judgement.floor)),
+        ladder=() if judgement is None else _list_steps(judgement),
+        noise_floor=None if judgement is None else read_result(errors_as_json(judgement.floor), Errors),
         explained_share=math.nan if last is None else last,
-        learned={}
+        learned=None
         if learned is None or ground is None
-        else learned_as_json(learned, ground.ideal.errors, ground.floor),
+        else summarize_learned(learned, ground.ideal.errors, ground.floor),
         where=tuple(pick_regions(regions, residual, windows.noise)),
         when=() if judgement is None else find_moments(judgement),
-        timing={"runs": cast("Json", clocks.list_runs(judgement.fitted if judgement else None))},
         by_path=_summarize_paths(paths, source, judgements.get("measured")),
-        disturbance=residual_structure.summarize_disturbance(
-            body.outcome.final, _describe_rest(unexplained, lead, _find_room(judgement))
-        ),
-        lead=lead,
-        proposal=None if judgement is None else note_fit(_begin(judgement, undecided), judgement),
-        budgets=tuple(
+        disturbance=residual_structure.summarize_disturbance(body.outcome.final),
+        concentrated=region,
+        model=None if proposal is None else format_model(proposal),
+        budget=tuple(
             budget for one in judgements.values() for budget in apportion(one, length_scale_m=length_scale_m)
         ),
-        estimates=tuple(
-            number for one in judgements.values() for number in list_estimates(context, one, named)
-        ),
+        need=measure_need(named, widths),
     )
+    estimates = tuple(number for one in judgements.values() for number in list_estimates(context, one, named))
+    fitted = judgement.fitted if judgement else None
+    return Diagnosis((common,), proposal, estimates), clocks.list_runs(fitted)
 
 
 def _find_unexplained(
@@ -186,9 +194,9 @@ def _find_unexplained(
             return described
     lasting = (residual_structure.find_lasting(path.outcome.final, path.path) for path in paths)
     outcome = next(filter(None, lasting), None)
-    if outcome is None and region is not None and region.is_narrow:
+    if outcome is None and region is not None and is_narrow(region):
         return Unexplained(
-            region.share, region.channel, (region.channel,), region.sentence, None, {}, paths[0].path
+            "region", region.share, region.channel, (region.channel,), paths[0].path, region=region
         )
     return outcome
 
@@ -202,52 +210,31 @@ def _find_region(context: Context, judgement: Judgement | None) -> Region | None
     return find_main_region(windows, known, windows.find_places())
 
 
-def _find_room(judgement: Judgement | None) -> float:
-    """The final error in position over the noise floor; NaN if either is unknown."""
-    floor = 0.0 if judgement is None else judgement.floor.t_mrmse_m
-    return judgement.whole.errors.t_mrmse_m / floor if judgement and floor > 0.0 else math.nan
-
-
-def _describe_rest(unexplained: Unexplained | None, lead: str, room: float) -> str:
-    """Sentence on the residual, apart from what is unexplained."""
-    if unexplained is not None:
-        return "Apart from this dependence, the residual is disturbance and localization noise"
-    if not lead and room > ABOVE_FLOOR:
-        times = f"{room:.1f} times the noise floor"
-        return f"The remaining error is {times}, and no term that was tried predicts it"
-    return lead or "The residual does not depend on any recorded signal: disturbance and localization noise"
-
-
 def _begin(judgement: Judgement, undecided: Sequence[Undecided]) -> ModelFile:
     groups = [list(item.candidates) for item in undecided]
     return ModelFile(judgement.fitted.model, fit={"undecided": groups})
 
 
-def of_run(common: RunDiagnosis, recording: Recording, number: int, context: Context) -> RunDiagnosis:
+def of_run(
+    common: RunDiagnosis, recording: Recording, number: int, delays: Delays, context: Context
+) -> RunDiagnosis:
     """The common diagnosis with the name, findings and delays of one run."""
-    findings = [*common.findings, *note_brevity(context, common)]
-    findings += [cast("Mapping[str, Json]", f) for f in recording.list_findings()]
-    runs = cast("Sequence[Mapping[str, Json]]", common.timing["runs"])
-    beside = [restore(e.id, e.by_run[number] if e.by_run else e.parameters) for e in common.effects]
-    effects = tuple(_choose_run(one, number, context, beside) for one in common.effects)
-    timing = dict(runs[number])
+    effects = tuple(
+        replace(one, parameters=one.by_run[number]) if one.by_run else one for one in common.effects
+    )
     for clock in (one for one in effects if find_effect(one.id).late is Late.POSES):
         (late,) = clock.parameters.values()
-        timing["pose_delay_s"] = round(late.value, 4)
+        delays = replace(delays, pose_delay_s=round(late.value, 4))
+    turn = measure_commanded_turn(context.runs[number], context.vehicle)
     return replace(
-        common, run=recording.name, effects=effects, findings=tuple(findings),
-        timing=timing, when=tuple(one for one in common.when if one.run == number),
-        commanded_turn=measure_commanded_turn(context.runs[number], context.vehicle),
-    )  # fmt: skip
-
-
-def _choose_run(effect: Named, number: int, context: Context, beside: Sequence[Effect]) -> Named:
-    """An effect with its values in one of the runs, described beside the other effects."""
-    if not effect.by_run:
-        return effect
-    acting = restore_known(effect.id, values := effect.by_run[number])
-    words = [word(context.vehicle, beside) for word in (acting.describe_motion, acting.describe_clause)]
-    return replace(effect, parameters=values, motion=words[0], clause=words[1])
+        common,
+        run=recording.name,
+        effects=effects,
+        findings=(*common.findings, *note_brevity(context, common), *recording.list_findings()),
+        timing=delays,
+        when=tuple(one for one in common.when if one.run == number),
+        commanded_turn=None if turn is None else turn.as_result(),
+    )
 
 
 def _gather(paths: Sequence[Explored], clocks: Clocks, context: Context) -> list[Effect]:
@@ -281,13 +268,6 @@ def _judge_path(context: Context, model: Model, source: Input) -> Judgement | No
     return None
 
 
-def _name_all(
-    effects: Sequence[Effect], context: Context, paths: Sequence[Explored], judgement: Judgement | None
-) -> tuple[Named, ...]:
-    widths = {} if judgement is None else narrow_intervals(judgement.fitted)
-    return tuple(_name(effect, context, paths, judgement, widths) for effect in effects)
-
-
 def _name(
     effect: Effect,
     context: Context,
@@ -299,7 +279,6 @@ def _name(
     judged = path.judge(effect)
     by_run = list_by_run(effect, context, judgement)
     values = by_run[0]
-    acting, beside = restore_known(effect.id, values), () if judgement is None else judgement.fitted.model
     return Named(
         id=effect.id,
         parameters=values,
@@ -310,11 +289,9 @@ def _name(
         ),
         corrected=was_aligned(effect, context),
         path=path.path,
-        selected=math.nan if judged is None else judged.frequency,
-        motion=acting.describe_motion(context.vehicle, beside),
-        clause=acting.describe_clause(context.vehicle, beside),
+        selection_frequency=math.nan if judged is None else judged.frequency,
         moves=None if judgement is None else measure_moves(judgement.fitted, effect),
-        growth=Growth(
+        growth=thin_growth(
             None if judged is None else _grow_evidence(path, judged),
             {name: widths[label] for name in values if (label := f"{effect.id}.{name}") in widths},
         ),
@@ -352,33 +329,28 @@ def _order(named: tuple[Named, ...], judgement: Judgement | None) -> tuple[Named
     return tuple(sorted(named, key=lambda one: [*ranked, one.id].index(one.id)))
 
 
-def _list_steps(judgement: Judgement) -> list[Mapping[str, Json]]:
-    return cast("list[Mapping[str, Json]]", ladder_as_json(judgement.ladder, judgement.floor))
+def _list_steps(judgement: Judgement) -> tuple[Step, ...]:
+    return tuple(read_result(one, Step) for one in ladder_as_json(judgement.ladder, judgement.floor))
 
 
-def _summarize_paths(paths: Sequence[Explored], source: Input, measured: Judgement | None) -> dict[str, Json]:
+def _summarize_paths(
+    paths: Sequence[Explored], source: Input, measured: Judgement | None
+) -> dict[str, PathLadder]:
     """Separate ladders of the ground and of the drivetrain."""
     if len(paths) == 1:
         return {}
-    described: dict[str, Json] = {}
+    described: dict[str, PathLadder] = {}
     wheels = paths[1].outcome
     if source is Input.COMMAND and measured is not None:
-        described["measured"] = {
-            "effects": list(measured.fitted.model.ids),
-            "ladder": cast("Json", _list_steps(measured)),
-            "noise_floor": cast("Json", errors_as_json(measured.floor)),
-        }
+        floor = read_result(errors_as_json(measured.floor), Errors)
+        described["measured"] = PathLadder(measured.fitted.model.ids, _list_steps(measured), floor)
     spans = wheels.final.part.spans[:, None]
-    described["wheels"] = {
-        "effects": list(wheels.new),
-        "ladder": [
-            {
-                "effects": list(one.ids),
-                "velocity_rms": [
-                    round(float(v), 6) for v in np.sqrt(((one.residual / spans) ** 2).mean(axis=0))
-                ],
-            }
-            for one in (wheels.start, wheels.final)
-        ],
-    }
+    steps = tuple(
+        Step(
+            velocity_rms=tuple(np.sqrt(((one.residual / spans) ** 2).mean(axis=0)).tolist()),
+            effects=tuple(one.ids),
+        )
+        for one in (wheels.start, wheels.final)
+    )
+    described["wheels"] = PathLadder(tuple(wheels.new), steps)
     return described

@@ -16,19 +16,18 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import enumerate_texts, suffix_unit
+from pipeline.core import enumerate_texts, format_errors, suffix_unit
 from pipeline.core.arrays import Flags, Floats
 from pipeline.estimation.decision import LEAST_T, list_costs
-from pipeline.estimation.error_regions import format_errors
 from pipeline.estimation.folds import find_in_test, refit, refit_fold, score
-from pipeline.estimation.ladder import ERRORS_OVER_2S
-from pipeline.estimation.verdict import CHANGE, name_effect
+from pipeline.models.catalogue import name_term
+from pipeline.results import Finding
+from pipeline.results.reading import CHANGE, ERRORS_OVER_2S
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
 
     from pipeline.estimation.comparison import Comparison
-    from pipeline.estimation.diagnosis import Json
     from pipeline.estimation.fit import PartFit
     from pipeline.estimation.folds import HeldOut
     from pipeline.estimation.ladder import Judgement
@@ -99,7 +98,7 @@ class _Change:
         return replace(self, time=float(self.part.times[first, 1]))
 
 
-def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
+def find_change(judgement: Judgement) -> list[Finding]:
     """A finding about the most significant change of a number during a run; empty without a change.
 
     Of several runs that were fitted together none is examined: they differ from one another.
@@ -144,7 +143,7 @@ def find_change(judgement: Judgement) -> list[Mapping[str, Json]]:
 
 def _report(
     sides: Sequence[State], number: Free, since: float, errors: Mapping[str, float], others: Sequence[str]
-) -> Mapping[str, Json]:
+) -> Finding:
     """The finding of a change.
 
     Args:
@@ -159,22 +158,16 @@ def _report(
     about = "" if effect is None else effect.parameter(number.name).about
     places = max(1 - math.floor(math.log10(change)), 0) if change > 0.0 else 0
     before, after = (f"{value:.{places}f}{suffix_unit(number.unit)}" for value in values)
-    beside = f" (perhaps {enumerate_texts([name_effect(one) for one in others])}, too)" if others else ""
+    beside = f" (perhaps {enumerate_texts([name_term(one) for one in others])}, too)" if others else ""
     text = (
-        f"the {name_effect(number.effect)} changes {since:.0f} s after the start of the run{beside}: its "
+        f"the {name_term(number.effect)} changes {since:.0f} s after the start of the run{beside}: its "
         f"{about} is {before} before and {after} after; "
-        f"with a model for each part {format_errors(errors)} remain"
+        f"with a model for each part {format_errors(*errors.values())} remain"
     )
-    return {
-        "id": CHANGE,
-        "text": text,
-        "where": number.effect,
-        "severity": "warning",
-        "parameter": number.name,
-        "time": round(since, 1),
-        "before": values[0],
-        "after": values[1],
-    }
+    return Finding(
+        CHANGE, text, number.effect, "warning", parameter=number.name, time=round(since, 1),
+        before=values[0], after=values[1],
+    )  # fmt: skip
 
 
 def _is_lower(errors: Mapping[str, float], than: HeldOut) -> bool:

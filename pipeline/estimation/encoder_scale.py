@@ -5,13 +5,13 @@ Together both leave the motion as it was commanded: they change nothing but the 
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 from pipeline.core import format_share
-from pipeline.estimation.diagnosis import Json, Named, RunDiagnosis, Value
 from pipeline.models.catalogue import find_effect
+from pipeline.results import Finding, Named, RunDiagnosis, Value
 from pipeline.run import MotionRun
 
 GIVEN: Final = "encoder_scale_given"
@@ -43,7 +43,7 @@ class EncoderScale:
             for run in runs
         ]
 
-    def report(self) -> Mapping[str, Json]:
+    def report(self) -> Finding:
         """The finding, with the line of run.toml that mends it."""
         direction = "low" if self.value < 1.0 else "high"
         text = (
@@ -54,13 +54,12 @@ class EncoderScale:
             f"scale = {1.0 / self.value:.4g} under [wheels] in run.toml corrects the tables too. If instead "
             "the wheels have another radius and the drive has that gain by coincidence, scale = 1 names both"
         )
-        about: dict[str, Json] = {"where": "wheels", "severity": "warning", "value": self.value}
-        return {"id": "encoder_scale", "text": text, **about}
+        return Finding("encoder_scale", text, "wheels", "warning", self.value)
 
 
 def find_encoder_scale(diagnosis: RunDiagnosis) -> EncoderScale | None:
     """Scale of the encoders that explains two identified effects; None if their product is not one."""
-    if any(finding["id"] == GIVEN for finding in diagnosis.findings):
+    if any(finding.id == GIVEN for finding in diagnosis.findings):
         return None
     gain, radius = (next(_list_values(diagnosis.effects, role), None) for role in ("gain", "radius"))
     if gain is None or radius is None or gain.is_undetermined or radius.is_undetermined:

@@ -10,28 +10,25 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import JSON_DIGITS, NORMAL_95, finite_or_none, pick_finite
-from pipeline.estimation.diagnosis import EstimatedNumber, Json, Named, RunDiagnosis, Value
-from pipeline.estimation.error_regions import BREVITY
 from pipeline.estimation.fit import PartFit, invert
 from pipeline.estimation.intervals import NOTHING as NOT_FITTED
 from pipeline.estimation.intervals import Estimate, Estimates, estimate_part
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.state import State, combine_columns
-from pipeline.estimation.verdict import SEARCH_CUT
 from pipeline.estimation.window_residuals import count_seconds
 from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import (
-    AT_BOUND,
-    UNDETERMINED,
     Parameter,
     cut_interval,
     is_of_one_run,
     stands_at_bound,
 )
+from pipeline.results import EstimatedNumber, Finding, Interval, Named, RunDiagnosis, Value
+from pipeline.results.reading import BREVITY, SEARCH_CUT
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
@@ -54,7 +51,7 @@ def list_values(effect: Effect, estimates: Estimates | None) -> dict[str, Value]
         low, high = (math.nan, math.nan) if item is None else item.interval
         at_bound = stands_at_bound(value, parameter.bounds)
         own = at_bound or is_of_one_run(effect.parameters)
-        another = (math.nan, math.nan) if own else expect_another_run(parameter, value, low, high)
+        another = Interval() if own else expect_another_run(parameter, value, low, high)
         one_sided = parameter.is_one_sided(low, high)
         values[parameter.name] = Value(
             value, low, high, parameter.unit, at_bound, another, one_sided,
@@ -69,7 +66,7 @@ def list_first_run(state: State, estimates: Estimates) -> dict[str, dict[str, Va
     return {effect.id: list_values(effect, first) for effect in state.effects_of(0)}
 
 
-def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> tuple[float, float]:
+def expect_another_run(parameter: Parameter, value: float, low: float, high: float) -> Interval:
     """95 % interval of a value in another run on the same ground, NaN where this run has none.
 
     It combines the interval of this run with the spread between runs, observed or typical
@@ -77,10 +74,10 @@ def expect_another_run(parameter: Parameter, value: float, low: float, high: flo
     by the root of two than the deviation of one run from the ground's mean. It is cut at the search bounds.
     """
     if not math.isfinite(high - low):
-        return math.nan, math.nan
+        return Interval()
     change = NORMAL_95 * math.sqrt(2.0) * parameter.spread.size
     below, above = math.hypot(value - low, change), math.hypot(high - value, change)
-    return cut_interval(value - below, value + above, parameter.bounds)
+    return Interval(*cut_interval(value - below, value + above, parameter.bounds))
 
 
 def read_clock(effect: Effect, run: MotionRun) -> dict[str, Value]:
@@ -153,25 +150,11 @@ def restore(name: str, values: Mapping[str, Value]) -> Effect:
     return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
-def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect for text output: digits that intervals support, and of several values those that are known.
-
-    A value at neutral is an estimate, not a start value, and stays; so does a single parameter.
-    """
-    new = find_effect(name)()
-    effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
-    if len(new.parameters) == 1:
-        return effect
-    return effect.omit_open(
-        key for key, one in values.items() if one.is_undetermined and one.value != new.parameter(key).neutral
-    )
-
-
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.
 _LEAST_DRIVING_S = {"measured": (48.0, "measured wheels"), "command": (90.0, "commands")}
 
 
-def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Json]]:
+def note_brevity(context: Context, common: RunDiagnosis) -> list[Finding]:
     """A finding where the driving is too short for reliable identification."""
     least, words = _LEAST_DRIVING_S[common.input]
     driven = float(count_seconds(context.problem.whole).sum())
@@ -181,10 +164,10 @@ def note_brevity(context: Context, common: RunDiagnosis) -> list[Mapping[str, Js
         f"the run has {math.floor(driven)} s of driving: effects estimated from {words} need at least "
         f"{least:.0f} s, with turns and speeds of both signs"
     )
-    return [{"id": BREVITY, "text": text, "where": "diagnosis", "severity": "warning"}]
+    return [Finding(BREVITY, text, "diagnosis", "warning")]
 
 
-def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
+def note_cut(budget: Budget) -> list[Finding]:
     """A finding where the budget stopped the search before it was complete."""
     if not budget.was_cut:
         return []
@@ -192,10 +175,10 @@ def note_cut(budget: Budget) -> list[Mapping[str, Json]]:
         f"the search stopped after {budget.seconds:g} s of CPU time: this is the best model found, and "
         f"not all alternatives were tried (--budget {2.0 * budget.seconds:g}s continues the search)"
     )
-    return [{"id": SEARCH_CUT, "text": text, "where": "diagnosis", "severity": "warning"}]
+    return [Finding(SEARCH_CUT, text, "diagnosis", "warning")]
 
 
-def note_grounds(context: Context) -> list[Mapping[str, Json]]:
+def note_grounds(context: Context) -> list[Finding]:
     """A finding where runs on different grounds were judged together."""
     grounds = sorted({run.terrain for run in context.runs})
     if len(grounds) == 1:
@@ -204,7 +187,7 @@ def note_grounds(context: Context) -> list[Mapping[str, Json]]:
         f"these runs are on {', '.join(grounds)} and were fitted together: a difference between terrains may "
         "appear as a change within a run (slip compare --causes and slip fleet fit separate terrains)"
     )
-    return [{"id": "unlike_grounds", "text": text, "where": "diagnosis", "severity": "warning"}]
+    return [Finding("unlike_grounds", text, "diagnosis", "warning")]
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
@@ -308,43 +291,6 @@ def correlations_as_json(estimates: Estimates) -> list[dict[str, object]]:
     ]
 
 
-def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
-    """Corrections to and exclusions of poses; empty where there are none."""
-    lines = []
-    for run in runs:
-        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
-        if spread > 0.0:
-            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s: corrected")
-        if outlier_s > 0.0:
-            lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
-    return lines
-
-
-def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
-    """Parameters with intervals, one per line."""
-    lines = []
-    for label, entry in parameters.items():
-        rows = entry.get("runs")
-        for row in rows if isinstance(rows, list) else [entry]:
-            unit = "" if entry["unit"] == "1" else entry["unit"]
-            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
-            if row.get("low") is not None:
-                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
-            elif row.get("fitted"):
-                text += UNDETERMINED
-            marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
-            marks += ["not observable in these runs"] * (row.get("observable") is False)
-            text += "".join(f"  ({mark})" for mark in marks)
-            if "run" in row:
-                text += f"  run {row['run']}"
-            lines.append(text.rstrip())
-    return lines
-
-
-def _show(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else "-"
-
-
 def _round(value: float) -> float | None:
     return finite_or_none(value, JSON_DIGITS)
 
@@ -356,7 +302,7 @@ def was_aligned(effect: Effect, context: Context) -> bool:
 
 def list_by_run(
     effect: Effect, context: Context, judgement: Judgement | None
-) -> tuple[Mapping[str, Value], ...]:
+) -> tuple[dict[str, Value], ...]:
     """Values of an effect: by run where each run has its own clock, else once."""
     if was_aligned(effect, context):
         delays = [run.alignment.heading_delay_s for run in context.runs]

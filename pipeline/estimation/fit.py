@@ -263,7 +263,8 @@ def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
             fit, is_fresh = replace(fit, columns=columns), True
         if not is_learned and not 0.0 < fall <= _NEWS:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
-            cost, damping, is_learned = measure_cost(part, fit.noise, fit.state, free, fit.residual), _LOOSEST, True
+            cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
+            damping, is_learned = _LOOSEST, True
     if not is_fresh:
         fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit

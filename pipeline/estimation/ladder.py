@@ -7,11 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
-from typing import Final
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, finite_or_none, format_share, pick, round_digits
+from pipeline.core import JSON_DIGITS, finite_or_none, pick
 from pipeline.core.arrays import Floats
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
@@ -21,17 +20,10 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
+from pipeline.results.reading import CHANCE, ERRORS_OVER_2S, as_written, list_rises
 
-NOTHING = 1e-3
-"""Relative increase below which an error counts as unchanged: rounding of fits."""
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
-# Two fits of one model differ by as much on other folds: a step may raise one error by this share.
-CHANCE = 1e-2
-"""Relative change of an error over 2 s below which it is chance: the smallest relevant one, as
-`LEAST_GAIN`."""
-ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
-"""Quantity and unit by name in `Errors` and in JSON."""
 _DRIVEN_QUANTILE = 0.99
 """Quantile of the driven speed: the maximum would be that of one bad pose."""
 _LEAST_SQUARE = 1e-24
@@ -177,25 +169,6 @@ def fit_step(
     return LadderStep(fitted, hold_out(problem, fitted))
 
 
-def list_rises(
-    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
-) -> tuple[str, ...]:
-    """Names in `ERRORS_OVER_2S` of the errors that rise in a step; unknown errors do not rise.
-
-    They are compared as they are written, so that screen and page agree.
-
-    Args:
-        below: errors before the step, or the step in JSON.
-        errors: errors after it.
-        forgiven: tolerated relative increase, by default that of rounding.
-    """
-    return tuple(
-        name
-        for name in ERRORS_OVER_2S
-        if _as_written(errors, name) > _as_written(below, name) * (1.0 + forgiven)
-    )
-
-
 def raises_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object]) -> bool:
     """Whether a step raises both errors over 2 s, or one by more than chance and the other falls no more."""
     if len(list_rises(below, errors)) == len(ERRORS_OVER_2S):
@@ -207,19 +180,8 @@ def lowers_errors(below: Errors | Mapping[str, object], errors: Errors | Mapping
     """Whether a step lowers an error over 2 s by more than chance, and both together."""
     if raises_errors(below, errors) or not list_rises(errors, below, CHANCE):
         return False
-    after, before = (math.prod(_as_written(one, name) for name in ERRORS_OVER_2S) for one in (errors, below))
+    after, before = (math.prod(as_written(one, name) for name in ERRORS_OVER_2S) for one in (errors, below))
     return after < before
-
-
-def _as_written(errors: Errors | Mapping[str, object], name: str) -> float:
-    """An error with the digits that JSON has; NaN if unknown."""
-    return round_digits(read_error(errors, name), JSON_DIGITS)
-
-
-def read_error(errors: Errors | Mapping[str, object], name: str) -> float:
-    """An error by its name; NaN if unknown."""
-    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
-    return float(value) if isinstance(value, int | float) else math.nan
 
 
 def compare_losses(new: HeldOut, old: HeldOut) -> float:
@@ -369,10 +331,6 @@ def _measure_driven(problem: Problem) -> list[dict[str, float]]:
     return driven
 
 
-_HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
-_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
-
-
 def ladder_as_json(ladder: Ladder, floor: Errors | None = None) -> list[dict[str, object]]:
     """Steps with their errors, the removed share of the removable error, and `rises` where an error rises."""
     rungs: list[dict[str, object]] = []
@@ -401,75 +359,5 @@ def step_as_json(before: LadderStep, after: LadderStep) -> dict[str, object]:
     }
 
 
-def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
-    """The ladder as a text table."""
-    heads, units = format_heads("held-out error of")
-    lines = [f"{heads}{'removed':>9}", units]
-    for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
-        name = "ideal" if number == 0 else f"+ {_added(ladder.steps[number - 1], step)}"
-        removed = "" if share is None else f"{format_share(share, 0):>9}"
-        lines.append(f"{name:<30}{_columns(step.errors)}{removed}")
-        below = ladder.steps[max(number - 1, 0)].errors
-        rises = format_rises(below, step.errors)
-        lines += [f"  ! {rises}"] if rises else []
-    if floor is not None:
-        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
-    if ladder.idle:
-        verb = "does" if len(ladder.idle) == 1 else "do"
-        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
-    return lines
-
-
-def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
-    """Change of the 2 s errors of the whole model, and the objection to it, if any."""
-    old, new = before.errors, after.errors
-    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
-    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
-    word = "added" if set(after.effects) > set(before.effects) else "changed"
-    line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    note = refusal or format_rises(old, new)
-    return [line, f"  ! {note}: {word} as requested"] if note else [line]
-
-
-def format_rises(
-    below: Errors | Mapping[str, object], errors: Errors | Mapping[str, object], forgiven: float = NOTHING
-) -> str:
-    """Which 2 s errors rise, and by how much: `position error rises by 2.0%`; empty where none does.
-
-    Args:
-        below: errors before, or the step in JSON.
-        errors: errors after.
-        forgiven: fraction by which an error may rise.
-    """
-    phrases: list[str] = []
-    for key in list_rises(below, errors, forgiven):
-        old, new = read_error(below, key), read_error(errors, key)
-        by = f" by {format_share(new / old - 1.0)}" if old else ""
-        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
-    return ", ".join(phrases)
-
-
-def format_measured_errors(name: str, errors: Errors) -> str:
-    """One row of errors."""
-    return f"{name:<30}{_columns(errors)}"
-
-
-def format_heads(name: str) -> tuple[str, str]:
-    """The headers of the error columns, and their units."""
-    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
-    return f"{name:<30}{heads}", f"{'':<30}{units}"
-
-
 def _round(value: float) -> float | None:
     return finite_or_none(value, JSON_DIGITS)
-
-
-def _added(before: LadderStep, step: LadderStep) -> str:
-    return ", ".join(name for name in step.effects if name not in before.effects)
-
-
-def _columns(errors: Errors) -> str:
-    x, y, turn = errors.velocity_rms
-    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
-    values.append((math.degrees(errors.r_mrmse_rad), 2))
-    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)

@@ -10,15 +10,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, format_share, pick_finite
+from pipeline.core import FOLDS, format_share
 from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.error_regions import ABOVE_FLOOR
 from pipeline.estimation.folds import (
     Errors,
     HeldOut,
@@ -27,17 +26,7 @@ from pipeline.estimation.folds import (
     number_predictions,
     score,
 )
-from pipeline.estimation.ladder import (
-    CHANCE,
-    ERRORS_OVER_2S,
-    Judgement,
-    LadderStep,
-    find_share_removed,
-    format_rises,
-    judge_whole,
-    list_rises,
-    read_error,
-)
+from pipeline.estimation.ladder import Judgement, LadderStep, find_share_removed, judge_whole
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.state import State
@@ -54,11 +43,12 @@ from pipeline.models.learned_term import (
     learned_as_table,
 )
 from pipeline.models.model import Model
+from pipeline.results import Learned, LearnedShare
+from pipeline.results.reading import ABOVE_FLOOR, CHANCE, ERRORS_OVER_2S, format_rises, list_rises, read_error
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.estimation.across_runs import Coverage, Ratios
-    from pipeline.estimation.diagnosis import Json
     from pipeline.estimation.rivals import Rival
 
 _INDEPENDENT = 0.25
@@ -461,21 +451,17 @@ def learn_beyond(judgement: Judgement) -> LearnedStep | None:
     return make_learned_step(judgement.problem, below.fitted, below.held_out)
 
 
-def learned_as_json(step: LearnedStep, ideal: Errors, floor: Errors) -> dict[str, Json]:
-    """The keys of `learned` in `slip diagnose --json`."""
-    shares = step.share_removed(ideal, floor)
-    return {
-        "kept": not step.refusal,
-        "reason": step.refusal or None,
-        **pick_finite(step.held_out.pooled, *ERRORS_OVER_2S, digits=JSON_DIGITS),
-        "explained_share": {
-            name: None
-            if one is None
-            else {
-                "physics": finite_or_none(one[0], JSON_DIGITS),
-                "with_learned": finite_or_none(one[1], JSON_DIGITS),
-            }
-            for name, one in shares.items()
+def summarize_learned(step: LearnedStep, ideal: Errors, floor: Errors) -> Learned:
+    """The gain of a learned term as a result."""
+    reached = step.held_out.pooled
+    return Learned(
+        helps=not step.refusal,
+        reason=step.refusal or None,
+        t_mrmse_m=reached.t_mrmse_m,
+        r_mrmse_rad=reached.r_mrmse_rad,
+        explained_share={
+            name: LearnedShare(*one) if one else None
+            for name, one in step.share_removed(ideal, floor).items()
         },
-        "term": None if step.refusal else cast("Json", learned_as_table(step.term)),
-    }
+        term=None if step.refusal else learned_as_table(step.term),
+    )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from pipeline.core import format_share, suffix_unit
 from pipeline.models.effect import Effect, Parameter
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
+from pipeline.results import Moves
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -99,21 +99,6 @@ def find_implausible(effect: Effect) -> str | None:
                 f"({low:g} to {high:g}{unit}); the cause may be another effect"
             )
     return None
-
-
-@dataclass(frozen=True)
-class Moves:
-    """RMS change of predictions over 2 s by an effect.
-
-    Attributes:
-        position_m: distance [m].
-        heading_rad: turn [rad].
-        path_share: the distance as a share of the predicted distance.
-    """
-
-    position_m: float
-    heading_rad: float
-    path_share: float
 
 
 def measure_moves(fitted: Fitted, effect: Effect) -> Moves | None:

@@ -25,12 +25,12 @@ from pipeline.core import CONFIDENCE, JSON_DIGITS, SlipError, finite_or_none
 from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, robust_spreads, student_quantile
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
-from pipeline.estimation.ladder import ERRORS_OVER_2S, read_error
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.model import Model, Timing
+from pipeline.results.reading import ERRORS_OVER_2S, read_error
 from pipeline.run import MotionError
 from pipeline.run.heading import MeasuredDrive
 from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
@@ -199,33 +199,6 @@ def contest_as_json(contest: Contest) -> dict[str, object]:
             for metric in ERRORS_OVER_2S
         },
     }
-
-
-def format_contest(contest: Contest) -> list[str]:
-    """The table as text: `*` marks the smallest error, `=` errors that are not significantly larger."""
-    width = max(len(rival.name) for rival in contest.rivals)
-    best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
-    lines = [f"{'held-out error over 2 s':<{width}}  numbers  position m   heading deg  fit s"]
-
-    def mark(rival: Rival, metric: str) -> str:
-        if rival is best[metric]:
-            return "*"
-        return "=" if contest.is_best(rival, metric) else " "
-
-    for rival in contest.rivals:
-        numbers = "" if rival.numbers is None else str(rival.numbers)
-        position, heading = (rival.read(metric) for metric in ERRORS_OVER_2S)
-        lines.append(
-            f"{rival.name:<{max(width, 23)}}  {numbers:>7}  "
-            f"{position:>10.4f} {mark(rival, 't_mrmse_m')} {math.degrees(heading):>10.2f} "
-            f"{mark(rival, 'r_mrmse_rad')} {rival.fit_s:>6.1f}"
-        )
-    lines += ["* smallest; = not significantly larger (95 % interval over stretches of 10 s)"]
-    for metric, (words, _) in ERRORS_OVER_2S.items():
-        tied = contest.ties[metric]
-        said = f"{best[metric].name} has the smallest error of {words}"
-        lines.append(f"{said}, not significantly different from {', '.join(tied)}" if tied else said)
-    return lines
 
 
 LAGS_S = (0.0, 0.1, 0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0, 4.0)

@@ -9,15 +9,13 @@ from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
-from pipeline.core import enumerate_texts, format_share
 from pipeline.estimation.candidates import PRICE
 from pipeline.estimation.decision import EQUAL, Search, SearchResult, find_cost
-from pipeline.estimation.diagnosis import Json, Unexplained
-from pipeline.estimation.error_regions import ERROR_WORDS
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.terms import CHANNELS, is_term, join_formula, list_terms
 from pipeline.models import format_effect
+from pipeline.results import Disturbance, Errors, Unexplained, read_result
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
@@ -93,13 +91,16 @@ def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
         falls = 1.0 - after / np.maximum(before, 1e-18)
         channel = CHANNELS[int(np.argmax(falls))][-1]
         fitted = step.fitted.model.effect(formula.id)
-        where = f"a formula removes {format_share(float(falls.max()), 0)} of the {ERROR_WORDS[channel]}"
-        reached = errors_as_json(step.errors)
         channels = tuple(name[-1] for name, fall in zip(CHANNELS, falls.tolist(), strict=True) if fall > 0.0)
         return Unexplained(
-            float(falls.max()), channel, channels or (channel,), where, format_effect(fitted), {},
-            judgement.problem.source.value, cast("dict[str, Json]", reached),
-        )  # fmt: skip
+            "formula",
+            float(falls.max()),
+            channel,
+            channels or (channel,),
+            judgement.problem.source.value,
+            formula=format_effect(fitted),
+            with_formula=read_result(errors_as_json(step.errors), Errors),
+        )
     return None
 
 
@@ -119,15 +120,9 @@ def describe_learned(step: LearnedStep, source: str) -> Unexplained | None:
     order = np.argsort(-scaled[:, channel])
     name = step.term.inputs[int(order[0])].name
     times = float(scaled[order[0], channel] / max(scaled[order[1], channel], 1e-3)) if order.size > 1 else 0.0
-    matters = f"; {name} matters {times:.0f} times as much as any other" if times >= 2.0 else ""  # noqa: PLR2004
     letter = CHANNELS[channel][-1]
     quantity = "position" if falls["x"] >= falls["w"] else "heading"
-    where = (
-        f"a learned term removes {format_share(fall, 0)} of the {quantity} error over 2 s: it depends most "
-        f"on {name}{matters}"
-    )
-    partial: dict[str, Json] = {"of": name, "unit": "rad/s" if letter == "w" else "m/s"}
-    return Unexplained(fall, letter, (letter,), where, None, partial, source)
+    return Unexplained("learned", fall, letter, (letter,), source, quantity=quantity, of=name, times=times)
 
 
 def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
@@ -144,13 +139,8 @@ def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
         return None
     order = np.argsort(-np.where(lasts, sizes / asked, 0.0))
     every = [CHANNELS[index][-1] for index in order.tolist() if lasts[index]]
-    units = {"x": "m/s", "y": "m/s", "w": "rad/s"}
-    said = enumerate_texts(
-        [f"{sizes['xyw'.index(letter)]:.2g} {units[letter]} in {ERROR_WORDS[letter]}" for letter in every]
-    )
-    whose = "the wheels deviate" if path == "wheels" else "the motion deviates"
-    where = f"{whose} from the model for seconds at a time, and nothing recorded predicts it: {said}"
-    return Unexplained(float(shares[order[0]]), every[0], tuple(every), where, None, {}, path)
+    lasting = {letter: float(sizes["xyw".index(letter)]) for letter in every}
+    return Unexplained("lasting", float(shares[order[0]]), every[0], tuple(every), path, sizes=lasting)
 
 
 def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
@@ -165,18 +155,12 @@ def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
     return np.maximum([x, max(x, y), w], 1e-9)
 
 
-def summarize_disturbance(fit: PartFit, text: str) -> dict[str, Json]:
-    """What is left of x, y, w, with a sentence on it.
-
-    `rms` [m/s, m/s, rad/s]; `lasting`, the disturbance in it that is no noise of poses [m/s, m/s, rad/s];
-    `pose_noise`, the error of single poses [m, m, rad].
-    """
+def summarize_disturbance(fit: PartFit) -> Disturbance:
+    """What is left of x, y, w."""
     noise, spans = fit.noise, fit.part.spans[:, None]
     scale = noise.spread
-    rms = np.sqrt(((fit.residual / spans) ** 2).mean(axis=0))
-    return {
-        "rms": [round(value, 6) for value in rms.tolist()],
-        "lasting": [round(value, 6) for value in (np.sqrt(noise.share) * scale / noise.step_s).tolist()],
-        "pose_noise": [round(value, 6) for value in (np.sqrt(1.0 - noise.share) * scale).tolist()],
-        "text": text,
-    }
+    return Disturbance(
+        rms=tuple(np.sqrt(((fit.residual / spans) ** 2).mean(axis=0)).tolist()),
+        lasting=tuple((np.sqrt(noise.share) * scale / noise.step_s).tolist()),
+        pose_noise=tuple((np.sqrt(1.0 - noise.share) * scale).tolist()),
+    )

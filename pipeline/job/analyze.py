@@ -37,6 +37,7 @@ from pipeline.job.run_results import (
 from pipeline.job.work import Progress, Work, hash_model, read_wanted, stored_contexts, stored_keys
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.report import PLANS, lead_to, lead_up
+from pipeline.results import RunDiagnosis
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
@@ -170,9 +171,9 @@ class Outcome:
     @property
     def refusal(self) -> str:
         """Reason why slip is not observable in the log; empty if it is."""
-        from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+        from pipeline.results.reading import find_refusal, read_findings  # noqa: PLC0415 - heavy
 
-        return find_refusal(self.summary)
+        return find_refusal(read_findings(self.summary))
 
 
 def _ignore(stage: str) -> None:
@@ -296,13 +297,15 @@ def _write_outputs(
     log: Mapping[str, JSON],
     options: Options,
     progress: Progress,
-    diagnosis: Mapping[str, JSON] | None,
+    diagnosis: RunDiagnosis | None,
     verdict: str,
 ) -> None:
     """Write summary, report and figures of a finished run."""
+    from pipeline.words.objects import diagnosis_as_json  # noqa: PLC0415 - heavy
+
     summary = summarize_run(work, log)
     summary["verdict"] = verdict
-    summary["diagnosis"] = diagnosis
+    summary["diagnosis"] = None if diagnosis is None else diagnosis_as_json(diagnosis)
     summary["report"] = REPORT if options.report else None
     summary["provenance"] = {
         "version": read_version(),
@@ -315,14 +318,16 @@ def _write_outputs(
         # Importing the plotting code is most of the start-up time: only if needed.
         from pipeline.report.motion_view import view_diagnosis  # noqa: PLC0415
         from pipeline.report.page import render_report  # noqa: PLC0415
-        from pipeline.report.scene import RunReport  # noqa: PLC0415
+        from pipeline.report.scene import NOT_DIAGNOSED, RunReport  # noqa: PLC0415
 
         progress("report")
         tables = {name: generation.read_table(name) for name in generation.table_names}
-        motion = view_diagnosis(tables, work.vehicle, diagnosis or {})
+        motion = view_diagnosis(tables, work.vehicle, diagnosis) if diagnosis else None
         peers = find_peers(Store(options.out), summary)
         planned = read_preview(options.out, work.run, generation.key)
-        report = RunReport(summary, tables, diagnosis or {}, motion, peers, lead_up(work.run), planned)
+        report = RunReport(
+            summary, tables, diagnosis or NOT_DIAGNOSED, motion, peers, lead_up(work.run), planned
+        )
         if options.report:
             generation.write_text(REPORT, render_report(report))
         if options.figures:

@@ -40,7 +40,8 @@ from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.parameter import is_of_one_run
-from pipeline.report.motion_view import load_motion_run, read_model_text
+from pipeline.report.motion_view import load_motion_run
+from pipeline.results.reading import read_model
 
 if TYPE_CHECKING:
     from pipeline.job.keys import Owner
@@ -314,7 +315,7 @@ def _find_model(manifest: Manifest, store: Store, *, is_needed: bool) -> Model |
     if diagnosis is None:
         diagnosis = diagnose_stored([manifest], INPUTS, None, None, None)
         keep_diagnosis(store.root, manifest, diagnosis)
-    file = read_model_text(diagnosis)
+    file = read_model(diagnosis)
     return None if file is None else file.model
 
 

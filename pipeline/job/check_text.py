@@ -8,7 +8,6 @@ from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
 from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
-from pipeline.estimation.verdict import name_effect
 from pipeline.fleet.changes import Change
 from pipeline.job.check import Check, find_pace
 from pipeline.job.stored_fits import (
@@ -19,6 +18,7 @@ from pipeline.job.stored_fits import (
     POSITION_ERROR,
     Label,
 )
+from pipeline.models.catalogue import name_term
 from pipeline.models.effect import Place
 from pipeline.models.parameter import Level
 
@@ -157,9 +157,7 @@ def _name(check: Check, name: str) -> str:
         return _NAMES[name]
     label = _find(check, name)
     alone = len(label.effect.parameters) == 1
-    return (
-        name_effect(label.effect.id) if alone else f"{name_effect(label.effect.id)} ({label.parameter.name})"
-    )
+    return name_term(label.effect.id) if alone else f"{name_term(label.effect.id)} ({label.parameter.name})"
 
 
 def _format_unchanged(check: Check, changed: Sequence[str]) -> str:
@@ -319,7 +317,7 @@ def _list_readings(check: Check) -> list[str]:
     )
     effects = {label.effect.id: label.effect for label in check.sides.labels}
     return [
-        f"{name_effect(name)}: {reading.text}"
+        f"{name_term(name)}: {reading.text}"
         for name in names
         for reading in effects[name].readings
         if reading.level is level

@@ -11,7 +11,6 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, read_version
 from pipeline.core.arrays import Ints
-from pipeline.estimation.verdict import CAUSE_NAMES
 from pipeline.fleet import (
     OVER_RUNS,
     THIS_RUN,
@@ -61,6 +60,7 @@ from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.report import Picture
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.store import Store
+from pipeline.words.effects import CAUSE_NAMES
 from schemas import Features
 
 _FEWEST = 2

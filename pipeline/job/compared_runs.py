@@ -6,10 +6,10 @@ from dataclasses import dataclass, field, replace
 import polars as pl
 
 from pipeline.core import guess_names
-from pipeline.estimation.verdict import find_refusal
 from pipeline.fleet import ComparisonError, label_runs
 from pipeline.job.run_results import DIAGNOSED, DIAGNOSIS
 from pipeline.models.catalogue import list_effects
+from pipeline.results.reading import find_refusal, read_findings
 from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.stages.checks import find_gain, is_grip
 from pipeline.store import Manifest, Store, StoreError
@@ -280,7 +280,9 @@ def find_run_refusal(manifest: Manifest) -> str:
     """Reason why slip is not observable in a run; empty if it is."""
     if "findings" not in manifest.tables or manifest.find_damage(["findings"]):
         return ""
-    return find_refusal({"findings": manifest.read("findings").select("id", "text").to_dicts()})
+    return find_refusal(
+        read_findings({"findings": manifest.read("findings").select("id", "text").to_dicts()})
+    )
 
 
 def _lacks_pose(manifest: Manifest) -> bool:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.core import SlipError
-from pipeline.estimation import Recording, RunDiagnosis
+from pipeline.estimation import Recording
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
@@ -33,6 +33,7 @@ from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question
 from pipeline.plan.rehearsal import Knowledge
 from pipeline.report.motion_view import load_motion_run
+from pipeline.results import RunDiagnosis
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
 
@@ -300,19 +301,20 @@ def study(
         SlipError: nothing can be estimated, or a run has no commands.
     """
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
-    from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
 
-    diagnosis = diagnose_runs(recordings, vehicle, notify=notify).runs[0]
-    if diagnosis.proposal is None:
-        why = find_refusal(diagnosis.to_json()) or "the log cannot be judged"
+    joint = diagnose_runs(recordings, vehicle, notify=notify)
+    diagnosis = joint.runs[0]
+    if joint.proposal is None:
+        why = find_refusal(diagnosis.findings) or "the log cannot be judged"
         what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
     # Terms outside the catalogue are specific to this run's terrain.
     catalogue = {effect.id for effect in list_effects()}
-    named = [effect for effect in diagnosis.proposal.model.effects if effect.id in catalogue]
+    named = [effect for effect in joint.proposal.model.effects if effect.id in catalogue]
     runs = [load_recording(recording, vehicle) for recording in recordings]
     if terrain is None or known is None:
         return Studied(diagnosis, learn(runs, vehicle, named))
@@ -374,7 +376,7 @@ def ask(
         numbers |= knowledge.base.names.difference(*groups)
     questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
     if ALL in wanted:
-        names += [u.id for u in diagnosis.unobservable] if diagnosis is not None else list_names(knowledge)
+        names += [*diagnosis.unobservable_why] if diagnosis is not None else list_names(knowledge)
     elif diagnosis is None and not names:
         names = list(list_names(knowledge))
     if names:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import platform
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -27,6 +28,8 @@ from pipeline.job import INPUTS, JobError
 from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
 from pipeline.job.work import Work, add_model, remove_model, stored_contexts, stored_keys
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
+from pipeline.results import Finding, RunDiagnosis, read_result, to_json
+from pipeline.results.reading import read_findings, read_model
 from pipeline.stages.reading import list_wanted
 from pipeline.stages.slip_stage import set_residuals
 from pipeline.store import JSON, Generation, Manifest, Store, StoreError
@@ -74,11 +77,10 @@ def _look_up(name: str) -> str:
 
 
 STAGE = "diagnosis"
-LINES = "lines"
 DIAGNOSIS = "diagnosis.json"
 _SUMMARY = "summary.json"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 46
+VERSION = 47
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 
@@ -99,60 +101,56 @@ def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
     return manifest.part("stages", STAGE).get("key") == key
 
 
-def diagnose_work(work: Work) -> dict[str, JSON] | None:
+def diagnose_work(work: Work) -> RunDiagnosis | None:
     """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
     Table `slip` is given the model that was judged, now or by an earlier ``slip diagnose``, unless one was
     named with ``--model``; without a diagnosis it has none.
 
     Returns:
-        The JSON object of the run as in ``slip diagnose --json``, and its lines for the screen; None if it
-        neither exists nor is requested.
+        None if it neither exists nor is requested.
     """
     generation, key = work.generation, key_diagnosis(work.keys)
     previous = generation.previous
-    content: dict[str, JSON] | None = None
+    diagnosis: RunDiagnosis | None = None
     if previous is not None and has_diagnosis(previous, key) and not work.options.force:
         generation.reuse_file(DIAGNOSIS)
         for table in DIAGNOSED:
             if table in previous.tables:
                 generation.reuse_table(table)
-        content = previous.read_json(DIAGNOSIS)
+        diagnosis = read_result(previous.read_json(DIAGNOSIS), RunDiagnosis)
     else:
         if work.options.diagnosis:
             work.progress(STAGE)
-            content = _diagnose(work)
-            generation.write_text(DIAGNOSIS, json.dumps(content, indent=1) + "\n")
+            diagnosis = _diagnose(work)
+            generation.write_text(DIAGNOSIS, json.dumps(to_json(diagnosis), indent=1) + "\n")
             work.computed.append(STAGE)
         if work.options.model is None:
             length = work.setup.configuration.slip.length_scale_m
-            judged = content or _read_stored(work.options.out, generation.run, key) or {}
+            judged = diagnosis or _read_stored(work.options.out, generation.run, key)
             show_model(generation, judged, work.vehicle, length)
-    if content is None:
+    if diagnosis is None:
         return None
     work.keys = {**work.keys, STAGE: key}
     work.contexts[STAGE] = {}
-    return content
+    return diagnosis
 
 
 def show_model(
-    generation: Generation, diagnosis: Mapping[str, object], vehicle: Vehicle, length: float
+    generation: Generation, diagnosis: RunDiagnosis | None, vehicle: Vehicle, length: float
 ) -> None:
     """Fill the model columns of table `slip`, and their medians, with the model that a diagnosis judged.
 
     Args:
         generation: generation with the tables of all stages.
-        diagnosis: JSON object of the run; where it has no model, the columns become empty.
+        diagnosis: of the run; where it has no model, the columns become empty.
         vehicle: vehicle of the run.
         length: length scale L [m] of the moduli.
     """
     slip = generation.read_table("slip")
-    text = diagnosis.get("model")
-    if isinstance(text, str):
-        from pipeline.models.model_file import parse_model  # noqa: PLC0415 - heavy
-
+    file = None if diagnosis is None else read_model(diagnosis)
+    if file is not None:
         tables = {name: generation.read_table(name) for name in generation.table_names if name in _TABLES}
-        file = parse_model(text, Path(DIAGNOSIS))
         slip, _ = add_model(slip, tables, file, vehicle, length=length, where=generation.run)
     elif slip["model_x"].null_count() < slip.height:
         slip = remove_model(slip)
@@ -162,8 +160,8 @@ def show_model(
     generation.replace_table("aggregates", set_residuals(generation.read_table("aggregates"), slip))
 
 
-def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
-    """Diagnosis that `diagnose_work` stored: the object of ``slip diagnose --json``, and its lines.
+def read_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
+    """Diagnosis that `diagnose_work` stored.
 
     Returns:
         None if it is missing, of another version, not of both inputs, or of a log that cannot be diagnosed;
@@ -173,8 +171,24 @@ def read_diagnosis(manifest: Manifest) -> dict[str, object] | None:
     is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
     if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
         return None
-    content = manifest.read_json(DIAGNOSIS)
-    return {**content, **read_choices(manifest)} if "input" in content else None
+    diagnosis = read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
+    return diagnosis if diagnosis.input else None
+
+
+def read_stored_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
+    """The diagnosis in the results of a run, also one of an earlier version.
+
+    Returns:
+        None if there is none, or one of a version that this one cannot read.
+
+    Raises:
+        StoreError: it is damaged.
+    """
+    if DIAGNOSIS not in manifest.files:
+        return None
+    with suppress(msgspec.ValidationError):
+        return read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
+    return None
 
 
 def diagnose_stored(
@@ -183,8 +197,8 @@ def diagnose_stored(
     known: Model | None,
     owner: Owner | None,
     budget_s: float | None,
-) -> dict[str, object]:
-    """Diagnose stored runs jointly; return the diagnosis of the first as `read_diagnosis` does.
+) -> RunDiagnosis:
+    """Diagnose stored runs jointly; return the diagnosis of the first.
 
     Args:
         manifests: manifests of the runs.
@@ -197,20 +211,16 @@ def diagnose_stored(
         SlipError: a run has insufficient data, or vehicles differ.
     """
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnosis_lines import list_lines  # noqa: PLC0415 - heavy
 
     read = [read_recording(manifest) for manifest in manifests]
     vehicles = {recording.name: vehicle for vehicle, recording in read}
     vehicle = agree_on_vehicle(None if known is None else known.vehicle, vehicles, owner)
     recordings = [recording for _, recording in read]
-    (first, *_) = diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs
-    return {**first.to_json(), **read_choices(manifests[0]), LINES: list_lines(first)}
+    return diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs[0]
 
 
-def _diagnose(work: Work) -> dict[str, JSON]:
+def _diagnose(work: Work) -> RunDiagnosis:
     from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.diagnosis_lines import VERDICT, list_lines  # noqa: PLC0415 - heavy
-    from pipeline.estimation.verdict import format_verdict  # noqa: PLC0415 - heavy
 
     generation, setup = work.generation, work.setup
     recording = _make_recording(
@@ -223,29 +233,26 @@ def _diagnose(work: Work) -> dict[str, JSON]:
         diagnosis = diagnose_runs([recording], work.vehicle, inputs=work.options.inputs, notify=work.progress)
     except SlipError as error:
         # The slip of a log is valid even if it cannot be diagnosed.
-        finding = {"id": error.code, "severity": "warning", "text": str(error), "where": "diagnosis"}
-        content: dict[str, JSON] = {
-            "run": work.run, "effects": [], "undecided": [], "findings": [finding], "ladder": [],
-        }  # fmt: skip
-        verdict = format_verdict(content)
-        return {**content, VERDICT: verdict, LINES: [[VERDICT, verdict]]}
+        return RunDiagnosis(work.run, findings=(Finding(error.code, str(error), "diagnosis", "warning"),))
     for table in DIAGNOSED:
         frame = diagnosis.tabulate(table, work.run)
         if not frame.is_empty():
             work.write(table, frame)
-    return {**diagnosis.to_json()[0], LINES: [list(line) for line in list_lines(diagnosis.runs[0])]}
+    return diagnosis.runs[0]
 
 
-def judge_run(findings: pl.DataFrame, diagnosis: Mapping[str, JSON] | None) -> str:
+def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
     """The verdict on a run; without a diagnosis only the reason that forbids a fit, else empty.
 
     Args:
         findings: the run's findings.
-        diagnosis: its JSON object; None if it was not requested.
+        diagnosis: None if it was not requested.
     """
-    from pipeline.estimation.verdict import format_verdict  # noqa: PLC0415 - heavy
+    from pipeline.words.verdict import format_refusal, format_verdict  # noqa: PLC0415 - heavy
 
-    return format_verdict({"findings": findings.to_dicts()} if diagnosis is None else diagnosis)
+    if diagnosis is None:
+        return format_refusal(read_findings({"findings": findings.to_dicts()}))
+    return format_verdict(diagnosis)
 
 
 def load_vehicle(manifest: Manifest) -> Vehicle:
@@ -488,7 +495,7 @@ def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
     return resolve_inside(results, f"{FOLDER}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
 
 
-def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | None:
+def find_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
     """The diagnosis of a run from both inputs: that of `read_diagnosis`, or one of `keep_diagnosis`.
 
     Returns:
@@ -497,22 +504,21 @@ def find_diagnosis(results: Path, manifest: Manifest) -> dict[str, object] | Non
     diagnosis = read_diagnosis(manifest)
     if diagnosis is not None or not _is_of(results, manifest):
         return diagnosis
-    earlier = _read_stored(results, manifest.run, _key_of(manifest))
-    return None if earlier is None else {**earlier, **read_choices(manifest)}
+    return _read_stored(results, manifest.run, _key_of(manifest))
 
 
-def _read_stored(results: Path, run: str, key: str) -> dict[str, object] | None:
+def _read_stored(results: Path, run: str, key: str) -> RunDiagnosis | None:
     """What `keep_diagnosis` stored of a run under a key."""
     try:
         path = locate_beside(results, "diagnoses", run, ".json")
         stored = msgspec.json.decode(read_bounded(path), type=_StoredDiagnosis)
     except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
         return None
-    return stored.diagnosis if stored.key == key and LINES in stored.diagnosis else None
+    return read_result(stored.diagnosis, RunDiagnosis) if stored.key == key else None
 
 
-def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, object]) -> None:
-    """Store the diagnosis of a run from both inputs, with its lines, for later requests.
+def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: RunDiagnosis) -> None:
+    """Store the diagnosis of a run from both inputs for later requests.
 
     Table `slip` is given its model, unless the run was analyzed with another one. Nothing is stored for a run
     that is not of these results, as it was analyzed with other options.
@@ -525,7 +531,7 @@ def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: Mapping[str, ob
         return
     path = locate_beside(results, "diagnoses", manifest.run, ".json")
     make_folder(path.parent)
-    replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": diagnosis}).encode())
+    replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": to_json(diagnosis)}).encode())
     if stored_contexts(manifest)["slip"].get("model") is not None or _SUMMARY not in manifest.files:
         return
     with Store(results).open_generation(manifest.run, manifest.key) as generation:

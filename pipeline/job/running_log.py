@@ -10,6 +10,7 @@ stricter test here than in a finished log, and passes it in two successive looks
 from __future__ import annotations
 
 import ipaddress
+import math
 import os
 import re
 import subprocess
@@ -23,16 +24,19 @@ from typing import BinaryIO, Final, cast
 from urllib.parse import urlsplit
 
 import msgspec
+import numpy as np
 
-from pipeline.core import python_command
-from pipeline.core.untrusted import objects_in
+from pipeline.core import pick_finite, python_command
 from pipeline.estimation.decision import LEAST_T
-from pipeline.estimation.error_regions import ABOVE_FLOOR, INTERVAL_SHARE, find_goal, format_errors
-from pipeline.estimation.verdict import find_refusal, measure_excess
+from pipeline.estimation.driving_need import find_goal
 from pipeline.job import JobError
 from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
 from pipeline.logs.index import LISTING, GrowingLog, list_files
 from pipeline.logs.live_recording import lock_folder
+from pipeline.results import Named, RunDiagnosis, Value
+from pipeline.results.reading import ABOVE_FLOOR, INTERVAL_SHARE, find_refusal, measure_excess
+from pipeline.words.effects import describe_clause, describe_separation, suggest_drive
+from pipeline.words.errors import describe_need, format_step
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765
@@ -285,14 +289,11 @@ def receive_live(
     receiver.raise_error()
 
 
-Content = Mapping[str, object]
-
 RUNNING_T = 2.0 * LEAST_T
 """Threshold of t for naming in a running log, `LEAST_T` in a finished one: `make bench NAME=watch` counts
 retracted names."""
 _MOST_ASKS = 3
 """Maximum number of manoeuvres to ask for at once: as many as can be read while driving."""
-NUMBER_KEYS = ("value", "low", "high", "unit")
 
 
 @dataclass(frozen=True)
@@ -318,44 +319,41 @@ class Stated:
         }
 
 
-def list_passing(diagnosis: Content) -> list[str]:
-    """Ids of the effects that pass the test of a running log, regardless of the look before.
-
-    Args:
-        diagnosis: the JSON object of a run as in ``slip diagnose --json``.
-    """
-    return [str(effect["id"]) for effect in objects_in(diagnosis, "effects") if _passes(effect)]
+def list_passing(diagnosis: RunDiagnosis) -> list[str]:
+    """Ids of the effects that pass the test of a running log, regardless of the look before."""
+    return [effect.id for effect in diagnosis.effects if _passes(effect)]
 
 
-def list_stated(diagnosis: Content, before: Sequence[str]) -> list[Stated]:
+def list_stated(diagnosis: RunDiagnosis, before: Sequence[str]) -> list[Stated]:
     """The effects that may be reported after this look.
 
     Args:
-        diagnosis: the JSON object of a run.
+        diagnosis: of the log so far.
         before: result of `list_passing` for the look before.
     """
     return [
         Stated(
-            str(effect["id"]),
-            str(effect["clause"]),
+            effect.id,
+            describe_clause(effect, diagnosis),
             {
                 name: {
-                    **{key: value.get(key) for key in NUMBER_KEYS},
-                    "share": _measure_share(str(effect["id"]), name, value),
+                    **pick_finite(value, "value", "low", "high"),
+                    "unit": value.unit,
+                    "share": _measure_share(effect.id, name, value),
                 }
-                for name, value in cast("Mapping[str, Content]", effect["parameters"]).items()
+                for name, value in effect.parameters.items()
             },
         )
-        for effect in objects_in(diagnosis, "effects")
-        if _passes(effect) and effect["id"] in before
+        for effect in diagnosis.effects
+        if _passes(effect) and effect.id in before
     ]
 
 
-def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, object]:
+def summarize_knowledge(diagnosis: RunDiagnosis, before: Sequence[str]) -> dict[str, object]:
     """What is known after a look, what is not, and what to drive for it.
 
     Args:
-        diagnosis: the JSON object of a run.
+        diagnosis: of the log so far.
         before: result of `list_passing` for the look before.
 
     Returns:
@@ -368,57 +366,51 @@ def summarize_knowledge(diagnosis: Content, before: Sequence[str]) -> dict[str, 
     passing = list_passing(diagnosis)
     stated = list_stated(diagnosis, before)
     names = {one.id for one in stated}
-    undecided = objects_in(diagnosis, "undecided")
-    unseen = cast("Mapping[str, Content]", diagnosis.get("unobservable_why") or {})
-    named = [one for one in objects_in(diagnosis, "effects") if not one["corrected"]]
-    waiting = [str(one["id"]) for one in named if one["id"] not in names]
+    unseen = [*diagnosis.unobservable_why]
+    waiting = [one.id for one in diagnosis.effects if not one.corrected and one.id not in names]
     is_enough = _is_enough(diagnosis, stated, waiting)
-    asks = [str(one["separate_by"]) for one in undecided]
-    asks += [part for one in unseen.values() for part in str(one["manoeuvre"]).split("; ")]
-    ladder = objects_in(diagnosis, "ladder")
-    problems = [
-        str(one["text"]) for one in objects_in(diagnosis, "findings") if one.get("where") == "diagnosis"
-    ]
+    asks = [describe_separation(one) for one in diagnosis.undecided]
+    asks += [part for name in unseen for part in suggest_drive(name).split("; ")]
+    ladder = diagnosis.ladder
+    problems = [one.text for one in diagnosis.findings if one.where == "diagnosis"]
     return {
         "stated": [one.to_json() for one in stated],
         "waiting": waiting,
-        "undecided": [one["candidates"] for one in undecided],
-        "unseen": list(unseen),
+        "undecided": [list(one.candidates) for one in diagnosis.undecided],
+        "unseen": unseen,
         "drive": [] if is_enough else list(dict.fromkeys(asks))[:_MOST_ASKS],
         "enough": is_enough,
-        "data": diagnosis.get("enough"),
-        "error": format_errors(ladder[-1]) if ladder else None,
-        "problem": "" if ladder else next(iter(problems), find_refusal(diagnosis)),
+        "data": describe_need(diagnosis) or None,
+        "error": format_step(ladder[-1]) if ladder else None,
+        "problem": "" if ladder else next(iter(problems), find_refusal(diagnosis.findings)),
         "passing": passing,
     }
 
 
-def _is_enough(diagnosis: Content, stated: Sequence[Stated], waiting: Sequence[str]) -> bool:
+def _is_enough(diagnosis: RunDiagnosis, stated: Sequence[Stated], waiting: Sequence[str]) -> bool:
     """Whether all effects are reported and known accurately, and the model is at the noise floor."""
     known = all(
         number["share"] is not None and cast("float", number["share"]) <= INTERVAL_SHARE
         for one in stated
         for number in one.numbers.values()
     )
-    is_open = bool(waiting or diagnosis.get("undecided"))
+    is_open = bool(waiting or diagnosis.undecided)
     return bool(stated) and known and not is_open and 0.0 < measure_excess(diagnosis) < ABOVE_FLOOR
 
 
-def _passes(effect: Content) -> bool:
+def _passes(effect: Named) -> bool:
     """Whether a named effect has the evidence required in a running log; corrected clocks are excluded."""
-    return not effect["corrected"] and measure_t(effect) >= RUNNING_T
+    return not effect.corrected and measure_t(effect) >= RUNNING_T
 
 
-def measure_t(effect: Content) -> float:
+def measure_t(effect: Named) -> float:
     """The t value of an effect at the end of the log so far; 0 if it was not searched for."""
-    evidence = cast("Content", effect.get("growth") or {}).get("evidence")
-    values = cast("Sequence[float | None]", cast("Content", evidence or {}).get("t") or [])
-    return float(values[-1] or 0.0) if values else 0.0
+    evidence = None if effect.growth is None else effect.growth.evidence
+    return float(np.nan_to_num(evidence.t[-1])) if evidence is not None and evidence.t else 0.0
 
 
-def _measure_share(effect: str, name: str, number: Content) -> float | None:
+def _measure_share(effect: str, name: str, number: Value) -> float | None:
     """Half-width of an interval relative to the value, or to a typical one if that is larger."""
-    value, low, high = (cast("float | None", number.get(key)) for key in ("value", "low", "high"))
-    if value is None or low is None or high is None:
+    if not math.isfinite(number.high - number.low):
         return None
-    return INTERVAL_SHARE * 0.5 * (high - low) / find_goal(effect, name, value)
+    return INTERVAL_SHARE * 0.5 * (number.high - number.low) / find_goal(effect, name, number.value)

@@ -25,7 +25,6 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.rivals import (
     Contest,
     contest_as_json,
-    format_contest,
     hold_contest,
     judge_fit,
     judge_learned,
@@ -47,6 +46,7 @@ from pipeline.report.motion_view import load_motion_run
 from pipeline.run import MotionError, MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
+from pipeline.words.models import format_contest
 
 if TYPE_CHECKING:
     from pipeline.estimation.comparison import Input

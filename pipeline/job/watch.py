@@ -25,6 +25,7 @@ from pipeline.job.work import add_model, as_recorded, identify
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.models import read_model
+from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import read_drive
 from pipeline.stages import Finding, slip_stage, velocity
 from pipeline.stages.align import align_tables
@@ -404,12 +405,12 @@ class Watch:
             errors = cast("list[Content]", output.get("errors") or [{}])
             self.knowledge["problem"] = str(errors[0].get("message") or "the diagnosis gave no answer")
             return True
-        diagnosis = cast("Content", runs[0].get("diagnosis") or {})
+        diagnosis = read_result(cast("Content", runs[0].get("diagnosis") or {}), RunDiagnosis)
         passing = cast("Sequence[str]", self.knowledge.get("passing") or ())
         self.knowledge = {"until_s": running.duration_s, **summarize_knowledge(diagnosis, passing)}
-        if isinstance(text := diagnosis.get("model"), str):
+        if diagnosis.model is not None:
             self._model = scratch / "model.toml"
-            self._model.write_text(text, encoding="utf-8")
+            self._model.write_text(diagnosis.model, encoding="utf-8")
         self._notes.write(str(self.path.resolve()), cast("dict[str, JSON]", self.knowledge))
         return True
 
@@ -458,7 +459,7 @@ def _measure_medians(slip: pl.DataFrame, column: str) -> dict[str, float]:
 
 
 class _Number(msgspec.Struct):
-    """One of `running_log.NUMBER_KEYS`, with its precision."""
+    """A value with its interval and its precision."""
 
     value: float | None
     low: float | None

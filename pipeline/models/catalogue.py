@@ -374,6 +374,12 @@ MANOEUVRES: Mapping[Excitation, str] = {
 }
 
 
+def name_term(name: str) -> str:
+    """An effect by its term in place of its id: `lateral centre of rotation`."""
+    term = name_effect(name)
+    return f"{term[:1].lower()}{term[1:]}"
+
+
 def suggest_manoeuvre(*effects: Effect) -> str:
     """Manoeuvres that excite effects."""
     needs = dict.fromkeys(need for effect in effects for need in effect.needs)

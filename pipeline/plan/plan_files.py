@@ -15,7 +15,6 @@ from mcap_ros2.writer import Writer
 from pipeline.core import format_share
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text
-from pipeline.estimation import RunDiagnosis
 from pipeline.logs.schema import definition_text
 from pipeline.models import format_value
 from pipeline.models.catalogue import find_effect
@@ -23,10 +22,12 @@ from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_wit
 from pipeline.plan.plan import SAFETY, ExpectedGain, Plan, since_when
 from pipeline.plan.questions import Impossible, Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal
+from pipeline.results import RunDiagnosis
 from pipeline.run import MotionRun
 from pipeline.run.signals import DriveSeries, name_inputs
 from pipeline.sources import Vehicle
 from pipeline.store.files import TEMPORARY, replace_file
+from pipeline.words.effects import describe_separation, suggest_drive
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
@@ -246,8 +247,10 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
         _check_interval(one, diagnosis) if one.kind == "interval" else _check_separation(one, diagnosis)
         for one in promised.promises
     )
-    still = [f"{' or '.join(group.candidates)}: {group.separate_by}" for group in diagnosis.undecided]
-    still += [f"{one.id}: {one.manoeuvre}" for one in diagnosis.unobservable]
+    still = [
+        f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
+    ]
+    still += [f"{name}: {suggest_drive(name)}" for name in diagnosis.unobservable_why]
     return Check(answers, tuple(still))
 
 
@@ -259,14 +262,14 @@ def _check_separation(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedA
     if named and not is_ambiguous:
         # The identified effect explains the motion, which excludes its rival.
         return CheckedAnswer(answer.question, text, " and ".join(named), kept=True)
-    if is_ambiguous or asked & {one.id for one in diagnosis.unobservable}:
+    if is_ambiguous or asked & diagnosis.unobservable_why.keys():
         return CheckedAnswer(answer.question, text, "still open", kept=False)
     # With more data the shared part of two effects may vanish: that is a decision, too.
     return CheckedAnswer(answer.question, text, "decided: no effect", kept=True)
 
 
 def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAnswer:
-    text = f"+- {answer.goal:.2g} after {answer.decided_after_s:g} s"
+    text = f"±{answer.goal:.2g} after {answer.decided_after_s:g} s"
     label = answer.question.partition(" ")[0]
     for effect in diagnosis.effects:
         for name, value in effect.parameters.items():
@@ -275,7 +278,7 @@ def _check_interval(answer: ExpectedGain, diagnosis: RunDiagnosis) -> CheckedAns
                 return CheckedAnswer(
                     answer.question,
                     text,
-                    f"{value.value:.3g} +- {half:.2g}",
+                    f"{value.value:.3g} ±{half:.2g}",
                     kept=half <= answer.goal,
                 )
     return CheckedAnswer(answer.question, text, "not found", kept=False)

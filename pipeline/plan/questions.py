@@ -17,7 +17,7 @@ from scipy.special import chdtri, stdtrit
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, enumerate_texts, suffix_unit
 from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints
 from pipeline.estimation import Free, Problem
-from pipeline.estimation.error_regions import find_goal
+from pipeline.estimation.driving_need import find_goal
 from pipeline.models import Excitation, find_effect, list_effects
 from pipeline.models.catalogue import explain_idle, suggest_manoeuvre
 from pipeline.models.parameter import Largest
@@ -186,7 +186,7 @@ class Answerable:
         else:
             bound = float(self.bound(weight))
             enough = bound <= self.question.goal
-            what = f"+- {measured:.2g}, up to {bound:.2g}"
+            what = f"±{measured:.2g}, up to {bound:.2g}"
         if enough and (lacking := self.list_lacking(weight)):
             return f"{what}, without {enumerate_texts(lacking)}"
         return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what

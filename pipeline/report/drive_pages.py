@@ -89,7 +89,7 @@ def _plan_as_view(plan: Plan) -> dict[str, object]:
         "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
         "promises": [
             f"after {one.decided_after_s:.0f} s: {one.question} "
-            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(+- {one.expected:.2g})")
+            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(±{one.expected:.2g})")
             for one in plan.promises
         ],
         "rest": plan.format_rest(),

@@ -5,19 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.core.untrusted import mapping_in, objects_in
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
-from pipeline.models import ModelFile, Timing
-from pipeline.models.model_file import parse_model
+from pipeline.models import Timing
 from pipeline.report import ReportError
+from pipeline.results import Errors, RunDiagnosis, Step
+from pipeline.results.reading import read_model
 from pipeline.run import MotionError, MotionRun, load_run
 
 if TYPE_CHECKING:
@@ -97,8 +96,8 @@ class MotionView:
     Attributes:
         input: `command` or `measured`.
         effects: ids of its effects.
-        ladder: steps as in the JSON of `slip diagnose`, starting with the ideal model.
-        floor: noise floor under the same keys; None if unknown.
+        ladder: its steps, starting with the ideal model.
+        floor: noise floor; None if unknown.
         residuals: one row per window of half a second: ``t`` [s], residuals ``ideal_x`` .. ``model_w``
             [m/s, rad/s], and the signals of `SIGNALS`.
         velocity: the model's velocity: ``t piece v_x v_y v_w``.
@@ -111,8 +110,8 @@ class MotionView:
 
     input: str
     effects: tuple[str, ...]
-    ladder: Sequence[Mapping[str, object]]
-    floor: Mapping[str, object] | None
+    ladder: Sequence[Step]
+    floor: Errors | None
     residuals: pl.DataFrame
     velocity: pl.DataFrame
     horizon_errors: pl.DataFrame
@@ -157,15 +156,13 @@ class MotionStage:
         measured = measure_variables(self._comparison)
         return {name: measured[name] for name in SIGNALS}
 
-    def view(
-        self, state: State, ladder: Sequence[Mapping[str, object]], floor: Mapping[str, object] | None
-    ) -> MotionView:
+    def view(self, state: State, ladder: Sequence[Step], floor: Errors | None) -> MotionView:
         """Return the rows of one model.
 
         Args:
             state: model with its parameter values and the recording's delays.
-            ladder: its steps as JSON.
-            floor: noise floor as JSON.
+            ladder: its steps.
+            floor: noise floor; None if unknown.
         """
         from pipeline.estimation.effect_signature import find_signatures  # noqa: PLC0415 - for pages alone
 
@@ -253,7 +250,7 @@ class MotionStage:
 def view_diagnosis(
     tables: Mapping[str, pl.DataFrame],
     vehicle: Vehicle,
-    diagnosis: Mapping[str, object],
+    diagnosis: RunDiagnosis,
 ) -> MotionView | None:
     """Return the results of the diagnosed model on the run.
 
@@ -261,36 +258,21 @@ def view_diagnosis(
         tables: tables of the run: `poses`, `alignments` and `commands` or `wheels`, preferably with `imu`,
             `slip` and `velocities`.
         vehicle: geometry.
-        diagnosis: the JSON object of one run of ``slip diagnose --json``.
+        diagnosis: of the run.
 
     Returns:
         Rows to draw; None without effects, or if the run has too little data for a model.
     """
-    file = read_model_text(diagnosis)
+    file = read_model(diagnosis)
     if file is None or not file.model.effects or "poses" not in tables:
         return None
-    asked = diagnosis.get("input")
     try:
-        run = load_run(tables, vehicle, name=str(diagnosis.get("run", "")))
-        source = choose_input([run], asked if isinstance(asked, str) else None).source
+        run = load_run(tables, vehicle, name=diagnosis.run)
+        source = choose_input([run], diagnosis.input or None).source
         problem = Problem([run], vehicle, source)
     except MotionError:
         # A log with too little data for a model still has its slip.
         return None
     state = State(file.find_effects(run.name), (Timing(file.find_wheel_delay(run.name)),))
     places = tables["velocities"].select("t", "x", "y").sort("t") if "velocities" in tables else None
-    floor = mapping_in(diagnosis, "noise_floor")
-    return MotionStage(problem, places).view(state, objects_in(diagnosis, "ladder"), floor or None)
-
-
-def read_model_text(diagnosis: Mapping[str, object]) -> ModelFile | None:
-    """Model file written by a diagnosis; None without a readable one.
-
-    Args:
-        diagnosis: the JSON object of one run of ``slip diagnose --json``.
-    """
-    text = diagnosis.get("model")
-    try:
-        return parse_model(text, Path("diagnosis.toml")) if isinstance(text, str) else None
-    except MotionError:
-        return None
+    return MotionStage(problem, places).view(state, diagnosis.ladder, diagnosis.noise_floor)

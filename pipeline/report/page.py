@@ -13,9 +13,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from pipeline.core import INPUT_WORDS, format_recorded, naming_os_errors
-from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
-from pipeline.estimation.error_regions import format_errors
-from pipeline.estimation.verdict import has_no_pose
+from pipeline.core.untrusted import mapping_in, number_in, numbers_in
 from pipeline.report import (
     MISSING,
     Cell,
@@ -42,6 +40,8 @@ from pipeline.report.sections_why import (
     view_why,
 )
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
+from pipeline.results.reading import has_no_pose, read_findings
+from pipeline.words.errors import describe_regions, describe_structure, format_step, name_span
 
 _MOST_REGIONS = 2
 _SPARK_BINS, _SPARK_HEIGHT = 150, 28
@@ -64,10 +64,10 @@ def view_glance(page: Page) -> dict[str, object]:
         "regions": list_regions(report, _MOST_REGIONS),
         "pictures": page.pictures[Section.GLANCE],
         "refusal": report.refusal,
-        "diagnosed": bool(report.diagnosis),
-        "effects": [format_row(entry) for entry in main],
+        "diagnosed": report.is_diagnosed,
+        "effects": [format_row(report, entry) for entry in main],
         "more_effects": len(minor) + report.small_groups,
-        "unexplained": mapping_in(report.diagnosis, "unexplained").get("where"),
+        "unexplained": None if (rest := report.diagnosis.unexplained) is None else describe_structure(rest),
         "split": _order_split(report),
         "step": list_steps(report)[0] if report.text("run") else None,
         "undecided": next(iter(report.undecided), None),
@@ -126,7 +126,7 @@ def view_how_bad(page: Page) -> dict[str, object]:
     return {
         "refusal": report.refusal,
         "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
-        "ladder": [format_errors(step) for step in report.ladder],
+        "ladder": [format_step(step) for step in report.diagnosis.ladder],
         "pictures": page.pictures[Section.HOW_BAD],
         "table": _tabulate(report),
     }
@@ -157,9 +157,8 @@ def _tabulate(report: RunReport) -> Table | None:
     scale = report.number("length_scale_m")
     caption = "Slip g = f(u) \u2212 v of the ideal model"
     caption += "" if scale is None else f"; slip modulus with L = {scale:g} m"
-    caption += (
-        "; v is that of the measured wheels: no pose is recorded" if has_no_pose(report.summary) else ""
-    )
+    if has_no_pose(read_findings(report.summary)):
+        caption += "; v is that of the measured wheels: no pose is recorded"
     rows: list[list[str | Cell]] = [[words, *(c[i] for c in columns)] for i, words in enumerate(_QUANTITIES)]
     head = [Column("u"), *(Column(INPUT_WORDS[name], number=True) for name in report.inputs)]
     return Table(caption, head, rows)
@@ -189,7 +188,10 @@ def _list_numbers(numbers: Mapping[str, object]) -> list[str]:
 def view_where(page: Page) -> dict[str, object]:
     """Regions with the largest error, linked figures, and controls to mark time without a mouse."""
     report, pictures = page.report, page.pictures[Section.WHERE]
-    moments = objects_in(report.diagnosis, "when")
+    moments = [
+        {"of": one, "spans": [(span, name_span(span)) for span in one.spans[:3]]}
+        for one in report.diagnosis.when
+    ]
     return {"regions": list_regions(report), "moments": moments, "pictures": pictures}
 
 
@@ -197,10 +199,8 @@ def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
     """Regions of the ideal model's error, as on the screen: each with its part of the error."""
     if report.is_refused:
         return []
-    texts = [
-        [str(one.get(key, "")) for key in ("region", "text")] for one in objects_in(report.diagnosis, "where")
-    ]
-    return [(region, text.removeprefix(region).removeprefix(": ")) for region, text in texts[:most]]
+    parted = (text.partition(": ") for text in describe_regions(report.diagnosis.where)[:most])
+    return [(region, part) for region, _, part in parted]
 
 
 def view_what_now(page: Page) -> dict[str, object]:
@@ -208,9 +208,8 @@ def view_what_now(page: Page) -> dict[str, object]:
     if not page.report.text("run"):
         return {"steps": [], "settled": False, "planned": {}}
     diagnosis = page.report.diagnosis
-    settled = bool(diagnosis.get("effects")) and not any(
-        diagnosis.get(key) for key in ("undecided", "unobservable", "unexplained")
-    )
+    is_open = diagnosis.undecided or diagnosis.unobservable_why or diagnosis.unexplained
+    settled = bool(diagnosis.effects) and not is_open
     return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
 
 
@@ -239,26 +238,26 @@ def _list_mending_steps(report: RunReport) -> list[tuple[str, str]]:
 
 def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     diagnosis = report.diagnosis
-    if not diagnosis:
+    if not report.is_diagnosed:
         return [("Estimate the effects that the model lacks", f"slip diagnose {name}")]
     steps = []
-    if diagnosis.get("effects"):
+    if diagnosis.effects:
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
         against = f"slip model compare model.toml --against literature --on {name}"
         steps.append(("Compare it with models of the literature", against))
-        if mapping_in(diagnosis, "learned").get("kept"):
+        if diagnosis.learned is not None and diagnosis.learned.helps:
             learn = f"slip model add model.toml learned_term --on {name}"
             steps.append(("Put a learned term on top of it", learn))
-    if diagnosis.get("undecided") or diagnosis.get("unobservable"):
-        what = "is undecided" if diagnosis.get("undecided") else "is not observable"
+    if diagnosis.undecided or diagnosis.unobservable_why:
+        what = "is undecided" if diagnosis.undecided else "is not observable"
         steps += [
             (f"Plan a drive that determines what {what}, where one can", f"slip plan {name} --folder plan"),
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
         ]
     steps.append(("Try other effects, and plan the next drive, in the browser", "slip serve"))
-    if diagnosis.get("unexplained"):
+    if diagnosis.unexplained:
         steps.append(("Write the effect that explains the rest yourself", "slip model new-effect mine.py"))
     return steps
 

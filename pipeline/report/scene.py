@@ -14,11 +14,13 @@ import polars as pl
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import format_number
 from pipeline.report.theme import round_up, usual_ends
+from pipeline.results import Named, RunDiagnosis
 
 if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
 
 INPUTS = ("command", "measured")
+NOT_DIAGNOSED = RunDiagnosis()
 
 
 @dataclass(frozen=True)
@@ -28,7 +30,7 @@ class RunReport:
     Attributes:
         summary: the JSON object of one run of ``slip analyze --json``.
         tables: tables by contract name (`commands`, `slip`, `windows`, ...); any may be missing or empty.
-        diagnosis: the JSON object of one run of ``slip diagnose --json``; empty without one.
+        diagnosis: of the run; empty without one.
         motion: a model of the run; None without one.
         peers: median slip moduli [m/s] of comparable runs by input; empty without any.
         catalogue: relative address of the page over all runs; empty without one.
@@ -37,7 +39,7 @@ class RunReport:
 
     summary: Mapping[str, object]
     tables: Mapping[str, pl.DataFrame] = field(default_factory=dict)
-    diagnosis: Mapping[str, object] = field(default_factory=dict)
+    diagnosis: RunDiagnosis = NOT_DIAGNOSED
     motion: MotionView | None = None
     peers: Mapping[str, Sequence[float]] = field(default_factory=dict)
     catalogue: str = ""
@@ -67,30 +69,31 @@ class RunReport:
         return [name for name in INPUTS if name in names]
 
     @property
-    def ladder(self) -> list[Mapping[str, object]]:
-        """Errors over 2 s of the ideal model and with each further effect."""
-        return objects_in(self.diagnosis, "ladder")
+    def is_diagnosed(self) -> bool:
+        """Whether the run was diagnosed."""
+        return bool(self.diagnosis.run)
 
     @property
     def verdict(self) -> str:
-        """Stored verdict on the run; empty without a diagnosis."""
-        sentence = self.diagnosis.get("verdict") or self.summary.get("verdict")
-        return sentence if isinstance(sentence, str) else ""
+        """Verdict on the run; empty without a diagnosis."""
+        from pipeline.words.verdict import format_verdict  # noqa: PLC0415 - heavy
+
+        return format_verdict(self.diagnosis) if self.is_diagnosed else self.text("verdict")
 
     @property
-    def effects(self) -> tuple[list[Mapping[str, object]], list[Mapping[str, object]]]:
+    def effects(self) -> tuple[list[Named], list[Named]]:
         """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
-        from pipeline.estimation.verdict import split_main  # noqa: PLC0415 - heavy
+        from pipeline.results.reading import split_main  # noqa: PLC0415 - heavy
 
-        named, ladder = (objects_in(self.diagnosis, key) for key in ("effects", "ladder"))
-        return split_main(named, ladder, lambda entry: (entry.get("id"), bool(entry.get("corrected"))))
+        diagnosis = self.diagnosis
+        return split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
 
     @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
-        from pipeline.estimation.verdict import find_refusal  # noqa: PLC0415 - heavy
+        from pipeline.results.reading import find_refusal, read_findings  # noqa: PLC0415 - heavy
 
-        return find_refusal(self.summary)
+        return find_refusal(read_findings(self.summary))
 
     @property
     def is_refused(self) -> bool:
@@ -100,22 +103,16 @@ class RunReport:
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """Effects that explain the data equally well, and the manoeuvre that would separate them."""
-        from pipeline.estimation.verdict import name_group  # noqa: PLC0415 - heavy
+        from pipeline.words.effects import describe_separation, name_group  # noqa: PLC0415 - heavy
 
-        groups = []
-        for entry in objects_in(self.diagnosis, "undecided"):
-            names = entry.get("candidates")
-            between = name_group([*map(str, names)]) if isinstance(names, list) else ""
-            groups.append((between, str(entry.get("separate_by", ""))))
-        return groups
+        return [(name_group(one.candidates), describe_separation(one)) for one in self.diagnosis.undecided]
 
     @property
     def small_groups(self) -> int:
         """Number of undecided groups that count as one smaller effect each."""
-        from pipeline.estimation.verdict import is_small  # noqa: PLC0415 - heavy
+        from pipeline.results.reading import is_small  # noqa: PLC0415 - heavy
 
-        groups = objects_in(self.diagnosis, "undecided")
-        return sum(is_small(str(group.get("in_model")), self.ladder) for group in groups)
+        return sum(is_small(group.in_model, self.diagnosis.ladder) for group in self.diagnosis.undecided)
 
     @property
     def split(self) -> tuple[float | None, float | None, float | None]:

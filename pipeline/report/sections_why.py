@@ -3,18 +3,12 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.core import split_interval
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.estimation.diagnosis import CAUSE
-from pipeline.estimation.diagnosis_lines import (
-    format_learned_share,
-    format_suggestion,
-    format_unexplained,
-)
-from pipeline.estimation.error_regions import format_remaining_error
 from pipeline.models.catalogue import list_effects, suggest_manoeuvre
 from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.report import (
@@ -32,6 +26,10 @@ from pipeline.report import (
 )
 from pipeline.report.figures import Section
 from pipeline.report.scene import RunReport
+from pipeline.results import Named
+from pipeline.words.diagnosis import format_learned_share, format_suggestion
+from pipeline.words.effects import describe_cause, describe_motion
+from pipeline.words.errors import describe_rest, describe_unexplained, format_remaining_error
 
 if TYPE_CHECKING:
     from pipeline.report.page import Page
@@ -81,25 +79,14 @@ def summarise_health(report: RunReport) -> list[tuple[str, str]]:
     if segments is not None:
         gaps = int(segments) - 1
         strip.append(("good", "no gaps") if gaps <= 0 else ("note", f"{int(segments):,} segments"))
-    held = _held_share(report)
-    if held is not None:
-        strip.append(
-            ("good", "no held poses")
-            if held == 0
-            else ("note", f"{format_known_share(held)} of the poses held")
-        )
-    strip.extend(count_serious(list_findings(report)).items())
+    findings = list_findings(report)
+    repeated = next((number_in(one, "value") for one in findings if one.get("id") == "held_poses"), None)
+    if repeated is not None:
+        strip.append(("note", f"{format_known_share(repeated)} of the poses repeated"))
+    elif report.number("held_poses") == 0:
+        strip.append(("good", "no repeated poses"))
+    strip.extend(count_serious(findings).items())
     return strip
-
-
-def _held_share(report: RunReport) -> float | None:
-    """Share of held poses; the summary contains the share or, as an integer, the count."""
-    held, poses = report.summary.get("held_poses"), report.table("poses")
-    if isinstance(held, float):
-        return held
-    if isinstance(held, int) and (poses is not None or held == 0):
-        return held / poses.height if poses is not None else 0.0
-    return None
 
 
 def _view_finding(finding: Mapping[str, object]) -> dict[str, object]:
@@ -197,11 +184,11 @@ _HEAD = (
 def format_remaining(report: RunReport) -> str:
     """Format the error of the model relative to the noise floor; empty if unknown."""
     diagnosis = report.diagnosis
-    rungs, floor = objects_in(diagnosis, "ladder"), mapping_in(diagnosis, "noise_floor")
-    explained = number_in(diagnosis, "explained_share")
-    if len(rungs) < 2:  # noqa: PLR2004 - without an effect nothing remains of anything
+    if len(diagnosis.ladder) < 2 or diagnosis.noise_floor is None:  # noqa: PLR2004 - without an effect nothing remains
         return ""
-    return format_remaining_error(number_in(rungs[-1], "t_mrmse_m"), number_in(floor, "t_mrmse_m"), explained)
+    return format_remaining_error(
+        diagnosis.ladder[-1].t_mrmse_m, diagnosis.noise_floor.t_mrmse_m, diagnosis.explained_share
+    )
 
 
 def view_why(page: Page) -> dict[str, object]:
@@ -213,9 +200,9 @@ def view_why(page: Page) -> dict[str, object]:
     signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
     return {
         "refusal": report.refusal,
-        "diagnosed": bool(report.diagnosis),
-        "named": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in main],
-        "smaller": [_view_effect(entry, signatures.get(str(entry.get("id")))) for entry in minor],
+        "diagnosed": report.is_diagnosed,
+        "named": [_view_effect(report, entry, signatures.get(entry.id)) for entry in main],
+        "smaller": [_view_effect(report, entry, signatures.get(entry.id)) for entry in minor],
         "groups": report.small_groups,
         "undecided": bool(report.undecided),
         "remaining": format_remaining(report),
@@ -228,73 +215,64 @@ def view_why(page: Page) -> dict[str, object]:
     }
 
 
-def _view_effect(entry: Mapping[str, object], signature: object) -> dict[str, object]:
+def _view_effect(report: RunReport, effect: Named, signature: object) -> dict[str, object]:
     """One effect: description, possible causes, and its measured signature."""
-    name = str(entry.get("id", ""))
-    does, may_be = format_row(entry)
+    does, may_be = format_row(report, effect)
     return {
-        "id": name,
+        "id": effect.id,
         "does": begin_large(does),
         "may_be": may_be,
-        "alike": _list_alike(entry),
+        "alike": _list_alike(effect),
         "picture": signature,
     }
 
 
-def format_row(entry: Mapping[str, object]) -> tuple[str, str]:
+def format_row(report: RunReport, effect: Named) -> tuple[str, str]:
     """Description of an effect, and its possible causes."""
-    does, _, may_be = str(entry.get("sentence") or entry.get("id", "")).partition(CAUSE)
-    return set_squares(does), set_squares(may_be)
+    return set_squares(describe_motion(effect, report.diagnosis)), set_squares(describe_cause(effect))
 
 
-def _list_alike(entry: Mapping[str, object]) -> tuple[str, str] | None:
+def _list_alike(effect: Named) -> tuple[str, str] | None:
     """Effects that are easily confused with this one, and the drive that would separate them."""
-    alike = entry.get("confused_with")
-    known = {effect.id: effect() for effect in list_effects()}
-    names = [name for name in alike if name in known] if isinstance(alike, list | tuple) else []
-    if not names or entry.get("id") not in known:
+    known = {kind.id: kind() for kind in list_effects()}
+    names = [name for name in effect.confused_with if name in known]
+    if not names or effect.id not in known:
         return None
-    return ", ".join(names), suggest_manoeuvre(known[str(entry["id"])], *(known[name] for name in names))
+    return ", ".join(names), suggest_manoeuvre(known[effect.id], *(known[name] for name in names))
 
 
-def _list_parameters(entry: Mapping[str, object]) -> list[list[str | Cell]]:
+def _list_parameters(effect: Named) -> list[list[str | Cell]]:
     """One row per parameter: value, interval, and in the first row the gain of the effect."""
-    name, same = str(entry.get("id", "")), entry.get("equivalent_to")
-    notes = [f"same as {', '.join(map(str, same))}"] if isinstance(same, list) and same else []
-    gain = _format_gain(number_in(entry, "gain"))
-    without = Cell(gain, small=_PATHS.get(str(entry.get("found_on")), "")) if gain else ""
-    parameters = mapping_in(entry, "parameters")
+    notes = [f"same as {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
+    gain = _format_gain(effect.gain)
+    without = Cell(gain, small=_PATHS.get(effect.path, "")) if gain else ""
     rows: list[list[str | Cell]] = []
-    for key in parameters:
-        values = mapping_in(parameters, key)
-        unit = values.get("unit")
-        shown = set_squares(str(unit)) if unit not in (None, "1", "") else ""
-        doubt = AT_BOUND if values.get("at_bound") else UNDETERMINED
-        doubts = [doubt] if values.get("undetermined") else []
-        text, ends = _format_within(values, values)
+    for key, value in effect.parameters.items():
+        shown = "" if value.unit in {"1", ""} else set_squares(value.unit)
+        doubts = [AT_BOUND if value.at_bound else UNDETERMINED] if value.is_undetermined else []
+        text, ends = _format_within(value.value, value.low, value.high)
         rows.append(
             [
-                Cell(small=key) if rows else Cell(name, small=key, notes=notes),
+                Cell(small=key) if rows else Cell(effect.id, small=key, notes=notes),
                 Cell(text, small=shown, notes=doubts),
                 ends,
-                _format_within(values, mapping_in(values, "another_run"))[1],
+                _format_within(value.value, value.another_run.low, value.another_run.high)[1],
                 "" if rows else without,
             ]
         )
-    return rows or [[Cell(name, notes=notes), "", "", "", without]]
+    return rows or [[Cell(effect.id, notes=notes), "", "", "", without]]
 
 
-def _format_within(values: Mapping[str, object], ends: Mapping[str, object]) -> tuple[str, str]:
+def _format_within(value: float, low: float, high: float) -> tuple[str, str]:
     """A value, and an interval about it with the digits that it supports; empty where unknown."""
-    value, low, high = number_in(values, "value"), number_in(ends, "low"), number_in(ends, "high")
-    if value is None or low is None or high is None:
-        return "" if value is None else format_number(value, digits=4), ""
+    if not math.isfinite(value + low + high):
+        return format_number(value, digits=4) if math.isfinite(value) else "", ""
     text, *both = split_interval(value, low, high)
     return text, " to ".join(both)
 
 
-def _format_gain(gain: float | None) -> str:
-    if gain is None:
+def _format_gain(gain: float) -> str:
+    if not math.isfinite(gain):
         return ""
     if gain >= _MANY_FOLD:
         return f"x {gain + 1.0:,.0f}"
@@ -306,20 +284,18 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     diagnosis = report.diagnosis
     for names, advice in report.undecided:
         yield "undecided", f"{names}: {advice}", ""
-    rest = mapping_in(diagnosis, "unexplained")
-    if rest:
-        formula, suggested = str(rest.get("formula") or ""), format_suggestion(rest)
+    if diagnosis.unexplained is not None:
+        suggested = format_suggestion(diagnosis.unexplained)
         example = f"; suggested term: {suggested}" if suggested else ""
-        yield "unexplained", f"{format_unexplained(rest)}{example}", formula
-    if beyond := format_learned_share(mapping_in(diagnosis, "learned")):
+        formula = diagnosis.unexplained.formula or ""
+        yield "unexplained", f"{describe_unexplained(diagnosis.unexplained)}{example}", formula
+    if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
         yield "beyond the effects", beyond, ""
-    unseen = diagnosis.get("unobservable")
-    if isinstance(unseen, list) and unseen:
-        yield "not observable in this log", ", ".join(map(str, unseen)), ""
+    if diagnosis.unobservable_why:
+        yield "not observable in this log", ", ".join(diagnosis.unobservable_why), ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}
-    for entry in objects_in(diagnosis, "findings"):
-        if str(entry.get("text", "")) not in known:
-            yield "finding", str(entry.get("text", "")), ""
-    disturbance = mapping_in(diagnosis, "disturbance").get("text")
-    if disturbance and not rest:
-        yield "residual", str(disturbance), ""
+    for finding in diagnosis.findings:
+        if finding.text not in known:
+            yield "finding", finding.text, ""
+    if diagnosis.disturbance is not None and diagnosis.unexplained is None:
+        yield "residual", describe_rest(diagnosis), ""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Sequence, Sized
 
 import numpy as np
 import polars as pl
@@ -61,10 +61,10 @@ def render_trend(trend: Trend) -> str:
         [picture for *_, pictures in groups for picture in pictures],
         title="Trends",
         facts=[
-            f"{len(parameters)} parameters of {len(vehicles)} vehicle{'s' * (len(vehicles) != 1)}",
-            f"{len(series)} series of {len(names)} group{'s' * (len(names) != 1)}",
-            f"{len(keys)} runs",
-            f"{len(alerts)} alert{'s' * (len(alerts) != 1)}",
+            f"{_count(parameters, 'parameter')} of {_count(vehicles, 'vehicle')}",
+            f"{len(series)} series of {_count(names, 'group')}",
+            _count(keys, "run"),
+            _count(alerts, "alert"),
         ],
         alerts=[alert.text for alert in alerts],
         quiet=begin_large(format_quiet(series, parameters)),
@@ -72,6 +72,10 @@ def render_trend(trend: Trend) -> str:
         groups=[group for group in groups if group[-1]],
         runs=keys,
     )
+
+
+def _count(what: Sized, word: str) -> str:
+    return f"{len(what)} {word}{'s' * (len(what) != 1)}"
 
 
 def _draw_vehicle(

@@ -9,6 +9,7 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
+from pipeline.core import format_duration
 from pipeline.core.arrays import Flags, Floats
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError
@@ -95,7 +96,7 @@ def compute_slip(
         "t", "stamp", "segment", "v_x", "v_y", "v_w", "recorded_x", "recorded_y", "recorded_w"
     ).with_columns(step=pl.Series(cut.step), transitory=pl.Series(cut.transitory))
     spans = find_spans(velocities, tables["poses"], known, vehicle, hold_s)
-    findings = [*_report_stale(times, ideals), *spans.findings]
+    findings = [*_report_stale(times, ideals, hold_s), *spans.findings]
     suspect, motion = spans.excluded | spans.wrong | velocities["outlier"].to_numpy(), MotionEvents()
     if not is_drive_alone:
         motion = find_events(velocities, known, vehicle, spans)
@@ -171,16 +172,20 @@ def cut_windows(slip: pl.DataFrame, rate: float) -> pl.DataFrame:
     )
 
 
-def _report_stale(times: Floats, ideals: dict[str, Ideal]) -> list[Finding]:
+def _report_stale(times: Floats, ideals: dict[str, Ideal], hold_s: float | None) -> list[Finding]:
     ideal = ideals.get("command")
-    if ideal is None:
+    if ideal is None or hold_s is None:
         return []
     # A command of zero does not lapse: a vehicle that is asked to stand needs no second one.
     lapsed = ideal.expired.any(axis=1)
     if not lapsed.any():
         return []
     count = int(lapsed.sum())
-    text = f"in {count} time steps the last command is older than command.hold_s: left out"
+    seconds = count * float(np.median(np.diff(times))) if times.size > 1 else 0.0
+    text = (
+        f"for {format_duration(seconds)} no command had arrived within the last {hold_s:.2g} s "
+        "(command.hold_s): left out"
+    )
     first = float(times[np.flatnonzero(lapsed)[0]])
     return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
 

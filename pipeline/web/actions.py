@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import msgspec
 import polars as pl
 
+from pipeline import results
 from pipeline.core.arrays import Floats
 from pipeline.estimation import (
     Errors,
@@ -24,8 +25,8 @@ from pipeline.estimation import (
     State,
     choose_input,
 )
-from pipeline.estimation.additions import explain_refusal, explain_refusals, format_refusals
-from pipeline.estimation.apportion import SlipBudget, apportion
+from pipeline.estimation.additions import explain_refusal, explain_refusals
+from pipeline.estimation.apportion import apportion
 from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
@@ -37,6 +38,7 @@ from pipeline.job.run_results import load_vehicle
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.models.model_file import ModelFile
 from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run
+from pipeline.results import SlipBudget, read_result
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 from pipeline.store import Manifest
@@ -50,6 +52,8 @@ from pipeline.web.session import (
     show_session,
     switch_off,
 )
+from pipeline.words.errors import describe_region
+from pipeline.words.models import format_refusals
 
 _MOST_RUNS = 6
 _MOST_FITS = 60
@@ -199,8 +203,12 @@ class PreparedRun:
             residual = whole.find_residuals(state)
             regions = map_errors(whole, residual, whole.find_places())
             return Shown(
-                view=self.stage.view(state, ladder, floor),
-                where=[region.sentence for region in pick_regions(regions, residual, whole.noise)],
+                view=self.stage.view(
+                    state,
+                    [read_result(step, results.Step) for step in ladder],
+                    None if floor is None else read_result(floor, results.Errors),
+                ),
+                where=[describe_region(one) for one in pick_regions(regions, residual, whole.noise)],
                 predict=partial(predict_at_from, comparison, state.effects_of(0), state.timing[0]),
                 apportion=partial(self.apportion, model),
             )

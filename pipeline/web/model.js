@@ -123,7 +123,7 @@ const buildNext = (pane) => {
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build)),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map(build))),
     missing.length > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, title: missing.join(", "), onclick: () => pane.addAll() }, `Add all ${missing.length} of the diagnosis`),
-    trial?.done && !next && h("p", { class: "nothing" }, tellNothing(session, diagnosis)),
+    trial?.done && !next && h("p", { class: isAtFloor(session) ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     undecided, rest, buildPlan(pane),
@@ -134,9 +134,9 @@ const buildRow = (pane, row, first) => {
   const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
   const isFormula = row.formula.length > 0;
   const words = isFormula ? row.formula.join("; ") : (row.sentence || row.about).split(CAUSE)[0];
-  const marks = [row.named && h("i", { class: "mark" }, isFormula ? "suggested by the diagnosis for what no effect explains" : "identified by the diagnosis, together with its other effects"),
+  const marks = [row.named && h("i", { class: "mark" }, isFormula ? "suggested by the diagnosis for what no effect explains" : row.about),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
-  return h("li", { class: first ? "first" : "", data: { effect: row.id }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
+  return h("li", { class: first ? "first" : "", data: { effect: row.id, ...(row.named && { named: "" }) }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
       first && h("span", { class: "quiet" }, "Next"),
       h("b", { title: row.sentence || row.about }, words), h("span", { class: "quiet id" }, row.id),
@@ -145,11 +145,16 @@ const buildRow = (pane, row, first) => {
     h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => (row.named && isFormula ? pane.addFound() : pane.add(row.id)) }, "Add"));
 };
 
+// The larger error in times the noise floor.
+const findRoom = (session) => (session.floor ? Math.max(...["t", "r"].map((key) => session.errors[key] / session.floor[key])) : Infinity);
+const isAtFloor = (session) => findRoom(session) < 1.5;
+
 const tellNothing = (session, diagnosis) => {
   if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is identified: the run is too short.";
-  const room = session.floor ? Math.max(...["t", "r"].map((key) => session.errors[key] / session.floor[key])) : Infinity;
-  if (room < 1.5) return "No effect is missing: the remaining error is at the noise floor.";
-  return "No further effect of the catalogue reduces the error. The residual may be noise, or an effect that you can write as a formula.";
+  const room = findRoom(session);
+  if (isAtFloor(session)) return "No effect is missing: the remaining error is at the noise floor.";
+  const remain = `${sayLength(session.errors.t)} and ${sayAngle(session.errors.r)} remain${Number.isFinite(room) ? `, ${room.toFixed(1)} times the noise floor` : ""}`;
+  return `${remain}. No further effect of the catalogue reduces the error: look at the residual, or write the effect as a formula.`;
 };
 
 // Chosen and said apart: with keys one passes every entry of a list.

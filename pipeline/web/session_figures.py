@@ -16,6 +16,7 @@ from pipeline.report.figures import Drawing, Figure, Section, list_figures, slip
 from pipeline.report.motion_view import MotionView
 from pipeline.report.scene import RunReport, Scene, break_lines
 from pipeline.report.theme import Channel, Chart, build_spec, layer, make_axis, pack_rows, share_rows, stack
+from pipeline.results import RunDiagnosis
 from pipeline.run.windows import HORIZON_S
 from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Manifest
@@ -330,8 +331,8 @@ class FigureCache:
         if source not in self._caps:
             self._caps[source] = Scene(RunReport(summary, self._tables)).modulus_cap
         tables = {**self._tables, "slip": self._leave(shown)} if "slip" in self._tables else self._tables
-        budget = [one.to_json() for one in shown.apportion(self._length)] if with_budget else []
-        report = RunReport(summary, tables, {"input": source, "budget": budget}, motion=shown.view)
+        budget = tuple(shown.apportion(self._length)) if with_budget else ()
+        report = RunReport(summary, tables, RunDiagnosis(input=source, budget=budget), motion=shown.view)
         ranked = rank_stretches(shown.view)
         return StretchScene(report, self._caps[source], ranked[stretch % len(ranked)] if ranked else None)
 

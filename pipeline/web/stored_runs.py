@@ -7,7 +7,7 @@ import re
 import secrets
 import shutil
 from collections.abc import AsyncIterator, Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +15,6 @@ import msgspec
 
 from pipeline.core import SlipError, naming_os_errors
 from pipeline.core.untrusted import mapping_in, objects_in, read_object, resolve_inside
-from pipeline.estimation.verdict import find_refusal
 from pipeline.job import INPUTS
 from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.job.run_results import (
@@ -26,6 +25,8 @@ from pipeline.job.run_results import (
     keep_diagnosis,
     read_recording,
 )
+from pipeline.results import RunDiagnosis, read_result
+from pipeline.results.reading import find_refusal, read_findings
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock
 from pipeline.web import Limits, WorkbenchError
@@ -67,7 +68,7 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
         "complete": log.get("complete") is True,
         "losses": _cut_all(log, "losses", ("kind", "text")),
         "findings": _cut_all(summary, "findings", ("id", "severity", "text")),
-        "refusal": _cut(find_refusal(summary)),
+        "refusal": _cut(find_refusal(read_findings(summary))),
         "report": "report.html" in manifest.files,
     }
 
@@ -164,18 +165,14 @@ def find_file(results: Path, run: str, name: str) -> Path:
     return locate_plan(results, run, name)
 
 
-def read_diagnosis(results: Path, manifest: Manifest) -> Mapping[str, object] | None:
-    """The stored diagnosis of a run; None if it has not been diagnosed."""
-    if DIAGNOSIS in manifest.files:
-        return read_json(manifest.path(DIAGNOSIS)) or None
-    return find_diagnosis(results, manifest)
-
-
-def find_formula(diagnosis: Mapping[str, object] | None) -> str | None:
-    """The formula for the residual that no effect explains, as text of a model file; None without one."""
-    unexplained = mapping_in(diagnosis or {}, "unexplained")
-    formula = unexplained.get("formula")
-    return formula if isinstance(formula, str) and formula else None
+def read_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
+    """The stored diagnosis of a run; None if it has not been diagnosed, or if that cannot be read."""
+    if DIAGNOSIS not in manifest.files:
+        return find_diagnosis(results, manifest)
+    content = read_json(manifest.path(DIAGNOSIS))
+    with suppress(msgspec.ValidationError):
+        return read_result(content, RunDiagnosis) if content else None
+    return None
 
 
 def write_diagnosis(results: Path, manifest: Manifest) -> None:

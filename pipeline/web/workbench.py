@@ -2,7 +2,7 @@
 
 import threading
 from collections import OrderedDict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,10 +10,10 @@ from pathlib import Path
 from pipeline.core import SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
-from pipeline.estimation.verdict import find_refusal
 from pipeline.models import Effect, Model, write_model
 from pipeline.models.formula import FormulaEffect
-from pipeline.report.motion_view import read_model_text
+from pipeline.results import RunDiagnosis
+from pipeline.results.reading import find_refusal, read_findings, read_model
 from pipeline.store import Manifest, Store
 from pipeline.store.files import make_folder
 from pipeline.web import Ask, WorkbenchError, evaluating
@@ -32,13 +32,13 @@ from pipeline.web.session import (
 )
 from pipeline.web.session_figures import FigureCache
 from pipeline.web.stored_runs import (
-    find_formula,
     find_plan,
     find_run,
     read_diagnosis,
     read_summary,
     summarize_run,
 )
+from pipeline.words.objects import diagnosis_as_json
 
 _MOST_KEPT = 40
 _FITS = frozenset({"add", "add_named", "add_found", "formula", "drop", "fit", "try"})
@@ -175,13 +175,13 @@ def show_addition(addition: Addition, before: Errors, model: Model) -> dict[str,
     }
 
 
-def rank_offers(editor: Editor, diagnosis: Mapping[str, object] | None) -> list[dict[str, object]]:
+def rank_offers(editor: Editor, diagnosis: RunDiagnosis | None) -> list[dict[str, object]]:
     """What the diagnosis of a run has beyond a session, as JSON, the largest gain first.
 
     These are its effects and the formula that it suggests, each with the errors of the model once it is in.
     """
     prepared, step = editor.prepared, editor.session.step
-    file = None if diagnosis is None else read_model_text(diagnosis)
+    file = None if diagnosis is None else read_model(diagnosis)
     intervals = {} if file is None else file.intervals
     missing = (one for one in editor.diagnosed if one.id not in step.order)
     sound = Model(prepared.vehicle, tuple(one for one in missing if explain_refusal(one, intervals) is None))
@@ -286,7 +286,7 @@ class Sessions:
 
     def _change(self, file: SessionFile, prepared: PreparedRun, session: Session, ask: Ask) -> Session:
         editor = self._edit(file, prepared, session)
-        if ask.action in _FITS and (refusal := find_refusal(read_summary(prepared.manifest))):
+        if ask.action in _FITS and (refusal := find_refusal(read_findings(read_summary(prepared.manifest)))):
             hint = "No fit to it has a meaning: open another run."
             raise WorkbenchError("no_fit", refusal, where=ask.run, hint=hint)
 
@@ -313,7 +313,8 @@ class Sessions:
     def _edit(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Editor:
         """The operations on a session, with what the diagnosis of its run found."""
         diagnosis = read_diagnosis(self.results, prepared.manifest)
-        text = find_formula(diagnosis)
+        rest = None if diagnosis is None else diagnosis.unexplained
+        text = None if rest is None else rest.formula
         formula = () if text is None else file.parse(format_step(Model(prepared.vehicle), {}) + text).model
         return Editor(file, prepared, session, (*_list_named(diagnosis), *formula))
 
@@ -374,7 +375,7 @@ class Sessions:
             "run": summarize_run(prepared.manifest),
             "inputs": self._cache.list_inputs(prepared.manifest),
             "catalogue": list_catalogue(prepared.vehicle),
-            "diagnosis": diagnosis,
+            "diagnosis": None if diagnosis is None else diagnosis_as_json(diagnosis),
             "named": rank_offers(editor, diagnosis),
             "missing": [effect.id for effect in _list_missing(diagnosis, session)],
             "plan": find_plan(self.results, prepared.manifest),
@@ -407,12 +408,12 @@ def _view(file: SessionFile, prepared: PreparedRun, session: Session) -> Shown:
     return prepared.show(model, step.timing, step.ladder, session.floor or None)
 
 
-def _list_missing(diagnosis: Mapping[str, object] | None, session: Session) -> list[Effect]:
+def _list_missing(diagnosis: RunDiagnosis | None, session: Session) -> list[Effect]:
     """Effects of a run's diagnosis that the session's model lacks."""
     return [one for one in _list_named(diagnosis) if one.id not in session.step.order]
 
 
-def _list_named(diagnosis: Mapping[str, object] | None) -> list[Effect]:
+def _list_named(diagnosis: RunDiagnosis | None) -> list[Effect]:
     """Effects of a run's diagnosis, with their values."""
-    named = None if diagnosis is None else read_model_text(diagnosis)
+    named = None if diagnosis is None else read_model(diagnosis)
     return [] if named is None else list(named.model)

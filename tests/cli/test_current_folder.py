@@ -106,12 +106,13 @@ sys.path.pop(0)
 import json
 from pathlib import Path
 from pipeline.store import Store
+from pipeline.words.objects import diagnosis_as_json
 from pipeline.web.stored_runs import read_diagnosis, write_diagnosis
 results = Path("results")
 (name,) = Store(results).runs()
 manifest = Store(results).manifest(name)
 write_diagnosis(results, manifest)
-print(json.dumps(read_diagnosis(results, manifest)))
+print(json.dumps(diagnosis_as_json(read_diagnosis(results, manifest))))
 """
     said = run_in(trap, [sys.executable, "-c", program])
     assert json.loads(said)

@@ -22,6 +22,7 @@ from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Timing, find_effect
 from pipeline.simulate import Disturbance, Encoders, Program, simulate_run
 from pipeline.simulate.programs import Commands
+from pipeline.words.effects import describe_separation
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -120,9 +121,9 @@ def test_of_two_effects_that_do_the_same_both_are_reported() -> None:
     (group,) = find_undecided(made, found)
     assert chosen in group.candidates
     assert {"effective_track", "wheel_radius"} <= set(group.candidates)
-    assert group.separate_by
+    assert describe_separation(group)
     for name in ("effective_track", "wheel_radius"):
-        (value,) = group.numbers[name].values()
+        (value,) = group.parameters[name].values()
         expected = 1.3 if name == "effective_track" else 1.0 / 1.3
         assert value.low < expected < value.high
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+from msgspec.structs import astuple
 
 from pipeline.core import NORMAL_95
 from pipeline.estimation import (
@@ -20,7 +21,6 @@ from pipeline.estimation import (
     diagnose_runs,
     load_recording,
 )
-from pipeline.estimation.diagnosis_lines import describe, list_lines
 from pipeline.estimation.estimates import expect_another_run, list_values
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
@@ -31,6 +31,8 @@ from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect
+from pipeline.results import Errors, read_result, to_json
+from pipeline.results.reading import read_model as read_proposed
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -46,6 +48,10 @@ from pipeline.simulate import (
     Recording as Recorded,
 )
 from pipeline.sources import Vehicle, find_preset
+from pipeline.words.diagnosis import describe, list_lines
+from pipeline.words.effects import describe_separation, list_readings, suggest_drive
+from pipeline.words.errors import describe_structure
+from pipeline.words.objects import diagnosis_as_json
 
 _SCENE = Scenario(
     duration_s=120.0, seed=7, disturbance=Disturbance(0.02, 0.03), pose=PoseSensor(drift_m=0.005)
@@ -88,10 +94,10 @@ def test_what_a_planner_would_not_feel_has_no_name(tmp_path: Path) -> None:
     diagnosis = _diagnose(quiet, tmp_path, inputs=("measured",))
     found = diagnosis.runs[0]
     assert [effect.id for effect in found.effects] == ["effective_track"]
-    assert all("icr_offset" not in str(rung["effects"]) for rung in found.ladder)
-    (run,) = diagnosis.to_json()
+    assert all("icr_offset" not in rung.effects for rung in found.ladder)
+    run = diagnosis_as_json(diagnosis.runs[0])
     assert "icr_offset" not in str(run["model"])
-    assert "icr_offset" not in describe(diagnosis)
+    assert "icr_offset" not in describe(diagnosis.runs)
 
 
 _CAR = replace(
@@ -132,13 +138,13 @@ def test_wheels_that_spin_by_almost_half_are_small_or_slip_on_this_ground(
     spinning = replace(_SCENE, effects={"wheel_radius": 0.6}, duration_s=60.0)
     found = _diagnose(spinning, tmp_path, inputs=("measured",)).runs[0]
     assert [effect.id for effect in found.effects] == ["wheel_radius"]
-    assert {one.name for one in found.effects[0].readings} == {"wheel_radius", "longitudinal_slip"}
+    assert {one.name for one in list_readings(found.effects[0])} == {"wheel_radius", "longitudinal_slip"}
 
 
 def test_the_ladder_falls_on_data_that_no_rung_has_seen(skidding: Diagnosis) -> None:
-    errors = [rung["t_mrmse_m"] for rung in skidding.runs[0].ladder]
+    errors = [rung.t_mrmse_m for rung in skidding.runs[0].ladder]
     assert len(errors) == 3
-    assert errors == sorted(errors, reverse=True)  # type: ignore[type-var]
+    assert errors == sorted(errors, reverse=True)
     assert skidding.runs[0].explained_share > 0.9
 
 
@@ -157,16 +163,16 @@ def test_an_old_heading_is_found_against_the_gyro_and_rated_with_the_position_as
     assert named.id == "heading_skew"
     assert named.parameters["d"].value == pytest.approx(0.1, abs=0.02)
     # The heading that is compared is the gyro's: what falls is the error of the position.
-    assert run.ladder[-1]["t_mrmse_m"] < 0.9 * run.ladder[0]["t_mrmse_m"]  # type: ignore[operator]
+    assert run.ladder[-1].t_mrmse_m < 0.9 * run.ladder[0].t_mrmse_m
 
 
 def test_driven_straight_only_turning_is_said_to_be_unobservable(tmp_path: Path) -> None:
     scenario = replace(_SCENE, effects={"effective_track": 1.8}, program=Program("straight"))
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
-    hidden = {item.id: item for item in run.unobservable}
+    hidden = run.unobservable_why
     assert "effective_track" in hidden
-    assert "turn" in hidden["effective_track"].manoeuvre
+    assert "turn" in suggest_drive("effective_track")
 
 
 def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None:
@@ -174,19 +180,20 @@ def test_one_circle_leaves_it_undecided_with_a_manoeuvre(tmp_path: Path) -> None
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
     assert "turning_resistance" in run.undecided[0].candidates
-    assert run.undecided[0].separate_by
+    assert describe_separation(run.undecided[0])
     # In the place of the others it is known.
-    known = run.undecided[0].numbers["turning_resistance"]["k"]
+    known = run.undecided[0].parameters["turning_resistance"]["k"]
     assert known.low < 0.2 < known.high
-    lines = [" ".join(text.split()) for _, text in list_lines(run)]
+    lines = [" ".join(text.split()) for _, text in list_lines(run, everything=True)]
     assert any(line.startswith("turning_resistance k = 0.2") for line in lines)
     assert "This log does not decide between" in lines[0]
     assert "turning resistance" in lines[0]
-    held = run.find_held(run.undecided[0])
-    assert run.proposal is not None
-    write_model(run.proposal, tmp_path / "model.toml")
+    held = run.undecided[0].in_model
+    proposal = read_proposed(run)
+    assert proposal is not None
+    write_model(proposal, tmp_path / "model.toml")
     assert read_model(tmp_path / "model.toml").undecided == [list(run.undecided[0].candidates)]
-    assert held in run.proposal.model.ids
+    assert held in proposal.model.ids
     assert [line.split()[0] for line in lines if line.endswith("(in the model)")] == [held]
     assert any(line.startswith("to separate them: ") for line in lines)
 
@@ -195,8 +202,8 @@ def test_a_vehicle_that_does_not_move_gets_no_name(tmp_path: Path) -> None:
     scenario = replace(_SCENE, effects={"wheel_radius": 0.0}, disturbance=Disturbance())
     (run,) = _diagnose(scenario, tmp_path).runs
     assert run.effects == ()
-    assert "not_moving" in {finding["id"] for finding in run.findings}
-    told = describe(Diagnosis((run,)))
+    assert "not_moving" in {finding.id for finding in run.findings}
+    told = describe([run])
     assert "No effect can be estimated." in told
     assert told.lower().count("the vehicle does not move") == 1
 
@@ -208,26 +215,28 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
         return (-0.3 * state.v0 if state.v0 < 0.0 else 0.0), 0.0, 0.0
 
     recording, vehicle = _record(replace(_SCENE, extra=slip_in_reverse), tmp_path)
-    (run,) = diagnose_runs([recording], vehicle).runs
+    diagnosis = diagnose_runs([recording], vehicle)
+    (run,) = diagnosis.runs
     left = run.unexplained
     assert left is not None
     assert left.channel == "x"
     assert left.formula is not None
     # The model that is written is the model of the ladder, without the formula.
-    assert run.proposal is not None
-    assert list(run.proposal.model.ids) == run.ladder[-1]["effects"]
-    assert not any(isinstance(effect, FormulaEffect) for effect in run.proposal.model)
+    proposal = diagnosis.proposal
+    assert proposal is not None
+    assert proposal.model.ids == run.ladder[-1].effects
+    assert not any(isinstance(effect, FormulaEffect) for effect in proposal.model)
     model = tmp_path / "model.toml"
     model.write_text(f'format = 1\n[vehicle]\npreset = "husky_a200"\n\n{left.formula}', encoding="utf-8")
     formula = read_model(model).model
     assert formula.ids == ("unexplained",)
     # What it is said to bring is what the model has with it.
     problem = Problem([load_recording(recording, vehicle)], vehicle, Input(run.input))
-    whole = judge_whole(problem, run.proposal.model + formula.effect("unexplained"))
-    assert left.reached == errors_as_json(whole.errors)
-    before, after = (one["velocity_rms"][0] for one in (run.ladder[-1], left.reached))  # type: ignore[index]
+    whole = judge_whole(problem, proposal.model + formula.effect("unexplained"))
+    assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
+    before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]
-    assert "would remain over 2 s" in describe(Diagnosis((run,)))
+    assert "would remain over 2 s" in describe([run])
 
 
 @pytest.mark.long
@@ -238,9 +247,9 @@ def test_motion_that_lasts_is_unexplained_though_nothing_recorded_tells_of_it(tm
     left = run.unexplained
     assert left is not None
     assert "w" in left.channels
-    assert "no term that was tried predicts it" in left.where
+    assert "no term that was tried predicts it" in describe_structure(left)
     assert left.formula is None
-    assert run.noise_floor["velocity_rms"][2] < 0.5 * run.ladder[-1]["velocity_rms"][2]  # type: ignore[index, operator]
+    assert run.noise_floor.velocity_rms[2] < 0.5 * run.ladder[-1].velocity_rms[2]
 
 
 def test_an_encoder_that_reads_too_little_is_named_though_commands_do_not_show_it(
@@ -288,9 +297,9 @@ def test_a_diagnosis_is_the_same_each_time_on_one_core_or_more(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recording, vehicle = _record(replace(_SCENE, effects={"lateral_skid": 0.1}), tmp_path)
-    first = diagnose_runs([recording], vehicle).to_json()
+    first = [to_json(one) for one in diagnose_runs([recording], vehicle).runs]
     monkeypatch.setattr("os.sched_getaffinity", lambda _: {0}, raising=False)
-    assert diagnose_runs([recording], vehicle).to_json() == first
+    assert [to_json(one) for one in diagnose_runs([recording], vehicle).runs] == first
 
 
 @pytest.mark.long
@@ -306,12 +315,12 @@ def test_two_lags_that_have_become_one_make_room_for_what_set_them_apart(tmp_pat
 
 def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not_at_all() -> None:
     track = find_effect("effective_track")().parameter("k")
-    low, high = expect_another_run(track, 1.8, 1.78, 1.83)
+    low, high = astuple(expect_another_run(track, 1.8, 1.78, 1.83))
     assert low == pytest.approx(1.8 - np.hypot(0.02, NORMAL_95 * 2.0**0.5 * track.spread.size))
     assert high == pytest.approx(1.8 + np.hypot(0.03, NORMAL_95 * 2.0**0.5 * track.spread.size))
     lag = find_effect("drive_lag")().parameter("tau")
-    assert expect_another_run(lag, 0.1, 0.09, 0.11)[0] == lag.bounds[0]
-    assert not np.isfinite(expect_another_run(track, 1.8, math.nan, math.nan)).any()
+    assert expect_another_run(lag, 0.1, 0.09, 0.11).low == lag.bounds[0]
+    assert not np.isfinite(astuple(expect_another_run(track, 1.8, math.nan, math.nan))).any()
     for effect, is_known in (
         (find_effect("effective_track")(k=1.8), True),
         (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),
@@ -320,4 +329,4 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         items = [Estimate(one, 0.75, 0.15, 0.07, at_bound=False, observable=True) for one in free]
         values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())
-        assert all(np.isfinite(value.another_run).all() == is_known for value in values.values())
+        assert all(np.isfinite(astuple(value.another_run)).all() == is_known for value in values.values())

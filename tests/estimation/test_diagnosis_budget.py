@@ -11,12 +11,12 @@ import pytest
 from pipeline.core.compute import usual_budget
 from pipeline.estimation import diagnose_runs, parse_budget
 from pipeline.estimation.context import DiagnosisError
-from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.floor import estimate_floor
-from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
+from pipeline.words.diagnosis import describe
+from pipeline.words.verdict import format_verdict
 
 SAMPLE = Path(__file__).parents[2] / "data_samples" / "husky_tile.mcap"
 
@@ -28,11 +28,11 @@ def test_a_search_that_is_cut_says_so_and_gives_the_best_answer_so_far(tmp_path:
     cut = diagnose_runs([recording], vehicle, budget_s=0.0, notify=told.append).runs[0]
     whole = diagnose_runs([recording], vehicle, notify=told.append).runs[0]
 
-    assert [finding["id"] for finding in cut.findings].count("search_cut") == 1
-    verdict = format_verdict(cut.to_json())
+    assert [finding.id for finding in cut.findings].count("search_cut") == 1
+    verdict = format_verdict(cut)
     assert "budget ended the search" in verdict
     assert "o known effect" not in verdict
-    assert "search_cut" not in [finding["id"] for finding in whole.findings]
+    assert "search_cut" not in [finding.id for finding in whole.findings]
     assert len(cut.effects) < len(whole.effects)
     assert cut.ladder[-1]["t_mrmse_m"] <= cut.ladder[0]["t_mrmse_m"]
     assert cut.ladder[0] == whole.ladder[0]
@@ -66,5 +66,5 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
     (run,) = diagnosis.runs
     assert run.noise_floor["t_mrmse_m"] == 0.0
     assert run.effects
-    text = describe(diagnosis, everything=True)
+    text = describe(diagnosis.runs, everything=True)
     assert not {"inf", "nan"} & set(re.findall(r"[a-z]+", text))

@@ -8,23 +8,16 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.estimation import (
-    Comparison,
-    Errors,
-    Input,
-    Problem,
-    RunDiagnosis,
-    diagnose_runs,
-    fit_model,
-    load_recording,
-)
+from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.plausibility import find_implausible
-from pipeline.estimation.verdict import format_verdict
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import Model, Timing, find_effect
+from pipeline.results import RunDiagnosis
+from pipeline.results.reading import read_model
+from pipeline.words.verdict import format_verdict
 
 if TYPE_CHECKING:
     from pipeline.run import MotionRun
@@ -131,7 +124,7 @@ def test_every_recording_is_looked_at() -> None:
 
 @pytest.mark.parametrize("name", sorted(_FAULTS))
 def test_known_faults_are_found_and_said(asked: Asked, name: str) -> None:
-    found = {finding["id"] for finding in asked.diagnose(name, "measured").findings}
+    found = {finding.id for finding in asked.diagnose(name, "measured").findings}
     assert _FAULTS[name] <= found
 
 
@@ -147,7 +140,7 @@ def test_nothing_is_named_of_a_vehicle_that_stands(asked: Asked, name: str, sour
 
 def test_a_drivetrain_that_half_a_minute_shows_is_explained_from_commands(asked: Asked) -> None:
     rungs = asked.diagnose("warthog_wheels_asphalt_2024_9_20_8h13s12", "command").ladder
-    assert rungs[-1]["t_mrmse_m"] < 0.5 * rungs[0]["t_mrmse_m"]
+    assert rungs[-1].t_mrmse_m < 0.5 * rungs[0].t_mrmse_m
 
 
 @pytest.mark.parametrize("name", _DRIVEN)
@@ -159,10 +152,11 @@ def test_what_is_named_is_what_a_vehicle_can_do(asked: Asked, name: str, source:
         values = {key: value.value for key, value in effect.parameters.items()}
         assert find_implausible(find_effect(effect.id)().change(**values)) is None
     considered = {name for item in run.undecided for name in item.candidates}
-    assert set(run.ladder[-1]["effects"]) <= {*named, *considered}
+    assert set(run.ladder[-1].effects) <= {*named, *considered}
     # Contact friction contains the track, and the model has either where the log does not decide.
-    assert run.proposal is not None
-    (has_track,) = (e for e in run.proposal.model.effects if e.id in {"contact_friction", "effective_track"})
+    proposal = read_model(run)
+    assert proposal is not None
+    (has_track,) = (e for e in proposal.model.effects if e.id in {"contact_friction", "effective_track"})
     track = has_track.values["k"]
     assert 1.5 < track < (2.7 if name == "husky_snow_boreal" else 2.1)
 
@@ -172,9 +166,10 @@ def test_the_error_falls_as_far_as_it_can(asked: Asked, name: str) -> None:
     run = asked.diagnose(name, "measured")
     last, recorded = run.ladder[-1], asked.measure_as_recorded(name)
     position, yaw = _LEFT[name]
-    assert last["t_mrmse_m"] < position * recorded.t_mrmse_m  # type: ignore[operator]
-    assert last["r_mrmse_rad"] < yaw * recorded.r_mrmse_rad  # type: ignore[operator]
-    assert run.noise_floor["t_mrmse_m"] < 1.2 * last["t_mrmse_m"]  # type: ignore[operator]
+    assert last.t_mrmse_m < position * recorded.t_mrmse_m
+    assert last.r_mrmse_rad < yaw * recorded.r_mrmse_rad
+    assert run.noise_floor is not None
+    assert run.noise_floor.t_mrmse_m < 1.2 * last.t_mrmse_m
 
 
 @pytest.mark.parametrize("names", [_ASPHALT, _GRASS, _GRAVEL])
@@ -193,7 +188,7 @@ def test_runs_of_one_vehicle_on_one_ground_agree(asked: Asked, names: tuple[str,
 def test_on_ice_the_rest_is_said_to_be_unexplained(asked: Asked, source: str) -> None:
     """What is left lasts for a second (correlation .25 to .33), too little to call it a structure."""
     run = asked.diagnose("warthog_wheels_ice_2024_7_30_16h30s21", source)
-    verdict = format_verdict(run.to_json())
+    verdict = format_verdict(run)
     assert "times the noise floor" in verdict
     assert "no known effect explains the rest" in verdict.casefold()
     assert run.explained_share < 0.9
@@ -214,7 +209,7 @@ def test_the_servo_of_the_warthog_explains_its_turning(asked: Asked) -> None:
     assert 0.7 < named["wheel_servo"].parameters["scrub"].value < 1.6
     # Half-second means of the raw encoders under commands beyond it are 13.0 to 13.5 rad/s.
     assert 12.5 < named["wheel_speed_limit"].parameters["limit"].value < 13.5
-    assert run.ladder[-1]["r_mrmse_rad"] < 0.12 * run.ladder[0]["r_mrmse_rad"]  # type: ignore[operator]
+    assert run.ladder[-1].r_mrmse_rad < 0.12 * run.ladder[0].r_mrmse_rad
 
 
 def test_the_left_motor_of_the_warthog_is_weaker(asked: Asked) -> None:
@@ -222,7 +217,7 @@ def test_the_left_motor_of_the_warthog_is_weaker(asked: Asked) -> None:
     run = asked.diagnose("warthog_wheels_asphalt", "command")
     named = {effect.id: effect for effect in run.effects}
     assert 0.07 < named["motor_imbalance"].parameters["e"].value < 0.13
-    assert run.ladder[-1]["r_mrmse_rad"] < 0.08  # type: ignore[operator] # .111 without it
+    assert run.ladder[-1].r_mrmse_rad < 0.08  # .111 without it
 
 
 @pytest.mark.parametrize("source", ["command", "measured"])

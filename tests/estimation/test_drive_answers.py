@@ -27,7 +27,7 @@ from pipeline.simulate import (
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.estimation import RunDiagnosis
+    from pipeline.results import RunDiagnosis
 
 _GAINS = {
     "drive_gain": {"g": 0.9},

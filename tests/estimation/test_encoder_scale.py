@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from pipeline.estimation import diagnose_runs
-from pipeline.estimation.diagnosis import RunDiagnosis
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
+from pipeline.results import RunDiagnosis
 from pipeline.simulate import make_scenario, simulate_run, write_log
 
 
@@ -47,19 +47,19 @@ def test_encoders_that_misread_are_named_with_the_line_that_mends_them(reads: fl
     assert list_ids(judged) == {"drive_lag", "effective_track"}
     (track,) = (one for one in judged.effects if one.id == "effective_track")
     assert track.parameters["k"].value == pytest.approx(1.3, rel=0.01)
-    (found,) = (one for one in judged.findings if one["id"] == "encoder_scale")
-    assert found["value"] == pytest.approx(reads, rel=2e-3)
-    assert f"{'5 % low' if reads < 1.0 else '8 % high'}" in str(found["text"])
-    line = str(found["text"]).split("; ")[1].split(" under")[0]
+    (found,) = (one for one in judged.findings if one.id == "encoder_scale")
+    assert found.value == pytest.approx(reads, rel=2e-3)
+    assert f"{'5 % low' if reads < 1.0 else '8 % high'}" in found.text
+    line = found.text.split("; ")[1].split(" under")[0]
     mended = judge(tmp_path, {"effective_track": 1.3}, reads, f"[wheels]\n{line}\n")
     assert list_ids(mended) == {"drive_lag", "effective_track"}
-    assert "encoder_scale" not in {one["id"] for one in mended.findings}
+    assert "encoder_scale" not in {one.id for one in mended.findings}
 
 
 def test_a_radius_and_a_gain_that_do_not_undo_each_other_are_both_named(tmp_path: Path) -> None:
     judged = judge(tmp_path, {"wheel_radius": 1.05, "drive_gain": 0.9}, 1.0)
     assert list_ids(judged) == {"drive_lag", "wheel_radius", "drive_gain"}
-    assert "encoder_scale" not in {one["id"] for one in judged.findings}
+    assert "encoder_scale" not in {one.id for one in judged.findings}
 
 
 def test_a_radius_alone_is_named(tmp_path: Path) -> None:
@@ -70,8 +70,8 @@ def test_a_coincidence_is_said_and_can_be_claimed(tmp_path: Path) -> None:
     """No signal tells wheels of another radius behind a gain that undoes it from encoders that misread."""
     effects = {"wheel_radius": 1.0 / 0.95, "drive_gain": 0.95}
     judged = judge(tmp_path, effects, 1.0)
-    (found,) = (one for one in judged.findings if one["id"] == "encoder_scale")
-    assert "another radius and the drive has that gain by coincidence, scale = 1" in str(found["text"])
+    (found,) = (one for one in judged.findings if one.id == "encoder_scale")
+    assert "another radius and the drive has that gain by coincidence, scale = 1" in found.text
     claimed = judge(tmp_path, effects, 1.0, "[wheels]\nscale = 1\n")
     assert list_ids(claimed) == {"drive_lag", "wheel_radius", "drive_gain"}
-    assert "encoder_scale" not in {one["id"] for one in claimed.findings}
+    assert "encoder_scale" not in {one.id for one in claimed.findings}

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from test_diagnosis import _SCENE, _diagnose
 
-from pipeline.estimation.error_regions import Region, _expect_square, _list_responses, pick_regions
+from pipeline.estimation.error_regions import _expect_square, _list_responses, pick_regions
+from pipeline.results import Region
+from pipeline.words.errors import name_region
 
 _NOISE = np.full(3, 1e-3)
 
@@ -35,7 +37,7 @@ def test_a_wet_patch_is_a_place(tmp_path: Path) -> None:
     found = _find_circumstances(patch, 1, tmp_path)
     assert {region.kind for region in found} == {"time", "place"}
     assert all(region.share > 1.5 * region.expected for region in found)
-    assert found[0].text.startswith("where ")
+    assert name_region(found[0]).startswith("where ")
 
 
 def test_what_a_region_holds_is_compared_with_the_same_commands_elsewhere() -> None:
@@ -71,5 +73,5 @@ def test_a_region_counts_beyond_what_is_no_matter_of_it(
     kind: str, share: float, expected: float, *, counts: bool
 ) -> None:
     time_share = {"place": 0.5, "time": 0.2}.get(kind, expected)
-    region = Region("x", kind, "there", share, time_share, 0.1, expected)
+    region = Region("x", kind, "turning", (1.0,), share, time_share, 0.1, expected)
     assert (pick_regions([region], np.ones((4, 3)), _NOISE) == [region]) == counts

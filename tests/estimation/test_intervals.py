@@ -11,10 +11,11 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Estimates, Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.estimation.ambiguity import DETECTED, DETECTED_SHARE, _find_detectable
+from pipeline.estimation.ambiguity import DETECTED, _find_detectable
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.fit import invert
 from pipeline.models import Model, find_effect
+from pipeline.results.reading import DETECTED_SHARE
 from pipeline.simulate import Disturbance, Program
 
 if TYPE_CHECKING:

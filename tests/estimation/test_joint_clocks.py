@@ -11,13 +11,12 @@ from typing import TYPE_CHECKING
 import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.ladder import judge_model
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
+from pipeline.results import Value
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -27,6 +26,9 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
+from pipeline.words.diagnosis import describe
+from pipeline.words.effects import format_value
+from pipeline.words.objects import diagnosis_as_json
 
 if TYPE_CHECKING:
     from pipeline.run import MotionRun
@@ -66,9 +68,9 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
     layout: str, effects: dict[str, float], tmp_path: Path
 ) -> None:
     diagnosis, runs, vehicle = _diagnose(layout, effects, tmp_path)
-    screen = describe(diagnosis)
+    screen = describe(diagnosis.runs)
     for run, late in zip(diagnosis.runs, _CLOCKS, strict=True):
-        told = json.loads(json.dumps(run.to_json()))
+        told = json.loads(json.dumps(diagnosis_as_json(run)))
         named = {effect["id"]: effect["parameters"] for effect in told["effects"]}
         assert set(named) == {*effects, "clock_offset"}
         clock = named["clock_offset"]["d"]
@@ -77,7 +79,7 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
         assert told["timing"]["pose_delay_s"] == pytest.approx(clock["value"], abs=1e-4)
         # A value has the digits that its interval supports.
         value, low, high = (clock[name] for name in ("value", "low", "high"))
-        assert f"d = {Value(value, low, high, 's')} in {run.run}" in screen
+        assert f"d = {format_value(Value(value, low, high, 's'))} in {run.run}" in screen
     for name, value in effects.items():
         (number,) = named[name].values()
         assert number["low"] < value < number["high"]
@@ -85,7 +87,7 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
         assert name in confused["clock_offset"]
         assert "clock_offset" in confused[name]
 
-    proposal = diagnosis.runs[0].proposal
+    proposal = diagnosis.proposal
     assert proposal is not None
     path = tmp_path / "model.toml"
     write_model(proposal, path)

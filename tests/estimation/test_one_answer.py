@@ -13,8 +13,6 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
-from pipeline.estimation.diagnosis import Value
-from pipeline.estimation.diagnosis_lines import describe
 from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_model, ladder_as_json
@@ -22,13 +20,18 @@ from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
-from pipeline.report.motion_view import read_model_text, view_diagnosis
+from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
 from pipeline.report.sections_why import format_remaining
+from pipeline.results import RunDiagnosis, Value, read_result
+from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.simulate import simulate_case
 from pipeline.web.actions import Editor, RunCache, open_session
 from pipeline.web.session import SessionFile
+from pipeline.words.diagnosis import describe
+from pipeline.words.effects import format_value
+from pipeline.words.objects import diagnosis_as_json
 
 if TYPE_CHECKING:
     from pipeline.models import ModelFile
@@ -69,37 +72,37 @@ def compare_everywhere(log: Path, source: Input, results: Path, tmp_path: Path) 
     before = hash_results(results)
     vehicle, recording = read_recording(manifest)
     diagnosis = diagnose_runs([recording], vehicle, inputs=(source.value,))
-    told = json.loads(json.dumps(diagnosis.runs[0].to_json()))
-    proposal = diagnosis.runs[0].proposal
+    told = json.loads(json.dumps(diagnosis_as_json(diagnosis.runs[0])))
+    proposal = diagnosis.proposal
     if proposal is None:
         assert not told["effects"]
         return
     path = tmp_path / "model.toml"
     write_model(proposal, path)
     file = read_model(path)
-    check_written(told, file, describe(diagnosis, everything=True))
-    check_page(told, describe(diagnosis))
+    check_written(told, file, describe(diagnosis.runs, everything=True))
+    check_page(told, describe(diagnosis.runs), describe(diagnosis.runs, everything=True))
     own = check_model_verbs(
         told, file, Problem([load_recording(recording, vehicle)], file.model.vehicle, source)
     )
     require_no_rise(told["ladder"])
     if file.model.effects:
         check_workbench(told, file, own, manifest, SessionFile(tmp_path, manifest.run, "a"))
-        view = view_diagnosis(recording.tables, vehicle, told)
+        view = view_diagnosis(recording.tables, vehicle, diagnosis.runs[0])
         assert view is not None
         assert set(view.effects) == set(file.model.ids)
-        assert view.ladder == told["ladder"]
+        assert view.ladder == diagnosis.runs[0].ladder
     assert hash_results(results) == before
 
 
-def check_page(told: Json, screen: str) -> None:
+def check_page(told: Json, screen: str, everything: str) -> None:
     """The report counts the smaller effects as the screen does, and says the same of what remains."""
-    report = RunReport({"run": told["run"]}, diagnosis=told)
-    page, shown = render_report(report), " ".join(screen.split())
+    report = RunReport({"run": told["run"]}, diagnosis=read_result(told, RunDiagnosis))
+    page, shown, whole = render_report(report), *(" ".join(text.split()) for text in (screen, everything))
     assert re.findall(r"and (\d+) smaller effect", page) == re.findall(r"(\d+) smaller effect", shown)
     remaining = format_remaining(report)
     assert remaining in page
-    assert remaining.replace("remaining error ", "remaining ") in shown
+    assert remaining.replace("remaining error ", "remaining ") in whole
 
 
 def list_numbers(told: Json) -> list[tuple[str, str, Json]]:
@@ -114,7 +117,7 @@ def list_numbers(told: Json) -> list[tuple[str, str, Json]]:
 
 def check_written(told: Json, file: ModelFile, screen: str) -> None:
     """What is written, and what is on the screen, is what was said."""
-    assert read_model_text(told) == file
+    assert read_diagnosed_model(read_result(told, RunDiagnosis)) == file
     found = {effect["id"] for effect in told["effects"] if not effect["corrected"]}
     found |= {item["in_model"] for item in told["undecided"] if item["in_model"] is not None}
     assert set(file.model.ids) == found
@@ -128,7 +131,7 @@ def check_written(told: Json, file: ModelFile, screen: str) -> None:
     for effect, name, number in list_numbers(told):
         assert same(file.model.effect(effect).values[name], number["value"])
         low, high = (math.nan if number[end] is None else number[end] for end in ("low", "high"))
-        shown = re.escape(str(Value(number["value"], low, high, "1")).split()[0])
+        shown = re.escape(format_value(Value(number["value"], low, high, "1")).split()[0])
         assert re.search(rf"{name} = {shown}(?![\d.])", screen), (effect, name)
 
 

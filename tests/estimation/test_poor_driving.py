@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.estimation import Recording, RunDiagnosis, diagnose_runs
+from pipeline.estimation import Recording, diagnose_runs
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
+from pipeline.results import RunDiagnosis
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,
@@ -69,7 +70,7 @@ def test_a_change_of_ground_on_a_straight_is_a_change_of_speed(tmp_path: Path) -
 def test_what_shows_but_once_cannot_be_told(tmp_path: Path) -> None:
     found = _drive("circle", {"steering_lag": 0.4}, tmp_path, vehicle="car")
     assert not found.effects
-    assert "steering_lag" in {item.id for item in found.unobservable}
+    assert "steering_lag" in found.unobservable_why
 
 
 def test_straight_only_does_not_tell_one_lag_from_two(tmp_path: Path) -> None:
@@ -81,7 +82,7 @@ def test_straight_only_does_not_tell_one_lag_from_two(tmp_path: Path) -> None:
 def test_encoders_split_no_hairs_between_what_one_circle_makes_alike(tmp_path: Path) -> None:
     found = _drive("circle", {"steering_gain": 0.85}, tmp_path, vehicle="car")
     assert not found.effects
-    told = {name for item in found.undecided for name in item.candidates} | {u.id for u in found.unobservable}
+    told = {name for item in found.undecided for name in item.candidates} | found.unobservable_why.keys()
     assert "steering_gain" in told
 
 

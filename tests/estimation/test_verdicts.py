@@ -7,9 +7,11 @@ from pathlib import Path
 
 from test_diagnosis import _SCENE, _diagnose
 
-from pipeline.estimation.diagnosis_lines import describe
-from pipeline.estimation.verdict import NOTHING_MISSING
 from pipeline.simulate import VEHICLES
+from pipeline.words.diagnosis import describe
+from pipeline.words.errors import describe_rest, describe_structure
+from pipeline.words.objects import diagnosis_as_json
+from pipeline.words.verdict import NOTHING_MISSING
 
 _HUSKY = replace(_SCENE, vehicle=VEHICLES["husky"])
 _CLAIMS = (
@@ -22,16 +24,16 @@ _CLAIMS = (
 def test_a_run_of_18_s_is_too_short_to_tell(tmp_path: Path) -> None:
     diagnosis = _diagnose(replace(_HUSKY, duration_s=18.0), tmp_path)
     assert not diagnosis.runs[0].effects
-    screen = describe(diagnosis)
+    screen = describe(diagnosis.runs)
     assert "The run is too short to determine the cause." in screen
     assert not any(claim in screen for claim in _CLAIMS)
 
 
 def test_a_run_that_is_long_enough_may_miss_nothing(tmp_path: Path) -> None:
     diagnosis = _diagnose(_HUSKY, tmp_path)
-    assert NOTHING_MISSING in describe(diagnosis)
-    assert diagnosis.runs[0].lead == ""
-    assert "not depend on any recorded signal" in str(diagnosis.runs[0].disturbance["text"])
+    assert NOTHING_MISSING in describe(diagnosis.runs)
+    assert diagnosis.runs[0].concentrated is None
+    assert "not depend on any recorded signal" in describe_rest(diagnosis.runs[0])
 
 
 def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) -> None:
@@ -40,6 +42,6 @@ def test_an_error_that_a_wet_patch_makes_is_told_by_where_it_is(tmp_path: Path) 
     diagnosis = _diagnose(replace(_HUSKY, effects=patch, duration_s=150.0), tmp_path)
     (run,) = diagnosis.runs
     assert run.unexplained is not None
-    assert "from 0 to 30 s: 90 % of the yaw error in 20 % of the time" in run.unexplained.where
-    assert run.unexplained.where in describe(diagnosis)
-    assert not any(claim in f"{describe(diagnosis)} {run.to_json()}" for claim in _CLAIMS)
+    assert "from 0 to 30 s (20 % of the time): 90 % of the yaw error" in describe_structure(run.unexplained)
+    assert describe_structure(run.unexplained) in describe(diagnosis.runs)
+    assert not any(claim in f"{describe(diagnosis.runs)} {diagnosis_as_json(run)}" for claim in _CLAIMS)

@@ -2,24 +2,36 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import pytest
 from drawn_diagnoses import check_verdict, draw_diagnosis
 from golden import read_page
+from msgspec.structs import replace
 from report_synthesis import make_report
 
-from pipeline.estimation.ambiguity import Detectable
-from pipeline.estimation.diagnosis import Named, RunDiagnosis, Unexplained, Value
-from pipeline.estimation.diagnosis_lines import choose_lines, list_lines
-from pipeline.estimation.verdict import format_verdict
 from pipeline.models import find_effect, list_effects
 from pipeline.recording import FAULTS
 from pipeline.report.page import render_report
 from pipeline.report.scene import RunReport
+from pipeline.results import (
+    Delays,
+    Detectable,
+    Errors,
+    Finding,
+    Interval,
+    Named,
+    RunDiagnosis,
+    Step,
+    Unexplained,
+    Value,
+)
 from pipeline.sources import list_presets
+from pipeline.words.diagnosis import list_lines
+from pipeline.words.objects import diagnosis_as_json
+from pipeline.words.verdict import format_verdict
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -28,7 +40,7 @@ if TYPE_CHECKING:
 
 PRESETS = {vehicle.id: vehicle for vehicle in list_presets()}
 SHORT = [{"id": "little_driving", "text": "the run has 31 s of driving", "where": "diagnosis"}]
-POOR = [{"id": "too_short", "text": "run: 9 s of driving. Drive longer.", "where": "diagnosis"}]
+POOR = "run: 9 s of driving. Drive longer."
 TRACK, LAG, ASYMMETRY = {"k": 1.5}, {"tau": 0.3}, {"e": 0.02}
 CLOSE, FAR = [(0.055, 0.02)], [(0.4, 0.2)]
 UNDECIDED = [{"candidates": ["body_inertia", "lateral_skid"], "in_model": "body_inertia"}]
@@ -68,7 +80,7 @@ DRAWN = {
     "two rivals": draw_diagnosis({}, FAR, undecided=[{"candidates": RIVALS[2:4], "in_model": None}]),
     "five rivals": draw_diagnosis({}, FAR, undecided=[{"candidates": RIVALS, "in_model": None}]),
     "a clock alone": draw_diagnosis({"clock_offset": {"d": -0.15}}, CLOSE),
-    "too poor": {"ladder": [], "findings": POOR},
+    "too poor": RunDiagnosis("run", findings=(Finding("too_short", POOR, "diagnosis"),)),
 }
 UNUSUAL = {"five rivals", "nothing, and no floor", "too poor"}
 """Those with a number that counts something, or without a rung or a floor."""
@@ -93,8 +105,8 @@ def test_verdicts(check_golden: Check) -> None:
         name: (format_verdict if name in UNUSUAL else check_verdict)(drawn) for name, drawn in DRAWN.items()
     }
     for name in ("not_moving", "pose_from_wheels", *FAULTS):
-        finding = {"id": name, "text": "the reason in words", "severity": "error"}
-        told[f"refused: {name}"] = format_verdict({**DRAWN["two effects"], "findings": [finding]})
+        finding = Finding(name, "the reason in words", severity="error")
+        told[f"refused: {name}"] = format_verdict(replace(DRAWN["two effects"], findings=(finding,)))
     check_golden("verdicts.txt", "\n\n".join(f"{name}:\n{verdict}" for name, verdict in told.items()))
 
 
@@ -121,80 +133,63 @@ def test_sentences_of_effects(check_golden: Check) -> None:
     check_golden("effects.txt", "\n".join(lines))
 
 
-def name_effect(name: str, numbers: dict[str, Value], motion: str) -> Named:
-    clause = f"has a {name}"
-    return Named(
-        name,
-        numbers,
-        1.0,
-        (),
-        (),
-        corrected=False,
-        path="command",
-        selected=1.0,
-        motion=motion,
-        clause=clause,
-    )
-
-
 def test_lines_of_a_diagnosis(check_golden: Check) -> None:
     """Numbers at a bound, rises, findings that repeat, and a rest with and without a formula."""
     servo = {
         "tau": Value(0.681, 0.587, 0.775, "s"),
         "reset": Value(0.0, math.nan, math.nan, "1/s", at_bound=True),
-        "scrub": Value(1.3312, 1.3300, 1.3324, "m/s", another_run=(0.42, 2.24)),
-        "creep": Value(0.3601, 0.3597, 0.3605, "s/m", another_run=(0.277, 0.443), is_spread_measured=True),
+        "scrub": Value(1.3312, 1.3300, 1.3324, "m/s", another_run=Interval(0.42, 2.24)),
+        "creep": Value(
+            0.3601, 0.3597, 0.3605, "s/m", another_run=Interval(0.277, 0.443), is_spread_measured=True
+        ),
     }
-    stuck = {"id": "stuck", "severity": "warning", "text": "it was stuck"}
-    many = [{"id": "w", "severity": "warning", "text": f"warning {number}"} for number in range(5)]
-    grave, note = (
-        {"id": "e", "severity": "error", "text": "an error"},
-        {"id": "n", "severity": "info", "text": "a note"},
-    )
+    stuck = Finding("stuck", "it was stuck", severity="warning")
+    many = [Finding("w", f"warning {number}", severity="warning") for number in range(5)]
+    grave, note = Finding("e", "an error", severity="error"), Finding("n", "a note", severity="info")
+    names = ["wheel_servo", "torque_limit", "drive_lag"]
     formula = 'v_y = "k_1 * v0 * v0"\nk_1 = { value = 0.08188, unit = "s/m", bounds = [-50.0, 50.0] }\n'
-    reached = {"t_mrmse_m": 0.25, "r_mrmse_rad": 0.02}
-    grows = "lateral error grows with forward speed"
     run = RunDiagnosis(
         "field/run",
         "command",
+        vehicle=PRESETS["warthog"],
         effects=(
-            name_effect("wheel_servo", servo, "Wheel servo: lag 0.68 s"),
-            name_effect("torque_limit", {"limit": Value(14.4, math.nan, math.nan, "m/s^2")}, "Torque limit"),
-            name_effect(
-                "drive_lag",
-                {"tau": Value(0.3, 0.2, 0.4, "s")},
-                "Lag of the drive: the wheels follow commands with a time constant of 0.30 s",
-            ),
+            Named("wheel_servo", servo),
+            Named("torque_limit", {"limit": Value(14.4, unit="m/s^2")}),
+            Named("drive_lag", {"tau": Value(0.3, 0.2, 0.4, "s")}),
         ),
         detectable=(
             Detectable("yaw_drift", "c", "rad/s", 0.016),
             Detectable("difference_gain", "g", "1", 0.16),
         ),
-        unexplained=Unexplained(0.02, "y", ("y",), grows, formula, {}, "command", reached),
-        findings=(note, stuck, stuck, *many, grave),
-        ladder=(
-            {"effects": [], "t_mrmse_m": 0.6, "r_mrmse_rad": 0.5},
-            {"effects": ["wheel_servo"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
-            {"effects": ["wheel_servo", "torque_limit"], "t_mrmse_m": 0.54, "r_mrmse_rad": 0.5},
-            {"effects": ["wheel_servo", "torque_limit", "drive_lag"], "t_mrmse_m": 0.57, "r_mrmse_rad": 0.4},
+        unexplained=Unexplained(
+            "formula",
+            0.02,
+            "y",
+            ("y",),
+            "command",
+            formula=formula,
+            with_formula=Errors(t_mrmse_m=0.25, r_mrmse_rad=0.02),
         ),
-        noise_floor={"t_mrmse_m": 0.05, "r_mrmse_rad": 0.02},
+        findings=(note, stuck, stuck, *many, grave),
+        ladder=tuple(
+            Step(effects=tuple(names[:count]), t_mrmse_m=t, r_mrmse_rad=r)
+            for count, (t, r) in enumerate([(0.6, 0.5), (0.54, 0.5), (0.54, 0.5), (0.57, 0.4)])
+        ),
+        noise_floor=Errors(t_mrmse_m=0.05, r_mrmse_rad=0.02),
         explained_share=0.4,
-        timing={"wheel_delay_s": 0.334},
+        timing=Delays(wheel_delay_s=0.334),
     )
-    left = Unexplained(0.98, "w", ("w",), "yaw error grows with roll", None, {}, "body")
-    bare = replace(run, effects=(), ladder=run.ladder[:1], unexplained=left, findings=(), timing={})
+    left = Unexplained("lasting", 0.98, "w", ("w",), "command", sizes={"w": 0.19})
+    bare = replace(run, effects=(), ladder=run.ladder[:1], unexplained=left, findings=(), timing=Delays())
     parts = [
-        "\n".join(
-            f"{label:<10}{text}" for label, text in choose_lines(list_lines(one), everything=everything)
-        )
+        "\n".join(f"{label:<10}{text}" for label, text in list_lines(one, everything=everything))
         for one in (run, bare)
         for everything in (False, True)
     ]
     check_golden("diagnosis_lines.txt", "\n\n".join(parts))
     assert all(
         number["undetermined"]
-        for effect in run.to_json()["effects"]
+        for effect in diagnosis_as_json(run)["effects"]
         if effect["id"] == "torque_limit"
         for number in effect["parameters"].values()
     )
@@ -208,8 +203,10 @@ def test_page_of_a_run(kind: str, check_golden: Check) -> None:
     grave = {"id": "not_moving", "severity": "error", "text": "the vehicle does not move", "where": ""}
     report = {
         "undiagnosed": lambda: RunReport(whole.summary, whole.tables),
-        "undecided": lambda: RunReport(whole.summary, {}, {**whole.diagnosis, "effects": []}),
+        "undecided": lambda: RunReport(whole.summary, {}, replace(whole.diagnosis, effects=())),
         "refused": lambda: RunReport({**whole.summary, "findings": [grave]}, {}),
         "unknown": lambda: RunReport({}, {}),
-    }.get(kind, lambda: replace(whole, peers={"command": [0.01, 0.02, 99.0], "measured": [1.0]}))()
+    }.get(
+        kind, lambda: dataclasses.replace(whole, peers={"command": [0.01, 0.02, 99.0], "measured": [1.0]})
+    )()
     check_golden(f"page_{kind}.txt", read_page(render_report(report)))

@@ -17,7 +17,6 @@ from pipeline.core import SlipError
 from pipeline.estimation import Recording as Diagnosed
 from pipeline.estimation import choose_input, diagnose_runs, load_recording
 from pipeline.estimation.context import DiagnosisError
-from pipeline.estimation.verdict import NO_GROUND
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compared_runs import find_material
@@ -30,6 +29,8 @@ from pipeline.run.signals import GROUND_UNOBSERVABLE
 from pipeline.simulate import Encoders, Recording, Scenario, make_scenario, messages, simulate_run, write_log
 from pipeline.sources import find_preset
 from pipeline.store import Manifest, Store
+from pipeline.words.objects import diagnosis_as_json
+from pipeline.words.verdict import NO_GROUND
 
 CASES = Path(__file__).parents[3] / "shared" / "cases" / "logs"
 EFFECTS = {"drive_lag": 0.3, "effective_track": 1.8, "lateral_skid": 0.3}
@@ -69,7 +70,9 @@ class Analyzed:
 
     @property
     def diagnosis(self) -> dict[str, Any]:
-        return cast("dict[str, Any]", read_diagnosis(self.manifest))
+        diagnosis = read_diagnosis(self.manifest)
+        assert diagnosis is not None
+        return diagnosis_as_json(diagnosis)
 
     @property
     def named(self) -> dict[str, dict[str, Any]]:

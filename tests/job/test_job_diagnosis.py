@@ -11,7 +11,9 @@ import pytest
 
 from pipeline.job import Options, run_results
 from pipeline.job.analyze import Outcome, analyze_log
+from pipeline.results import RunDiagnosis, read_result
 from pipeline.simulate import make_scenario, simulate_case, simulate_run, write_log
+from pipeline.words.objects import diagnosis_as_json
 
 
 def analyze(log: Path, out: Path, **options: object) -> Outcome:
@@ -42,9 +44,9 @@ def test_an_analysis_names_what_is_missing(wide: tuple[Outcome, Path, Path]) -> 
 def test_the_ladder_and_the_diagnosis_are_kept(wide: tuple[Outcome, Path, Path]) -> None:
     outcome, _, _ = wide
     ladder = outcome.manifest.read("ladder")
-    stored = json.loads(outcome.manifest.path("diagnosis.json").read_text())
+    stored = read_result(json.loads(outcome.manifest.path("diagnosis.json").read_text()), RunDiagnosis)
 
-    assert stored == outcome.summary["diagnosis"]
+    assert diagnosis_as_json(stored) == outcome.summary["diagnosis"]
     rungs = ladder.filter(pl.col("kind") == "rung")
     assert rungs["added"].to_list() == ["", "effective_track"]
     assert rungs["r_mrmse"][1] < 0.3 * rungs["r_mrmse"][0]

@@ -11,7 +11,7 @@ import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -25,6 +25,7 @@ from pipeline.job.check import check_runs
 from pipeline.job.run_results import read_diagnosis
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT
 from pipeline.store import Store
+from pipeline.words.objects import diagnosis_as_json
 
 pytestmark = pytest.mark.long
 
@@ -74,7 +75,8 @@ def analyzed(shared_logs: Path, diagnosed_results: Path) -> list[Analyzed]:
     for log in sorted(shared_logs.glob("*.mcap")):
         outcome = analyze_log(log, Options(out=diagnosed_results, diagnosis=True))
         manifest = outcome.manifest
-        diagnosis = cast("dict[str, Any] | None", read_diagnosis(manifest)) or {"effects": []}
+        stored = read_diagnosis(manifest)
+        diagnosis = {"effects": []} if stored is None else diagnosis_as_json(stored)
         assert diagnosis["effects"] or outcome.refusal or not outcome.summary["median_modulus"], log.stem
         report = (manifest.folder / "report.html").read_text("utf-8")
         found.append(Analyzed(log.stem, diagnosis, manifest.folder, report))

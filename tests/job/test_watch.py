@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import msgspec
 import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
@@ -24,6 +25,7 @@ from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_re
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import GrowingLog
 from pipeline.logs.reader import Wanted
+from pipeline.results import Errors, Evidence, Growth, Named, RunDiagnosis, Step, Unobservable, Value
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store
 
@@ -320,41 +322,37 @@ def test_slip_and_distance_are_followed_over_splits(tmp_path: Path) -> None:
     assert seen[-1]["distance_m"] == pytest.approx(once["distance_m"], rel=0.05)
 
 
-def name(effect: str, t: float) -> dict[str, object]:
-    number = {"value": 1.8, "low": 1.7, "high": 1.9, "unit": "1"}
-    return {
-        "id": effect, "clause": f"shows {effect}", "corrected": False,
-        "parameters": {"k": number}, "growth": {"evidence": {"t": [1.0, t]}},
-    }  # fmt: skip
+def name(effect: str, t: float, width: float = 0.1, *, corrected: bool = False) -> Named:
+    number = Value(1.8, 1.8 - width, 1.8 + width)
+    return Named(effect, {"k": number}, corrected=corrected, growth=Growth(Evidence((1.0, 2.0), (1.0, t))))
 
 
 def test_a_name_needs_more_evidence_than_in_a_finished_log_and_a_second_look() -> None:
-    weak, strong = name("effective_track", 0.9 * RUNNING_T), name("effective_track", 1.1 * RUNNING_T)
-    assert list_passing({"effects": [weak]}) == []
-    assert list_passing({"effects": [strong]}) == ["effective_track"]
-    assert list_stated({"effects": [strong]}, []) == []
-    (stated,) = list_stated({"effects": [strong]}, ["effective_track"])
+    weak, strong = (
+        RunDiagnosis(effects=(name("effective_track", share * RUNNING_T),)) for share in (0.9, 1.1)
+    )
+    assert list_passing(weak) == []
+    assert list_passing(strong) == ["effective_track"]
+    assert list_stated(strong, []) == []
+    (stated,) = list_stated(strong, ["effective_track"])
     assert stated.numbers["k"]["value"] == 1.8
 
 
 def test_it_asks_until_it_knows_enough() -> None:
-    known = name("effective_track", 50.0)
-    known["parameters"] = {"k": {"value": 1.8, "low": 1.78, "high": 1.82, "unit": "1"}}
-    floor = {"t_mrmse_m": 0.01, "r_mrmse_rad": 0.01}
-    diagnosis = {
-        "effects": [known],
-        "unobservable_why": {"slope_creep": {"reason": "no excitation", "manoeuvre": "drive on a slope"}},
-        "ladder": [
-            {"effects": [], "t_mrmse_m": 0.05, "r_mrmse_rad": 0.05},
-            {"effects": ["effective_track"], **floor},
-        ],
-        "noise_floor": floor,
-    }
+    known = name("effective_track", 50.0, 0.02)
+    errors = Step(effects=("effective_track",), t_mrmse_m=0.01, r_mrmse_rad=0.01)
+    diagnosis = RunDiagnosis(
+        effects=(known,),
+        unobservable_why={"slope_creep": Unobservable("no excitation")},
+        ladder=(Step(t_mrmse_m=0.05, r_mrmse_rad=0.05), errors),
+        noise_floor=Errors(t_mrmse_m=0.01, r_mrmse_rad=0.01),
+    )
     asked = summarize_knowledge(diagnosis, [])
     assert asked["waiting"] == ["effective_track"]
-    assert asked["drive"] == ["drive on a slope"]
+    assert str(asked["drive"]).startswith("['drive on a slope")
     # A clock that is corrected anyway is nothing to confirm.
-    diagnosis["effects"] = [known, name("transport_delay", 9.0) | {"corrected": True}]
+    clock = name("transport_delay", 9.0, corrected=True)
+    diagnosis = msgspec.structs.replace(diagnosis, effects=(known, clock))
     done = summarize_knowledge(diagnosis, ["effective_track"])
     assert done["waiting"] == []
     assert done["enough"]
@@ -411,7 +409,7 @@ def test_a_log_whose_name_begins_with_a_dash_is_diagnosed(
 def test_notes_that_no_watch_wrote_are_forgotten(tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 3.0)
     notes = Store(tmp_path / "out").notes(NOTES)
-    diagnosis = {"effects": [name("effective_track", 50.0)], "ladder": []}
+    diagnosis = RunDiagnosis(effects=(name("effective_track", 50.0),))
     known = {"until_s": 30.0, **summarize_knowledge(diagnosis, ["effective_track"])}
     for noted, expected in ((known, known), (known | {"until_s": "30"}, {}), (known | {"stated": [5]}, {})):
         notes.write(str(log.resolve()), noted)

@@ -11,10 +11,12 @@ from motion_runs import align, extract, make_scenario, vehicle_of
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.constancy import find_change
 from pipeline.estimation.ladder import Judgement, judge_model
-from pipeline.estimation.verdict import CHANGE, format_verdict
 from pipeline.models import Model, find_effect
+from pipeline.results import Errors, RunDiagnosis, Step
+from pipeline.results.reading import CHANGE
 from pipeline.run import load_run
 from pipeline.simulate import simulate_run
+from pipeline.words.verdict import format_verdict
 
 HUSKY = vehicle_of("husky_a200")
 PAUSE_S = 5.0
@@ -55,22 +57,20 @@ def test_a_number_that_changes_is_found_with_its_time(
 ) -> None:
     findings = find_change(judge(({name: {number: before}}, {name: {number: after}}), 40, lengths_s))
     (finding,) = findings
-    assert (finding["id"], finding["where"], finding["parameter"]) == (CHANGE, name, number)
-    assert finding["time"] == pytest.approx(lengths_s[0] + 0.5 * PAUSE_S, abs=8.0)
-    assert finding["before"] == pytest.approx(before, rel=0.05)
-    assert finding["after"] == pytest.approx(after, rel=0.05)
+    assert (finding.id, finding.where, finding.parameter) == (CHANGE, name, number)
+    assert finding.time == pytest.approx(lengths_s[0] + 0.5 * PAUSE_S, abs=8.0)
+    assert finding.before == pytest.approx(before, rel=0.05)
+    assert finding.after == pytest.approx(after, rel=0.05)
     # Both values have the digits that tell them apart.
-    said = [
-        float(text) for text in re.findall(r" is ([\d.]+)\D* before and ([\d.]+)", str(finding["text"]))[0]
-    ]
+    said = [float(text) for text in re.findall(r" is ([\d.]+)\D* before and ([\d.]+)", str(finding.text))[0]]
     assert said[1] - said[0] == pytest.approx(after - before, rel=0.2)
-    steps = [
-        {"t_mrmse_m": 0.2, "r_mrmse_rad": 0.1},
-        {"effects": [name], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.1},
-    ]
-    floor = {"t_mrmse_m": 0.01, "r_mrmse_rad": 0.01}
-    verdict = format_verdict({"ladder": steps, "noise_floor": floor, "findings": findings})
-    assert str(finding["text"])[1:] in verdict
+    steps = (
+        Step(t_mrmse_m=0.2, r_mrmse_rad=0.1),
+        Step(effects=(name,), t_mrmse_m=0.1, r_mrmse_rad=0.1),
+    )
+    floor = Errors(t_mrmse_m=0.01, r_mrmse_rad=0.01)
+    verdict = format_verdict(RunDiagnosis("run", ladder=steps, noise_floor=floor, findings=tuple(findings)))
+    assert str(finding.text)[1:] in verdict
     assert "No known effect" not in verdict
 
 
@@ -79,8 +79,8 @@ def test_what_changes_beside_a_number_is_said() -> None:
         {"effective_track": {"k": k}, "wheel_radius": {"k": r}} for k, r in ((1.3, 1.0), (1.7, 0.9))
     )
     (finding,) = find_change(judge(halves, 60, (120.0, 120.0)))  # type: ignore[arg-type]
-    assert "effective track" in str(finding["text"])
-    assert "wheel radius" in str(finding["text"])
+    assert "effective track" in str(finding.text)
+    assert "wheel radius" in str(finding.text)
 
 
 @pytest.mark.parametrize("seed", range(50, 53))

@@ -6,6 +6,7 @@ from dataclasses import replace
 from itertools import combinations
 from math import factorial
 
+import msgspec
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -23,6 +24,7 @@ from pipeline.estimation.apportion import (
 from pipeline.estimation.estimates import estimate_unnamed
 from pipeline.estimation.ladder import Judgement, judge_model
 from pipeline.models import Model, find_effect
+from pipeline.words.errors import describe_moments
 
 TRUE = {"effective_track": {"k": 1.6}, "lateral_skid": {"c": 0.08}}
 
@@ -68,8 +70,8 @@ def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
     assert heading.total == pytest.approx(ideal.r_mrmse_rad**2)
     for budget in (slip, position, heading):
         assert budget.unit == QUANTITIES[budget.quantity]
-        assert sum(share.share for share in budget.shares) == pytest.approx(1.0)
-        left = sum(share.share for share in budget.shares if share.kind != "effect") * budget.total
+        assert sum(share.share for _, share in budget.causes) == pytest.approx(1.0)
+        left = sum(share.share for kind, share in budget.causes if kind != "effect") * budget.total
         whole = judged.whole.errors
         x, y, w = whole.velocity_rms
         squares = {
@@ -82,8 +84,8 @@ def test_a_budget_adds_up_to_the_ladders_numbers(judged: Judgement) -> None:
 
 def test_what_was_put_into_a_run_carries_its_slip_and_what_was_not_carries_none(judged: Judgement) -> None:
     slip = apportion(judged)[0]
-    shares = {share.name: share for share in slip.shares}
-    assert [share.name for share in slip.shares][:2] == ["effective_track", "lateral_skid"]
+    shares = {share.effect: share for share in slip.shares}
+    assert [share.effect for share in slip.shares][:2] == ["effective_track", "lateral_skid"]
     assert shares["effective_track"].share > 0.5
     assert shares["lateral_skid"].low > 0.0
     assert abs(shares["speed_slip"].share) < 0.001
@@ -98,12 +100,12 @@ def test_the_times_with_half_of_the_error_are_found_where_it_is_above_the_noise(
     )
     worse = replace(judged, physics=replace(judged.physics, held_out=replace(held, yaw=(floor * size,))))
     (heading,) = find_moments(worse)
-    (start, end, share), *_ = heading.spans
+    start, end, share = msgspec.structs.astuple(heading.spans[0])
     assert (heading.run, heading.quantity, start, end) == (0, "heading", 20.0, 24.0)
     whole = float(np.sum(size**2))
     assert share == pytest.approx(float(np.sum(size[(middle >= 20.0) & (middle < 24.0)] ** 2)) / whole)
     assert heading.time_share < 0.1
-    assert heading.sentence.endswith(f"largest parts: 20 to 24 s ({100.0 * share:.0f} %)")
+    assert describe_moments(heading).endswith(f"largest parts: 20 to 24 s ({100.0 * share:.0f} %)")
 
 
 def test_intervals_of_a_ratio_hold_it_as_often_as_they_say() -> None:

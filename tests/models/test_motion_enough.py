@@ -9,9 +9,7 @@ import pytest
 from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model
-from pipeline.estimation.error_regions import (
-    narrow_intervals,
-)
+from pipeline.estimation.driving_need import narrow_intervals
 from pipeline.estimation.intervals import estimate_part
 from pipeline.models import Model, find_effect
 from pipeline.run.windows import cut_run, find_driven

@@ -229,9 +229,9 @@ def test_the_noise_of_poses_is_measured_whatever_the_model_lacks() -> None:
     run = simulate({"effective_track": 1.8, "icr_offset": 0.1}, duration_s=300.0, pose=sparse)
     problem = Problem([run], HUSKY, Input.MEASURED)
     for rung in climb(problem, model_of("effective_track", "icr_offset")).steps:
-        noise = summarize_disturbance(rung.fitted.fits[0], "")["pose_noise"]
-        assert noise[0] == pytest.approx(0.03, rel=0.15)  # type: ignore[index, call-overload]
-        assert noise[1] == pytest.approx(0.03, rel=0.25)  # type: ignore[index, call-overload]
+        noise = summarize_disturbance(rung.fitted.fits[0]).pose_noise
+        assert noise[0] == pytest.approx(0.03, rel=0.15)
+        assert noise[1] == pytest.approx(0.03, rel=0.25)
 
 
 def test_motion_that_lasts_is_reported_as_such() -> None:
@@ -239,12 +239,12 @@ def test_motion_that_lasts_is_reported_as_such() -> None:
     for unseen in (Disturbance(), Disturbance(0.1, 0.1, correlation_s=4.0)):
         run = simulate({"effective_track": 1.8}, duration_s=300.0, disturbance=unseen)
         fitted = fit_model(Problem([run], HUSKY, Input.MEASURED), model_of("effective_track"))
-        left.append(summarize_disturbance(fitted.fits[0], ""))
+        left.append(summarize_disturbance(fitted.fits[0]))
     quiet, pushed = left
     for channel, size in enumerate((0.1, 0.1, 0.1)):
-        assert quiet["lasting"][channel] < 0.1 * size  # type: ignore[index, call-overload, operator]
+        assert quiet.lasting[channel] < 0.1 * size
         # It stops while the wheels stand.
-        assert 0.5 * size < pushed["lasting"][channel] < 1.2 * size  # type: ignore[index, call-overload, operator]
+        assert 0.5 * size < pushed.lasting[channel] < 1.2 * size
 
 
 def test_predictions_begin_at_measured_poses_and_follow_the_true_motion() -> None:

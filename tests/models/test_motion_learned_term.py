@@ -21,9 +21,9 @@ from pipeline.estimation.learned_step import (
     learn_beyond,
     learn_fold,
     learn_where_it_helps,
-    learned_as_json,
     make_learned_step,
     regress,
+    summarize_learned,
 )
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
@@ -98,10 +98,10 @@ def test_where_nothing_is_left_it_is_refused_and_never_makes_worse(complete: Pro
     judged = judge_model(complete, fitted.model)
     step = learn_beyond(judged)
     assert step is not None
-    told = learned_as_json(step, judged.ideal.errors, judged.floor)
-    assert told["kept"] is False
-    assert told["reason"] == "the remaining error is at the noise floor"
-    assert told["term"] is None
+    told = summarize_learned(step, judged.ideal.errors, judged.floor)
+    assert not told.helps
+    assert told.reason == "the remaining error is at the noise floor"
+    assert told.term is None
 
 
 def test_a_fold_is_learned_without_its_stretches(problem: Problem, monkeypatch: pytest.MonkeyPatch) -> None:

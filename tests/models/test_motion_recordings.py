@@ -10,8 +10,9 @@ import pytest
 from real_recordings import CASES, INERTIA, TRACK, C, Case, M, Recordings, make_model, measure
 
 from pipeline.estimation import Problem, carry_over, climb, fit_model
-from pipeline.estimation.ladder import CHANCE, compare_losses, list_rises
+from pipeline.estimation.ladder import compare_losses
 from pipeline.models import Model, find_effect
+from pipeline.results.reading import CHANCE, list_rises
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -111,13 +111,12 @@ def test_what_a_diagnosis_named_is_added_at_once(chrome: Chrome, tmp_path: Path)
         chrome.open(workbench.address)
         chrome.wait(SHOWN)
         named = (
-            "[...document.querySelectorAll('.proposals li')].filter((entry) =>"
-            " entry.textContent.includes('identified by the diagnosis')).map((entry) => entry.dataset.effect)"
+            "[...document.querySelectorAll('.proposals li[data-named]')].map((entry) => entry.dataset.effect)"
         )
         assert set(chrome.run(named)) == {"effective_track", "drive_lag"}
         manifest = Store(tmp_path / "out").manifest("field/late")
         assert manifest is not None
-        told = json.loads(manifest.path("diagnosis.json").read_text())["where"][0]["text"]
+        told = json.loads(manifest.path("summary.json").read_text())["diagnosis"]["where"][0]["text"]
         assert told in str(chrome.run("document.querySelector('.where').textContent"))
         chrome.click(".add-all")
         chrome.wait("document.querySelectorAll('.card').length === 2")

@@ -13,7 +13,8 @@ from workbench_server import RUN, TRACK
 from pipeline.estimation.additions import explain_refusal
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.report.motion_view import read_model_text
+from pipeline.results import RunDiagnosis, read_result
+from pipeline.results.reading import read_model
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.web import Ask, Limits, ServerFolders
@@ -58,7 +59,7 @@ def named_in(results: Path, run: str) -> set[str]:
     if "diagnosis.json" not in manifest.files:
         return set()
     told = json.loads(manifest.path("diagnosis.json").read_text())
-    file = read_model_text(told)
+    file = read_model(read_result(told, RunDiagnosis))
     if file is None:
         return set()
     named = set(file.model.ids)
@@ -131,7 +132,7 @@ def test_all_of_the_diagnosis_is_its_model_whatever_was_done_before(
     run, slot = "field/late", "b"
     manifest = Store(diagnosed).manifest(run)
     assert manifest is not None
-    file = read_model_text(json.loads(manifest.path("diagnosis.json").read_text()))
+    file = read_model(read_result(json.loads(manifest.path("diagnosis.json").read_text()), RunDiagnosis))
     assert file is not None
     wanted = {effect.id: dict(effect.values) for effect in file.model}
     begun: list[Model] = []

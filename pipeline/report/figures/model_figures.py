@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import math
+from collections.abc import Mapping, Sequence
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_angle, format_length
-from pipeline.core.untrusted import mapping_in, number_in, numbers_in, objects_in
+from pipeline.core import INPUT_WORDS, finite_or_none, format_angle, format_length
 from pipeline.estimation.decision import LEAST_T
-from pipeline.estimation.error_regions import INTERVAL_SHARE, find_goal
-from pipeline.estimation.ladder import format_rises
-from pipeline.estimation.verdict import CAUSE_NAMES
+from pipeline.estimation.driving_need import find_goal
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
 from pipeline.report.figures import Drawing, Figure, Section
 from pipeline.report.scene import (
@@ -24,6 +22,10 @@ from pipeline.report.scene import (
     thin_series,
 )
 from pipeline.report.theme import Channel, Chart, encode_column, find_range, layer, make_axis, stack
+from pipeline.results import Errors, Growth, SlipBudget, Step
+from pipeline.results.reading import INTERVAL_SHARE, format_rises
+from pipeline.words.effects import CAUSE_NAMES
+from pipeline.words.errors import describe_need
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),
@@ -150,14 +152,12 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
     """Rows of the ladder: ``rung step t told series``; of ceiling and floor: ``t told label``."""
     rungs, floor = _find_ladder(scene)
     rows = []
-    before: Sequence[object] = ()
+    before: Sequence[str] = ()
     for number, step in enumerate(rungs):
-        size = number_in(step, "t_mrmse_m")
-        effects = step.get("effects")
-        effects = effects if isinstance(effects, list | tuple) else []
-        added = [str(name) for name in effects if name not in before]
+        size, effects = step.t_mrmse_m, step.effects
+        added = [name for name in effects if name not in before]
         before = effects
-        if size is None:
+        if not math.isfinite(size):
             continue
         rises = format_rises(rungs[max(number - 1, 0)], step)
         rows.append(
@@ -169,8 +169,8 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
                 "series": "model" if effects else "ideal",
             }
         )
-    highest = number_in(rungs[0], "t_mrmse_m") if rungs else None
-    bounds = {"ceiling": highest, "floor": number_in(floor, "t_mrmse_m")}
+    ends = {"ceiling": rungs[0] if rungs else None, "floor": floor}
+    bounds = {word: None if one is None else finite_or_none(one.t_mrmse_m) for word, one in ends.items()}
     columns = [pl.lit(size, pl.Float64).alias(word) for word, size in bounds.items()]
     most = max((float(str(row["t"])) for row in rows), default=0.0)
     return {
@@ -179,10 +179,10 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
     }
 
 
-def _list_degrees(step: Mapping[str, object]) -> list[str]:
+def _list_degrees(step: Step) -> list[str]:
     """Heading error, if known, in short form for the label above a bar."""
-    angle = number_in(step, "r_mrmse_rad")
-    return [] if angle is None else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
+    angle = step.r_mrmse_rad
+    return [] if math.isnan(angle) else [f"{format_angle(angle).partition(' ')[0]}\u00b0"]
 
 
 def _list_bound(word: str, size: float | None, most: float) -> pl.DataFrame:
@@ -200,15 +200,12 @@ def name_input(scene: Scene) -> str:
     motion = scene.report.motion
     if motion is not None:
         return motion.input
-    source = scene.report.diagnosis.get("input")
-    return source if isinstance(source, str) else scene.report.main_input
+    return scene.report.diagnosis.input or scene.report.main_input
 
 
-def _find_ladder(scene: Scene) -> tuple[Sequence[Mapping[str, object]], Mapping[str, object]]:
-    motion = scene.report.motion
-    if motion is not None:
-        return motion.ladder, motion.floor or {}
-    return objects_in(scene.report.diagnosis, "ladder"), mapping_in(scene.report.diagnosis, "noise_floor")
+def _find_ladder(scene: Scene) -> tuple[Sequence[Step], Errors | None]:
+    motion, diagnosis = scene.report.motion, scene.report.diagnosis
+    return (diagnosis.ladder, diagnosis.noise_floor) if motion is None else (motion.ladder, motion.floor)
 
 
 def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
@@ -262,7 +259,7 @@ def draw_enough(scene: Scene) -> Drawing | None:
     ]
     bounds = {"enough_width_bound": INTERVAL_SHARE, "enough_evidence_bound": LEAST_T}
     shown = rows | {name: pl.DataFrame({"value": [value]}) for name, value in bounds.items()}
-    sentence = str(scene.report.diagnosis.get("enough") or "")
+    sentence = describe_need(scene.report.diagnosis)
     note = f"{begin_large(sentence)}. " if sentence else ""
     note += "Lines: 5 %, and the detection threshold in t."
     words = f"Data: {sentence}." if sentence else "No effect has an interval that narrows with driving."
@@ -302,34 +299,30 @@ def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:
     """Rows ``effect number seconds value`` of relative half-widths, and of evidence."""
     widths: list[tuple[str, str, float, float]] = []
     evidence: list[tuple[str, str, float, float]] = []
-    for effect in objects_in(scene.report.diagnosis, "effects"):
-        name, growth = str(effect.get("id")), mapping_in(effect, "growth")
-        curves, values = mapping_in(growth, "parameters"), mapping_in(effect, "parameters")
-        for key in curves:
-            value = number_in(mapping_in(values, key), "value")
-            points = _list_points(mapping_in(curves, key), "half_width")
-            if value is not None:
-                goal = find_goal(name, key, value) / INTERVAL_SHARE
+    for effect in scene.report.diagnosis.effects:
+        name, growth = effect.id, effect.growth or Growth()
+        for key, curve in growth.parameters.items():
+            if key in effect.parameters:
+                goal = find_goal(name, key, effect.parameters[key].value) / INTERVAL_SHARE
+                points = _list_points(curve.seconds, curve.half_width)
                 widths += [(name, f"{name}.{key}", second, half / goal) for second, half in points]
-        points = _list_points(mapping_in(growth, "evidence"), "t")
-        evidence += [(name, name, second, t) for second, t in points]
+        if growth.evidence is not None:
+            points = _list_points(growth.evidence.seconds, growth.evidence.t)
+            evidence += [(name, name, second, t) for second, t in points]
     return {
         "enough_width": pl.DataFrame(widths, schema=_SCHEMA_ENOUGH, orient="row"),
         "enough_evidence": pl.DataFrame(evidence, schema=_SCHEMA_ENOUGH, orient="row"),
     }
 
 
-def _list_points(curve: Mapping[str, object], key: str) -> Iterator[tuple[float, float]]:
-    for second, value in zip(numbers_in(curve, "seconds"), numbers_in(curve, key), strict=False):
-        if second is not None and value is not None:
-            yield second, value
+def _list_points(seconds: Sequence[float], values: Sequence[float]) -> list[tuple[float, float]]:
+    return [point for point in zip(seconds, values, strict=False) if math.isfinite(point[1])]
 
 
 ENOUGH = Figure("Is the log long enough", Section.WHY, draw_enough, order=6, width="full", id="enough")
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
 _SCHEMA_BUDGET = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
-_LEFT = ("disturbance", "localization_noise")
 _COLOURS_BUDGET = {"effect": theme.MODEL, "disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 
 
@@ -367,14 +360,11 @@ def draw_budget(scene: Scene) -> Drawing | None:
 def list_parts(scene: Scene) -> pl.DataFrame:
     """Rows ``cause from to low high kind told``: start and end of each cause's step, and its text."""
     slip, position = _find_budget(scene, "slip"), _find_budget(scene, "position")
-    errors = {str(part.get("effect")): number_in(part, "share") for part in objects_in(position, "shares")}
-    errors |= {kind: number_in(mapping_in(position, kind), "share") for kind in _LEFT}
-    parts = [("effect", str(part.get("effect")), part) for part in objects_in(slip, "shares")]
-    parts += [(kind, kind, mapping_in(slip, kind)) for kind in _LEFT if mapping_in(slip, kind)]
+    errors = {} if position is None else {part.effect: part.share for _, part in position.causes}
     rows, top = [], 1.0
-    for kind, name, part in parts:
-        share = number_in(part, "share") or 0.0
-        low, high = number_in(part, "low"), number_in(part, "high")
+    for kind, part in [] if slip is None else slip.causes:
+        name, share = part.effect, part.share
+        low, high = finite_or_none(part.low), finite_or_none(part.high)
         rows.append(
             {
                 "cause": CAUSE_NAMES.get(name, name),
@@ -390,21 +380,18 @@ def list_parts(scene: Scene) -> pl.DataFrame:
     return pl.DataFrame(rows, schema=_SCHEMA_BUDGET)
 
 
-def _find_budget(scene: Scene, quantity: str) -> Mapping[str, object]:
-    """Budget of a quantity on the leading input; empty without one."""
-    diagnosis = scene.report.diagnosis
-    wanted = (diagnosis.get("input"), quantity)
-    budgets = objects_in(diagnosis, "budget")
-    return next((one for one in budgets if (one.get("input"), one.get("quantity")) == wanted), {})
+def _find_budget(scene: Scene, quantity: str) -> SlipBudget | None:
+    """Budget of a quantity on the leading input; None without one."""
+    wanted = (scene.report.diagnosis.input, quantity)
+    return next((one for one in scene.report.diagnosis.budget if (one.input, one.quantity) == wanted), None)
 
 
 def _format_split(scene: Scene, rows: pl.DataFrame) -> str:
     """Format every cause with its share."""
     slip = _find_budget(scene, "slip")
-    total = number_in(slip, "total")
     sentence = "; ".join(f"{row['cause']}: {row['told']}" for row in rows.iter_rows(named=True))
-    words = INPUT_WORDS.get(str(slip.get("input")), "")
-    size = f"{format_number(total)} m\u00b2/s\u00b2"
+    words = "" if slip is None else INPUT_WORDS.get(slip.input, "")
+    size = f"{format_number(None if slip is None else slip.total)} m\u00b2/s\u00b2"
     return (
         f"Mean square slip {words}, {size} over half a second by cause, shares of it and of the 2 s error. "
         f"{sentence}."

@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from drawn_diagnoses import FLOOR, Diagnosis, check_form, check_verdict, draw_diagnosis
+from drawn_diagnoses import FLOOR, check_form, check_verdict, draw_diagnosis
 
-from pipeline.estimation.error_regions import ABOVE_FLOOR, format_remaining_error
-from pipeline.estimation.verdict import (
-    format_verdict,
-    split_main,
-)
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.run_results import load_vehicle
 from pipeline.models import find_effect, list_effects
+from pipeline.results import RunDiagnosis, read_result
+from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
+from pipeline.words.effects import describe_clause
+from pipeline.words.errors import format_remaining_error
+from pipeline.words.verdict import format_verdict
 
 _LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"
 _PRESETS = {vehicle.id: vehicle for vehicle in list_presets()}
@@ -28,7 +28,7 @@ _NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?")
 
 def test_a_clock_that_was_corrected_is_no_smaller_effect() -> None:
     errors = [(1.0, 0.5), (0.1, 0.1), (0.05, 0.1)]
-    ladder = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors)["ladder"]
+    ladder = draw_diagnosis({"drive_lag": {"tau": 0.3}, "deadband": {"d": 0.01}}, errors).ladder
     lag, band, clock = ("drive_lag", False), ("deadband", False), ("clock_offset", True)
     assert split_main([lag, band, clock], ladder, lambda one: one) == ([lag, clock], [band])
     assert split_main([band, clock], ladder, lambda one: one) == ([band, clock], [])
@@ -42,7 +42,7 @@ def test_every_effect_reads_well_in_a_verdict(kind: type[Any]) -> None:
     drawn = draw_diagnosis({kind.id: usual}, [(0.4, 0.3), (0.3, 0.2)], vehicle)
     verdict = check_verdict(drawn, vehicle)
     # With a number of its own, and short enough for three of them.
-    clause = str(drawn["effects"][0]["clause"])
+    clause = describe_clause(drawn.effects[0], drawn)
     assert _NUMBER.search(clause)
     assert len(clause) < 80
     assert re.search(r"\. (The robot [a-z]+s |The [a-z]+ )", verdict)
@@ -65,12 +65,12 @@ def test_the_verdict_on_a_recording_is_that_of_its_stored_results(log: Path | No
         pytest.skip("the real recordings are not here")
     manifest = analyze_log(log, Options(out=tmp_path, report=False, diagnosis=True)).manifest
     summary = manifest.read_json("summary.json")
-    stored: Diagnosis = json.loads(manifest.path("diagnosis.json").read_text())
-    assert summary["verdict"] == stored["verdict"] == format_verdict(stored)
-    if stored["ladder"]:
+    stored = read_result(json.loads(manifest.path("diagnosis.json").read_text()), RunDiagnosis)
+    assert summary["verdict"] == format_verdict(stored)
+    if stored.ladder:
         check_verdict(stored, load_vehicle(manifest))
     else:
-        check_form(stored["verdict"])
+        check_form(format_verdict(stored))
 
 
 @pytest.mark.parametrize(

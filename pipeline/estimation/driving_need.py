@@ -1,0 +1,168 @@
+"""How the evidence for effects and their intervals grow with driving, and whether the log is long enough."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from msgspec.structs import replace
+
+from pipeline.core import round_digits
+from pipeline.core.arrays import Floats, Ints
+from pipeline.estimation.intervals import narrow_part
+from pipeline.models.catalogue import find_effect
+from pipeline.results import DataNeed, Evidence, Growth, Narrowing
+from pipeline.results.reading import INTERVAL_SHARE
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.model_fit import Fitted
+    from pipeline.results import Named
+
+# A smaller relative reduction of an interval is no reduction.
+_NO_NARROWER = 0.1
+# Longest suggested driving, as a multiple of the time driven.
+_TOO_LONG = 10.0
+_POINTS = 60
+"""Maximum number of points of a curve in a figure."""
+_DIGITS = 4
+"""Significant digits of a curve in JSON: a figure shows three."""
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Values by the seconds of driving, both of shape (k,)."""
+
+    seconds: Floats
+    values: Floats
+
+
+def thin_growth(evidence: Curve | None, widths: Mapping[str, Curve]) -> Growth:
+    """Evidence and half-widths by parameter with at most sixty points each.
+
+    Args:
+        evidence: t of the effect; None where it was not searched for.
+        widths: half-width of the 95 % interval by parameter.
+    """
+    return Growth(
+        None if evidence is None else Evidence(*_thin(evidence)),
+        {name: Narrowing(*_thin(one)) for name, one in widths.items()},
+    )
+
+
+def _thin(curve: Curve) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    places = pick_points(curve.seconds.size)
+    seconds, values = (column[places].tolist() for column in (curve.seconds, curve.values))
+    return tuple(round(one, 1) for one in seconds), tuple(
+        round_digits(one, _DIGITS) if math.isfinite(one) else math.nan for one in values
+    )
+
+
+def measure_need(effects: Sequence[Named], widths: Mapping[str, Curve]) -> DataNeed | None:
+    """How well the driven time determines the parameters of effects, and how much more is needed.
+
+    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger,
+    and open if the interval is as wide as that value itself.
+
+    Args:
+        effects: identified effects.
+        widths: half-width of the 95 % interval by label ``effect.name``.
+
+    Returns:
+        None where no identified effect has a curve.
+    """
+    known, vague, needed, driven, small, open_ones = [], [], 0.0, 0.0, False, 0
+    for effect in effects:
+        for name, value in effect.parameters.items():
+            label = f"{effect.id}.{name}"
+            curve = widths.get(label)
+            if curve is None:
+                continue
+            half, goal = float(curve.values[-1]), find_goal(effect.id, name, value.value)
+            if value.is_undetermined or not half < goal / INTERVAL_SHARE:
+                open_ones += 1
+                continue
+            since = last_until(curve, goal)
+            driven = max(driven, float(curve.seconds[-1]))
+            needed = max(needed, last_until(curve, half * (1.0 + _NO_NARROWER)))
+            if math.isfinite(since):
+                known.append((since, label))
+                small |= half > INTERVAL_SHARE * abs(value.value)
+            else:
+                vague.append((half / goal, label, half, value.unit, curve, goal))
+    if not (known or vague or open_ones):
+        return None
+    need = DataNeed(
+        tuple(label for _, label in sorted(known)),
+        max(known)[0] if known else math.nan,
+        driven,
+        is_typical=small,
+        open=open_ones,
+        idle_share=1.0 - needed / driven if driven else 0.0,
+    )
+    if not vague:
+        return need
+    _, label, half, unit, curve, goal = max(vague, key=lambda one: one[0])
+    seconds = extrapolate(curve, goal)
+    minutes = math.ceil((seconds - driven) / 60.0) if seconds < _TOO_LONG * driven else 0
+    return replace(need, vague=label, half_width=half, unit=unit, others=len(vague) - 1, minutes=minutes)
+
+
+def pick_points(count: int) -> Ints:
+    """Indices of the points of a curve that are reported: at most sixty, including the first and the last."""
+    return np.unique(np.linspace(0, max(count - 1, 0), min(count, _POINTS)).round().astype(np.int64))
+
+
+def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
+    """Half-widths of the 95 % intervals of all smooth parameters of effects, by label ``effect.name``.
+
+    See `narrow_part`; parameters of single runs are excluded.
+    """
+    curves: dict[str, Curve] = {}
+    for fit in fitted.fits:
+        if not fit.free:
+            continue
+        seconds, halves = narrow_part(fit)
+        curves |= {
+            number.label: Curve(seconds, halves[:, index])
+            for index, number in enumerate(fit.free)
+            if number.effect and number.run is None and number.is_smooth
+        }
+    return curves
+
+
+def find_goal(effect: str, name: str, value: float) -> float:
+    """Target half-width for a parameter: a share of its size, or of its typical size if that is larger."""
+    parameter = find_effect(effect)().parameter(name)
+    neutral = parameter.neutral if math.isfinite(parameter.neutral) else 0.0
+    return INTERVAL_SHARE * max(abs(value), abs(parameter.typical - neutral))
+
+
+def last_until(curve: Curve, goal: float) -> float:
+    """Seconds after which a curve stays at or below a goal; infinite if it ends above it."""
+    above = np.flatnonzero(~(curve.values <= goal))
+    if above.size == 0:
+        return float(curve.seconds[0])
+    if above[-1] == curve.seconds.size - 1:
+        return math.inf
+    return float(curve.seconds[above[-1] + 1])
+
+
+def extrapolate(curve: Curve, goal: float) -> float:
+    """Seconds of such driving after which a width would reach a goal; infinite if it never would.
+
+    The square of a width is the sum of a part that falls with the driving time, and of a constant: more
+    driving does not reduce the clock errors. Both are fitted to the later half of the curve.
+    """
+    seconds, squares = curve.seconds, curve.values**2
+    later = np.isfinite(squares) & (seconds >= 0.5 * seconds[-1])
+    if later.sum() < 2:  # noqa: PLR2004 - two numbers are read from it
+        return float(seconds[-1] * squares[-1] / goal**2)
+    slope, stays = np.polyfit(1.0 / seconds[later], squares[later], 1)
+    # The extrapolation begins at the last width, even if the fit deviates from it.
+    falls = float(np.clip(slope / seconds[-1], 0.0, squares[-1]))
+    stays = float(squares[-1]) - falls
+    return math.inf if stays >= goal**2 else float(seconds[-1]) * falls / (goal**2 - stays)

@@ -1,0 +1,204 @@
+"""What follows from a result: refusals, the effects that count, and the distance to the noise floor."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, TypeVar
+
+from pipeline.core import JSON_DIGITS, format_share, round_digits
+from pipeline.core.untrusted import number_in, objects_in
+from pipeline.recording import FAULTS
+from pipeline.results import Errors, Finding, RunDiagnosis, Step
+from pipeline.run.signals import GROUND_UNOBSERVABLE
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterable, Sequence
+
+    from pipeline.models import ModelFile
+
+Entry = TypeVar("Entry")
+
+ERRORS_OVER_2S: Final = {"t_mrmse_m": ("position", "m"), "r_mrmse_rad": ("heading", "rad")}
+"""Quantity and unit by name in `Errors` and in JSON."""
+_TEXTS = ("id", "text", "where", "severity")
+NOTHING = 1e-3
+"""Relative increase below which an error counts as unchanged: rounding of fits."""
+# Two fits of one model differ by as much on other folds: a step may raise one error by this share.
+CHANCE = 1e-2
+"""Relative change of an error over 2 s below which it is chance: the smallest relevant one, as
+`LEAST_GAIN`."""
+FATAL = ("not_moving", "pose_from_wheels", *FAULTS)
+"""Findings of which one makes every fit meaningless: no effect is named."""
+CHANGE = "changing_number"
+"""The finding of a run during which a number of the model changes."""
+SEARCH_CUT = "search_cut"
+"""The finding of a run whose budget ended the search for effects before it was complete."""
+BREVITY = "little_driving"
+"""Finding of a run with less driving than effects can be trusted on."""
+ABOVE_FLOOR = 1.5
+"""Factor over the (estimated) noise floor above which an error over 2 s is not noise."""
+DETECTED_SHARE = 90
+"""Share of logs with an effect of the size of a detection limit in which it is named [percent]."""
+INTERVAL_SHARE = 0.05
+"""Target half-width of a 95 % interval as a share of the parameter's size."""
+_MAIN_SHARE = 0.1
+"""Of the ideal model's error over 2 s, in metres or radians: an effect that removes less is a smaller one."""
+
+
+def read_findings(content: Mapping[str, object]) -> tuple[Finding, ...]:
+    """The ``findings`` of a run's JSON object."""
+    return tuple(
+        Finding(
+            **{name: str(one.get(name) or "") for name in _TEXTS},  # type: ignore[arg-type]
+            value=one.get("value"),
+            t_start=number_in(one, "t_start"),
+            t_end=number_in(one, "t_end"),
+        )
+        for one in objects_in(content, "findings")
+    )
+
+
+def find_refusal(findings: Iterable[Finding]) -> str:
+    """The finding that makes every fit to a run meaningless; empty where there is none."""
+    return next((one.text for one in findings if one.id in FATAL), "")
+
+
+def has_no_pose(findings: Iterable[Finding]) -> bool:
+    """Whether the log of a run holds no pose, so that only its drivetrain is observable."""
+    return any(one.id == GROUND_UNOBSERVABLE for one in findings)
+
+
+def read_model(run: RunDiagnosis) -> ModelFile | None:
+    """The model file that a diagnosis proposes; None without a readable one."""
+    from pipeline.models.model_file import parse_model  # noqa: PLC0415 - heavy
+    from pipeline.run import MotionError  # noqa: PLC0415 - heavy
+
+    try:
+        return None if run.model is None else parse_model(run.model, Path("diagnosis.toml"))
+    except MotionError:
+        return None
+
+
+def list_added(before: Step, after: Step) -> list[str]:
+    """Ids of the effects that a step of the ladder has beyond the one below."""
+    return [name for name in after.effects if name not in before.effects]
+
+
+def rank_effects(ladder: Sequence[Step]) -> dict[str, float]:
+    """Effects in the order in which they are listed everywhere: that of the ladder.
+
+    Returns:
+        The share of the ideal model's error over 2 s that each removes, in position or heading, by id.
+    """
+    shares: dict[str, float] = {}
+    for before, after in pairwise(ladder):
+        falls = [
+            fall
+            for key in ERRORS_OVER_2S
+            if (ideal := getattr(ladder[0], key))
+            and math.isfinite(fall := (getattr(before, key) - getattr(after, key)) / ideal)
+        ]
+        for name in list_added(before, after):
+            shares.setdefault(name, max(falls, default=0.0))
+    return shares
+
+
+def rank_main(ladder: Sequence[Step]) -> dict[str, float]:
+    """Those of `rank_effects` up to the last one that removes a tenth of the error, at least one effect.
+
+    What removes less before it stays in the list, so that each error continues from the one above.
+    """
+    ranked = rank_effects(ladder)
+    large = [number for number, share in enumerate(ranked.values()) if share >= _MAIN_SHARE]
+    return dict([*ranked.items()][: max([*large, 0]) + 1])
+
+
+def split_main(
+    effects: Sequence[Entry], ladder: Sequence[Step], read: Callable[[Entry], tuple[str, bool]]
+) -> tuple[list[Entry], list[Entry]]:
+    """The effects of `rank_main` with the clocks that were corrected, and the smaller effects.
+
+    A clock that was corrected before the first fit has no step of the ladder that could show it to be small.
+
+    Args:
+        effects: that were named.
+        ladder: as in `rank_main`.
+        read: the id of one of them, and whether it was corrected.
+
+    Returns:
+        Main and smaller effects in their order; where `rank_main` lists none, all are main.
+    """
+    first = rank_main(ladder)
+    if not first.keys() & {read(effect)[0] for effect in effects}:
+        return list(effects), []
+    is_main = [name in first or corrected for name, corrected in map(read, effects)]
+    main = [effect for effect, chosen in zip(effects, is_main, strict=True) if chosen]
+    return main, [effect for effect, chosen in zip(effects, is_main, strict=True) if not chosen]
+
+
+def is_small(name: str | None, ladder: Sequence[Step]) -> bool:
+    """Whether the ladder contains an effect that `rank_main` does not list."""
+    ids = {added for before, after in pairwise(ladder) for added in list_added(before, after)}
+    return name in ids - set(rank_main(ladder))
+
+
+def list_excess(run: RunDiagnosis) -> dict[str, float]:
+    """The errors of the last step over the noise floor, where that is known."""
+    last, floor = run.ladder[-1], run.noise_floor or Errors()
+    return {
+        key: getattr(last, key) / least
+        for key in ERRORS_OVER_2S
+        if (least := getattr(floor, key)) > 0.0 and math.isfinite(getattr(last, key))
+    }
+
+
+def measure_excess(run: RunDiagnosis) -> float:
+    """The larger error of the last step over its noise floor; 0 where that is not known."""
+    return max(list_excess(run).values(), default=0.0) if run.ladder else 0.0
+
+
+def read_error(errors: object, name: str) -> float:
+    """An error by its name; NaN if unknown."""
+    value = errors.get(name) if isinstance(errors, Mapping) else getattr(errors, name)
+    return float(value) if isinstance(value, int | float) else math.nan
+
+
+def as_written(errors: object, name: str) -> float:
+    """An error with the digits that JSON has; NaN if unknown."""
+    return round_digits(read_error(errors, name), JSON_DIGITS)
+
+
+def list_rises(below: object, errors: object, forgiven: float = NOTHING) -> tuple[str, ...]:
+    """Names in `ERRORS_OVER_2S` of the errors that rise in a step; unknown errors do not rise.
+
+    They are compared as they are written, so that screen and page agree.
+
+    Args:
+        below: errors before the step, or the step in JSON.
+        errors: errors after it.
+        forgiven: tolerated relative increase, by default that of rounding.
+    """
+    return tuple(
+        name
+        for name in ERRORS_OVER_2S
+        if as_written(errors, name) > as_written(below, name) * (1.0 + forgiven)
+    )
+
+
+def format_rises(below: object, errors: object, forgiven: float = NOTHING) -> str:
+    """Which 2 s errors rise, and by how much: `position error rises by 2.0%`; empty where none does.
+
+    Args:
+        below: errors before, or the step in JSON.
+        errors: errors after.
+        forgiven: fraction by which an error may rise.
+    """
+    phrases: list[str] = []
+    for key in list_rises(below, errors, forgiven):
+        old, new = read_error(below, key), read_error(errors, key)
+        by = f" by {format_share(new / old - 1.0)}" if old else ""
+        phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
+    return ", ".join(phrases)

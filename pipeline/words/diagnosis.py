@@ -1,0 +1,540 @@
+"""A diagnosis as lines of text: verdict, main effects and remaining error; then all other sections."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+
+from pipeline.core import (
+    INPUT_WORDS,
+    format_angle,
+    format_length,
+    format_part,
+    format_share,
+    mark_finding,
+    suffix_unit,
+)
+from pipeline.models.catalogue import list_effects, name_term
+from pipeline.models.effect import Excitation
+from pipeline.results import (
+    Errors,
+    Finding,
+    Learned,
+    Named,
+    RunDiagnosis,
+    Step,
+    Undecided,
+    Unexplained,
+    Value,
+    split_determined,
+)
+from pipeline.results.reading import (
+    ABOVE_FLOOR,
+    BREVITY,
+    CHANCE,
+    CHANGE,
+    DETECTED_SHARE,
+    ERRORS_OVER_2S,
+    SEARCH_CUT,
+    format_rises,
+    is_small,
+    list_added,
+    measure_excess,
+    split_main,
+)
+from pipeline.run.windows import HORIZON_S
+from pipeline.words.effects import (
+    CAUSE_NAMES,
+    describe_cause,
+    describe_motion,
+    describe_separation,
+    format_numbers,
+    format_with_range,
+    name_group,
+    suggest_drive,
+)
+from pipeline.words.errors import (
+    describe_lead,
+    describe_moments,
+    describe_need,
+    describe_regions,
+    describe_unexplained,
+    format_remaining_error,
+    format_step,
+)
+from pipeline.words.verdict import format_verdict
+
+Row = tuple[str, str]
+
+VERDICT = "verdict"
+_LABEL = 10
+"""Columns of a label on a screen, with the space after it."""
+_INDENT = "    "
+_WIDEST = 34
+"""Largest column width for the values of an effect in a table of effects."""
+_MOST_IN_LINE = 2
+"""Most values in one line; an effect with more, as a servo, has one line per value."""
+_UNCHANGED = "no visible change of the error over 2 s"
+_WHERE_SHOWN = 3
+"""Regions of the error that are listed."""
+_UNOBSERVABLE_SHOWN = 8
+"""Unobservable effects that are listed: more would fill a screen."""
+_DETECTABLE_SHOWN = 5
+"""Detection limits that are listed, the smallest ones."""
+_VALUE = re.compile(r'^(\w+) = \{ value = ([^,}]+), unit = "([^"]*)"', re.MULTILINE)
+_IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal yaw rate"}
+"""Inputs of formulas in words."""
+_FINDINGS_SHOWN = 3
+"""Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
+_EFFECTS_SHOWN = 5
+"""Effects with a line by default."""
+_RANK = {"error": 0, "warning": 1, "info": 3}
+_LONGEST_TERM = 70
+"""Characters up to which a suggested term is shown: a longer one is no formula that anybody reads."""
+
+
+def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: bool = False) -> str:
+    """A diagnosis as plain text; the common part of runs that were judged together appears once.
+
+    Args:
+        runs: of one run, or of all that were judged together.
+        following: command suggested as the next step, where effects were identified.
+        everything: show all sections, not only verdict, main effects and remaining error.
+    """
+    first, *others = runs
+    heads = [run.run for run in runs]
+    heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason or '')}"
+    lines = list_lines(first, others, everything=everything)
+    rows = format_lines(lines)
+    if following and first.effects:
+        rows.append(f"next      {following}")
+    return "".join(f"{line}\n" for line in [*heads, *rows])
+
+
+def format_lines(lines: Sequence[Row]) -> list[str]:
+    """Lines as shown on a screen; the verdict has no label."""
+    return [text if label == VERDICT else f"{label:<{_LABEL - 1}} {text}".rstrip() for label, text in lines]
+
+
+def _name_input(source: str, reason: str) -> str:
+    return f"{INPUT_WORDS[source]}{f' ({reason})' if reason else ''}"
+
+
+def list_lines(
+    run: RunDiagnosis, others: Sequence[RunDiagnosis] = (), *, everything: bool = False
+) -> list[Row]:
+    """Label and text of every line after the head; a line without a label continues the section above.
+
+    Args:
+        run: what was found.
+        others: in the runs that were judged together with it.
+        everything: all sections, not only verdict, main effects, what they do not explain, and findings.
+    """
+    verdict = format_verdict(run)
+    findings = list_findings(
+        {one.run: one.findings for one in (run, *others)}, verdict, everything=everything
+    )
+    lines = [(VERDICT, verdict)]
+    if not run.ladder:
+        return [*lines, *findings]
+    if everything:
+        return [*lines, *_list_all(run, findings)]
+    return [*lines, *_label("effects", _list_main(run)), *_label("remaining", _list_rest(run)), *findings]
+
+
+def _list_main(run: RunDiagnosis) -> list[str]:
+    """A line for each of the main effects: its term, value, the error that it lowers most, and its id."""
+    main, minor, _ = _split_effects(run)
+    felt, small = _split_ambiguous(run)
+    undecided = {item.in_model for item in felt}
+    shown = [effect for effect in main if effect.id not in undecided]
+    folded = len(shown[_EFFECTS_SHOWN:]) + len(minor) + len(small)
+    falls = {
+        name: _format_largest_fall(before, after)
+        for before, after in pairwise(run.ladder)
+        for name in list_added(before, after)
+    }
+    rows = [
+        (
+            name_term(effect.id),
+            _format_short(effect),
+            "corrected before the fit" if effect.corrected else falls.get(effect.id, ""),
+            effect.id,
+        )
+        for effect in shown[:_EFFECTS_SHOWN]
+    ]
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    texts = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)) for row in rows]
+    for item in felt:
+        texts.append(f"Undecided: {name_group(item.candidates)}")
+        texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
+    if folded:
+        texts.append(f"{folded} smaller effect{'s' * (folded > 1)} (--all)")
+    return texts
+
+
+def _format_short(effect: Named) -> str:
+    """The value of an effect, or how many it has."""
+    if effect.by_run:
+        return "one offset a run"
+    return format_numbers(effect.shown) if len(effect.shown) == 1 else f"{len(effect.shown)} numbers"
+
+
+def _format_largest_fall(before: Step, after: Step) -> str:
+    """The error over 2 s that falls most, before and after a step."""
+    shares = {key: getattr(after, key) / old for key in ERRORS_OVER_2S if (old := getattr(before, key)) > 0.0}
+    largest = min(shares, key=shares.__getitem__, default=None)
+    return "" if largest is None else _format_fall(before, after, largest) or _UNCHANGED
+
+
+def _list_rest(run: RunDiagnosis) -> list[str]:
+    """What the effects do not explain, and a suggested term."""
+    rest = run.unexplained
+    if rest is None:
+        return []
+    return [describe_unexplained(rest), *_list_terms(rest), format_suggestion(rest)]
+
+
+def _list_terms(rest: Unexplained) -> list[str]:
+    terms = [line for line in _list_formula(rest.formula or "") if len(line) <= _LONGEST_TERM]
+    return [f"suggested term: {line}" for line in terms]
+
+
+def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
+    """All sections after the verdict."""
+    main, minor, unknown = _split_effects(run)
+    felt, small = _split_ambiguous(run)
+    falls = _list_falls(run)
+    short = [effect for effect in main if len(effect.shown) <= _MOST_IN_LINE]
+    width = max((len(_format_values(effect)) for effect in short), default=0)
+    effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
+    effects += [text for item in felt for text in _format_ambiguous(item, falls)]
+    others = [text for one in minor for text in _format_effect(one, run, falls)]
+    others += [text for item in small for text in _format_ambiguous(item, falls)]
+    learned = run.learned
+    return [
+        *_label("effects", effects),
+        *_label("remaining", _format_remaining(run)),
+        *_label("learned", [] if learned is None or learned.helps else [format_learned_share(learned)]),
+        *findings,
+        *_label("smaller", others),
+        *_label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)]),
+        *_label("causes", [text for effect in run.effects for text in _format_causes(effect)]),
+        *_label("clocks", [_format_encoders(run)]),
+        *_label("ranges", [text for effect in run.effects for text in _format_range(effect)]),
+        *_label("error", [f"{format_step(run.ladder[0])} over {HORIZON_S:g} s with the ideal model"]),
+        *_label("where", describe_regions(run.where)[:_WHERE_SHOWN]),
+        *_label("when", [describe_moments(one) for one in run.when]),
+        *_label("budget", [_format_budget(run)]),
+        *_label("data", [describe_need(run)]),
+        *_label("unseen", _format_unobservable(run)),
+        *_label("limits", [_format_detectable(run)]),
+    ]
+
+
+def _label(label: str, texts: Sequence[str]) -> list[Row]:
+    return [("" if number else label, text) for number, text in enumerate(filter(None, texts))]
+
+
+def _split_effects(run: RunDiagnosis) -> tuple[list[Named], list[Named], list[Named]]:
+    """Effects that remove a tenth of the error, with corrected clocks; smaller ones; those without a number.
+
+    What this log does not determine, or only at a bound, has no row but with `--all`.
+    """
+    unknown = [effect for effect in run.effects if not effect.is_determined]
+    known = [effect for effect in run.effects if effect.is_determined]
+    return *split_main(known, run.ladder, lambda effect: (effect.id, effect.corrected)), unknown
+
+
+def _format_unknown(run: RunDiagnosis) -> str:
+    """Numbers that this log does not determine."""
+    texts = [
+        f"{effect.id} {', '.join(unknown)}"
+        for effect in run.effects
+        if not (effect.corrected or effect.by_run) and (unknown := split_determined(effect.parameters)[1])
+    ]
+    return f"not determined by this log: {'; '.join(texts)}" if texts else ""
+
+
+def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:
+    """Groups with an effect that removes a tenth of the error or with none in the model; smaller groups."""
+    small = [item for item in run.undecided if is_small(item.in_model, run.ladder)]
+    return [item for item in run.undecided if item not in small], small
+
+
+def _format_effect(
+    effect: Named, run: RunDiagnosis, falls: Mapping[str, str], width: int = 0
+) -> Iterator[str]:
+    """The motion due to an effect, then its id with values, error reductions and qualifications."""
+    yield describe_motion(effect, run)
+    notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
+    notes += ["corrected before the fit"] if effect.corrected else []
+    parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
+    yield from _describe_numbers(effect.id, effect.shown, parts, _format_values(effect), width)
+    for name, numbers in zip(run.joint, effect.by_run, strict=False):
+        yield f"{_INDENT}{format_numbers(numbers)} in {name}"
+
+
+def _describe_numbers(
+    name: str, numbers: Mapping[str, Value], parts: Sequence[str], values: str, width: int = 0
+) -> Iterator[str]:
+    """An id with its values and notes: in one line, or with one line per value."""
+    is_long = len(numbers) > _MOST_IN_LINE
+    first = "" if is_long else f"{values:<{min(width, _WIDEST)}}"
+    rest = "  ".join(filter(None, [first, *parts]))
+    yield f"{_INDENT}{_pad_id(name)}{rest}".rstrip()
+    if is_long:
+        yield from (f"{_INDENT}{_pad_id('')}{_format_all({key: one})}" for key, one in numbers.items())
+
+
+def _pad_id(name: str) -> str:
+    """An id padded to a column, always followed by two spaces."""
+    return f"{name + '  ':<20}"
+
+
+def _format_ambiguous(item: Undecided, falls: Mapping[str, str]) -> Iterator[str]:
+    yield f"Undecided: {name_group(item.candidates)}"
+    for name in item.candidates:
+        if numbers := split_determined(item.parameters.get(name, {}))[0]:
+            notes = [falls.get(name, ""), "(in the model)"] if name == item.in_model else []
+            yield from _describe_numbers(name, numbers, notes, _format_all(numbers))
+    yield f"{_INDENT}to separate them: {describe_separation(item)}"
+
+
+def _format_remaining(run: RunDiagnosis) -> list[str]:
+    """The remaining error relative to the noise floor, and its structure."""
+    last, floor = run.ladder[-1], run.noise_floor or Errors()
+    rows = []
+    if len(run.ladder) > 1:
+        text = format_remaining_error(last.t_mrmse_m, floor.t_mrmse_m, run.explained_share)
+        rows.append(text.removeprefix("remaining error "))
+        if last.r_mrmse_rad >= ABOVE_FLOOR * floor.r_mrmse_rad > 0.0:
+            turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
+            rows.append(f"{turn} in heading, noise floor {least}")
+    if run.learned is not None and run.learned.helps:
+        rows.append(format_learned_share(run.learned))
+    rest = run.unexplained
+    if rest is None:
+        return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
+    rows.append(describe_unexplained(rest))
+    rows += _list_terms(rest)
+    return [*rows, format_suggestion(rest), *_suggest_next_steps(run)]
+
+
+def _list_formula(text: str) -> Iterator[str]:
+    """Each term of a formula as model files have it, with its numbers, and its inputs in words."""
+    numbers = [(name, f"{float(value):.3g} {unit}") for name, value, unit in _VALUE.findall(text)]
+    for line in text.splitlines():
+        if line.startswith("v_"):
+            names = set(re.findall(r"\w+", line))
+            known = [f"{name} = {value.removesuffix(' 1')}" for name, value in numbers if name in names]
+            known += [f"{name} the {words}" for name, words in _IDEAL.items() if name in names]
+            yield ", ".join([line.replace('"', ""), *known])
+
+
+def format_suggestion(rest: Unexplained) -> str:
+    """What a suggested formula would bring; empty without one."""
+    if rest.with_formula is None:
+        return ""
+    remaining = format_step(rest.with_formula)
+    return f"no model holds it until you add it (`slip serve`): {remaining} would remain over {HORIZON_S:g} s"
+
+
+def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
+    """Suggested steps where no known effect explains the remaining error."""
+    if measure_excess(run) < ABOVE_FLOOR:
+        return []
+    noted = {one.id for one in run.findings}
+    if CHANGE in noted:
+        causes = "load, tyres, battery, controller or terrain"
+        return [
+            f"next steps: find out what changed then ({causes}); cut the log there, and diagnose both parts"
+        ]
+    if SEARCH_CUT in noted:
+        return ["next steps: diagnose the run again with a larger --budget"]
+    if BREVITY in noted:
+        return ["next steps: drive longer, with turns and speeds of both signs"]
+    steps = ["see what `slip plan` proposes"] if run.undecided or run.unobservable_why else []
+    steps += ["diagnose another run to see whether it repeats", "write the missing effect yourself"]
+    how = "as a formula in `slip serve`, or in Python with `slip model new-effect`"
+    return [f"next steps: {'; '.join(steps)}, {how}"]
+
+
+def format_learned_share(learned: Learned) -> str:
+    """The share that a learned term explains beyond the physics, or why it does not help; else empty."""
+    if not learned.helps:
+        return f"a learned term does not help: {learned.reason}" if learned.reason else ""
+    # Below the noise floor a share is of nothing.
+    known = {
+        ERRORS_OVER_2S[name][0]: one
+        for name, one in learned.explained_share.items()
+        if one is not None and one.physics < 1.0 and one.with_learned < 1.0
+    }
+    if not known:
+        return ""
+    removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
+    with_learned = " and ".join(format_share(one.with_learned) for one in known.values())
+    beyond = f"with a function learned from the data, which names no cause, {with_learned}"
+    return f"above the noise floor the effects remove {' and '.join(removed)}; {beyond}"
+
+
+def _format_causes(effect: Named) -> Iterator[str]:
+    """Possible causes of an effect; its motion stands above, under `effects`."""
+    if cause := describe_cause(effect):
+        yield f"{effect.id}: {cause}"
+
+
+def _format_range(effect: Named) -> Iterator[str]:
+    """The expected range of values in another run on this ground, where it is known."""
+    ends = [
+        f"{name} {value.another_run.low:.3g} to {value.another_run.high:.3g}{suffix_unit(value.unit)}"
+        for name, value in effect.parameters.items()
+        if math.isfinite(value.another_run.low)
+    ]
+    if ends:
+        yield f"expected range between runs: {effect.id} {', '.join(ends)}"
+
+
+def _format_encoders(run: RunDiagnosis) -> str:
+    """How late the encoders are in the fit, beyond what was corrected against the gyro before."""
+    late = run.timing.wheel_delay_s
+    corrected = any(one.id == "wheels_delay" for one in run.findings)
+    beyond = " beyond the delay corrected before the fit" if corrected else ""
+    return f"estimated encoder delay {late * 1e3:.0f} ms{beyond}" if late else ""
+
+
+def _format_budget(run: RunDiagnosis) -> str:
+    """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
+    for budget in run.budget if run.effects else ():
+        if (budget.input, budget.quantity) == (run.input, "slip"):
+            parts = [
+                f"{CAUSE_NAMES.get(one.effect, one.effect)} {format_part(one.share)}"
+                for _, one in budget.causes
+            ]
+            signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
+            total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
+            return f"error budget by cause ({total}): {', '.join(parts)}{signs}"
+    return ""
+
+
+def _format_values(effect: Named) -> str:
+    return "a clock offset of each run:" if effect.by_run else _format_all(effect.shown)
+
+
+def _format_all(numbers: Mapping[str, Value]) -> str:
+    """Values by parameter, with their ranges between runs where these are much wider."""
+    return ", ".join(f"{name} = {format_with_range(value)}" for name, value in numbers.items())
+
+
+def _list_falls(run: RunDiagnosis) -> dict[str, str]:
+    """Changes of the errors at the ladder step of each effect, and by how much one of them rises."""
+    falls: dict[str, str] = {}
+    for before, after in pairwise(run.ladder):
+        falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
+        visible, rises = ", ".join(filter(None, falling)), format_rises(before, after, CHANCE)
+        text = f"{visible} ({rises})" if visible and rises else visible or rises
+        for name in list_added(before, after):
+            falls[name] = text or (_UNCHANGED if falling else "")
+    return falls
+
+
+def _format_fall(before: Step, after: Step, key: str) -> str | None:
+    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
+    old, new = getattr(before, key), getattr(after, key)
+    if not math.isfinite(old + new):
+        return None
+    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
+    texts = [render(value) for value in (old, new)]
+    if texts[0] == texts[1]:
+        return ""
+    (number, unit), (_, other) = (text.split() for text in texts)
+    same = unit.rstrip("s") == other.rstrip("s")
+    return f"{number if same else texts[0]} -> {texts[1]}"
+
+
+def _format_unobservable(run: RunDiagnosis) -> list[str]:
+    hidden = list(run.unobservable_why)
+    if not hidden:
+        return []
+    shown = ", ".join(hidden[:_UNOBSERVABLE_SHOWN])
+    others = f" and {len(hidden) - _UNOBSERVABLE_SHOWN} more" if len(hidden) > _UNOBSERVABLE_SHOWN else ""
+    manoeuvres = dict.fromkeys(part for name in hidden for part in suggest_drive(name).split("; "))
+    advice = "; ".join(list(manoeuvres)[:3])
+    # Only a rehearsal shows what a drive reaches within the limits of the site and the robot.
+    needs = [kind.needs for kind in list_effects() if kind.id in hidden]
+    if any(Excitation.SLOPE not in one for one in needs):
+        advice += "; `slip plan` says whether its room and time are enough"
+    return [
+        f"not observable in this log: {shown}{others}",
+        f"to observe {'it' if len(hidden) == 1 else 'them'}: {advice}",
+    ]
+
+
+def _format_detectable(run: RunDiagnosis) -> str:
+    """Detection limits of effects that were not identified, the smallest first."""
+    known = {kind.id: kind for kind in list_effects()}
+    usual = {one.id: known[one.id]().parameter(one.parameter) for one in run.detectable if one.id in known}
+    sharpest = sorted(
+        (one for one in run.detectable if one.id in usual),
+        key=lambda one: one.size / usual[one.id].usual_size,
+    )
+    shown = [
+        f"{name_term(one.id)} {format_share(one.size)}"
+        if one.unit == "1"
+        else f"{name_term(one.id)} {one.size:.2g} {one.unit}"
+        for one in sharpest[:_DETECTABLE_SHOWN]
+    ]
+    return f"detection limits ({DETECTED_SHARE} %): {', '.join(shown)}" if shown else ""
+
+
+def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everything: bool) -> list[Row]:
+    """The findings of runs, except those stated in the verdict: each once, the severe ones first.
+
+    Args:
+        runs: findings by the name of the run.
+        verdict: on them.
+        everything: also notes, and more than three.
+    """
+    by_text: dict[tuple[str, str], list[str]] = {}
+    for run, findings in runs.items():
+        for key in _join_incidents(findings):
+            if key[1].casefold() not in verdict.casefold():
+                by_text.setdefault(key, []).append(run)
+    texts: list[str] = []
+    notes = 0
+    for (severity, text), where in sorted(by_text.items(), key=lambda one: _RANK.get(one[0][0], 2)):
+        is_note = severity == "info"
+        notes += is_note
+        if everything or not is_note:
+            which = f"{where[0]}: " if len(runs) > 1 and len(where) == 1 else ""
+            count = f" ({len(where)} runs)" if len(where) > 1 else ""
+            texts.append(f"{mark_finding(severity)}{which}{text}{count}")
+    if not everything and len(texts) > _FINDINGS_SHOWN:
+        rest = len(texts) - _FINDINGS_SHOWN + notes
+        texts = [*texts[:_FINDINGS_SHOWN], f"   {rest} more (--all)"]
+    return _label("findings", texts)
+
+
+def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, str]]:
+    """Severity and text of every finding, of incidents of one kind and of repeated ones only once."""
+    incidents: dict[str, list[Finding]] = {}
+    for one in findings:
+        if one.severity != "info" and one.t_start is not None and one.t_end is not None:
+            incidents.setdefault(one.id, []).append(one)
+    timed = [(alike[0].severity, _format_timed(alike)) for alike in incidents.values()]
+    joined = {one for alike in incidents.values() for one in map(id, alike)}
+    plain = Counter((one.severity, one.text) for one in findings if id(one) not in joined)
+    return timed + [
+        (severity, f"{text} ({count} times)" if count > 1 else text)
+        for (severity, text), count in plain.items()
+    ]
+
+
+def _format_timed(alike: Sequence[Finding]) -> str:
+    """Number of incidents of one kind, and the longest of them."""
+    longest = max(alike, key=lambda one: (one.t_end or 0.0) - (one.t_start or 0.0))
+    many = f"{len(alike)} incidents, the longest " if len(alike) > 1 else ""
+    return f"{many}from {longest.t_start:.1f} to {longest.t_end:.1f} s: {longest.text}"

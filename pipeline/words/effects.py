@@ -1,0 +1,152 @@
+"""Effects as text: what the vehicle does by them, their possible causes, and their values."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+from pipeline.core import format_interval, round_digits, split_interval, suffix_unit
+from pipeline.models.catalogue import find_effect, list_effects, name_term, suggest_manoeuvre
+from pipeline.models.parameter import AT_BOUND, UNDETERMINED, Level, Reading
+from pipeline.results.reading import read_model
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.models import Effect
+    from pipeline.results import Named, RunDiagnosis, Undecided, Value
+
+CAUSE = ". Cause: "
+"""Separator between an effect and its possible causes in the sentence of a named effect."""
+CAUSE_NAMES = {"localization_noise": "localization noise"}
+"""Causes of an error budget in words, where these differ from the id."""
+_TIGHT = 10.0
+"""Expected range between runs over the interval in this run above which a row says so: a limit that clips the
+samples of one run is known to a fraction of a percent there, and not in the next run."""
+_MOST_ALTERNATIVES = 3
+"""Alternatives of an effect that it names."""
+
+
+def restore_known(name: str, values: Mapping[str, Value]) -> Effect:
+    """The effect for text: digits that intervals support, and of several values those that are known.
+
+    A value at neutral is an estimate, not a start value, and stays; so does a single parameter.
+    """
+    new = find_effect(name)()
+    effect = new.change(**{k: new.parameter(k).round(one.value, one.digits) for k, one in values.items()})
+    if len(new.parameters) == 1:
+        return effect
+    return effect.omit_open(
+        key for key, one in values.items() if one.is_undetermined and one.value != new.parameter(key).neutral
+    )
+
+
+def describe_motion(effect: Named, run: RunDiagnosis) -> str:
+    """What the vehicle does by an effect, with its values beside the other effects of the model."""
+    if run.vehicle is None or effect.id not in _list_known():
+        return name_term(effect.id)
+    return restore_known(effect.id, effect.parameters).describe_motion(run.vehicle, _list_beside(run))
+
+
+def describe_clause(effect: Named, run: RunDiagnosis) -> str:
+    """What the vehicle does by an effect, as a clause of a sentence; empty where its vehicle is not known."""
+    if run.vehicle is None or effect.id not in _list_known():
+        return ""
+    return restore_known(effect.id, effect.parameters).describe_clause(run.vehicle, _list_beside(run))
+
+
+@lru_cache(maxsize=8)
+def _read_effects(model: str) -> tuple[Effect, ...]:
+    from pipeline.results import RunDiagnosis  # noqa: PLC0415 - only for its model
+
+    file = read_model(RunDiagnosis(model=model))
+    return () if file is None else file.model.effects
+
+
+def _list_beside(run: RunDiagnosis) -> tuple[Effect, ...]:
+    """All effects of the model of a diagnosis."""
+    return () if run.model is None else _read_effects(run.model)
+
+
+def list_readings(effect: Named) -> tuple[Reading, ...]:
+    """Its meanings as a property of the vehicle, the ground or the run, which one run cannot separate."""
+    kind = _list_known().get(effect.id)
+    known = () if kind is None else kind.readings
+    if effect.corrected:
+        # The delay comes from the gyro, so it is that of the pose clock and not of the body.
+        known = tuple(one for one in known if one.name == effect.id)
+    return tuple(one for one in known if one.level is Level.RUN) if effect.by_run else known
+
+
+def describe_cause(effect: Named) -> str:
+    """Possible causes of an effect where one run cannot separate them; else empty."""
+    texts = {reading.name: reading.text for reading in reversed(list_readings(effect))}
+    if len(texts) <= 1:
+        return ""
+    between = ", or " if any(" or " in text for text in texts.values()) else " or "
+    return f"{between.join(texts.values())}; a run on another surface separates them."
+
+
+def describe_effect(effect: Named, run: RunDiagnosis) -> str:
+    """An effect with its values, and its possible causes."""
+    motion, cause = describe_motion(effect, run), describe_cause(effect)
+    return f"{motion}{CAUSE}{cause}" if cause else motion
+
+
+def describe_separation(item: Undecided) -> str:
+    """The manoeuvre that distinguishes alternatives."""
+    return suggest_drive(*item.candidates)
+
+
+def suggest_drive(*names: str) -> str:
+    """Manoeuvres that excite effects; nothing for those that only an earlier version knew."""
+    known = _list_known()
+    return suggest_manoeuvre(*(known[name]() for name in names if name in known))
+
+
+def _list_known() -> dict[str, type[Effect]]:
+    return {kind.id: kind for kind in list_effects()}
+
+
+def name_group(candidates: Sequence[str]) -> str:
+    """Alternatives in words: `body inertia or lateral skid`; of many the first two, and how many more."""
+    names = list_names(candidates)
+    return " or ".join(filter(None, [", ".join(names[:-1]), *names[-1:]]))
+
+
+def list_names(candidates: Sequence[str]) -> list[str]:
+    """Alternatives by their terms; of many the first two, and how many more."""
+    names = [name_term(name) for name in candidates]
+    return [*names[:2], f"{len(names) - 2} others"] if len(names) > _MOST_ALTERNATIVES else names
+
+
+def format_value(value: Value) -> str:
+    """A value with its interval where there is one, and whether it is at its bound."""
+    text = f"{round_digits(value.value, value.digits):.3g}{suffix_unit(value.unit)}"
+    if math.isfinite(value.high - value.low):
+        text = format_interval(value.value, value.low, value.high, value.unit)
+    elif math.isfinite(value.low):
+        text += f" [{value.low:.3g}, {value.high:.3g}]"
+    if value.at_bound:
+        return f"{text} ({AT_BOUND})"
+    return f"{text} ({UNDETERMINED})" if value.is_undetermined else text
+
+
+def format_with_range(value: Value) -> str:
+    """A value; where its interval says little about another run, that it is this run's.
+
+    The range between runs stands beside it where it was measured how much runs differ.
+    """
+    low, high = value.another_run.low, value.another_run.high
+    if not high - low > _TIGHT * (value.high - value.low):
+        return format_value(value)
+    _, *ends = split_interval(value.value, low, high)
+    return f"{format_value(value)} this run" + (
+        f", [{', '.join(ends)}] another" if value.is_spread_measured else ""
+    )
+
+
+def format_numbers(numbers: Mapping[str, Value]) -> str:
+    """Values of an effect by parameter, with their intervals."""
+    return ", ".join(f"{name} = {format_value(value)}" for name, value in numbers.items())

@@ -1,0 +1,222 @@
+"""Errors of a model as text: their size, where and when they arise, what remains, and the ladder."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from pipeline.core import (
+    enumerate_texts,
+    format_digits,
+    format_errors,
+    format_length,
+    format_share,
+)
+from pipeline.results.reading import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE
+from pipeline.run.windows import HORIZON_S
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from pipeline.results import Errors, Moments, Region, RunDiagnosis, Span, Unexplained
+
+ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
+REGIONS = {
+    "left": "turning left faster than {0:.2g} rad/s",
+    "right": "turning right faster than {0:.2g} rad/s",
+    "forward": "forward above {0:.2g} m/s",
+    "backward": "backward above {0:.2g} m/s",
+    "turning": "turning faster than {0:.2g} rad/s",
+    "driving": "above {0:.2g} m/s",
+    "curve": "turning faster than {0:.2g} rad/s while driving above {1:.2g} m/s",
+    "on_the_spot": "turning on the spot",
+    "straight": "driving straight",
+    "to_the_left": "to the left above {0:.2g} m/s",
+    "to_the_right": "to the right above {0:.2g} m/s",
+    "sideways": "sideways above {0:.2g} m/s",
+    "change": "within {0:g} s of a change of command",
+    "steady": "in steady driving",
+    "between": "from {0:.0f} to {1:.0f} s",
+    "uphill": "uphill above {0:.0f} degrees",
+    "downhill": "downhill above {0:.0f} degrees",
+    "slope_left": "across a slope to the left above {0:.0f} degrees",
+    "slope_right": "across a slope to the right above {0:.0f} degrees",
+    "x_above": "where x > {0:.1f} m in the map",
+    "x_below": "where x <= {0:.1f} m in the map",
+    "y_above": "where y > {0:.1f} m in the map",
+    "y_below": "where y <= {0:.1f} m in the map",
+}
+"""Regions in words, with their limits."""
+_KNOWN_TO = 1.2  # factor to which a noise floor is known: nine of ten drawn logs are within it
+# A larger share is rounded to more than 100 %: the error is below the noise floor.
+_WHOLE = 1.005
+_GOAL = f"{100.0 * INTERVAL_SHARE:.0f} %"
+# Smallest unused share of a drive that is reported: in uniform driving it can be a fifth.
+_LEAST_SHOWN = 0.25
+_MATTERS = 2.0
+"""Least factor of an input over all others at which it is said."""
+_SPANS = 3
+"""Number of spans in a sentence."""
+_UNITS = {"x": "m/s", "y": "m/s", "w": "rad/s"}
+
+
+def format_step(errors: Errors) -> str:
+    """Both errors over 2 s: `1.06 m and 55 degrees`."""
+    return format_errors(errors.t_mrmse_m, errors.r_mrmse_rad)
+
+
+def name_region(region: Region) -> str:
+    """A region in words; empty for one of an earlier version."""
+    return REGIONS.get(region.id, "").format(*region.limits)
+
+
+def describe_region(region: Region) -> str:
+    """Region, its share of the error and its share of the time."""
+    return next(iter(describe_regions([region])), "")
+
+
+def describe_regions(regions: Sequence[Region]) -> list[str]:
+    """Regions with their shares of the time and of each error; one region of several errors is said once."""
+    alike: dict[tuple[str, tuple[float, ...]], list[Region]] = {}
+    for region in regions:
+        if region.id:
+            alike.setdefault((region.id, region.limits), []).append(region)
+    return [
+        f"{name_region(ones[0])} ({format_share(ones[0].time_share, 0)} of the time): {_join_shares(ones)}"
+        for ones in alike.values()
+    ]
+
+
+def _join_shares(regions: Sequence[Region]) -> str:
+    """Shares of errors: `68 % of the lateral and 65 % of the forward error`."""
+    names = [ERROR_WORDS[one.channel].removesuffix(" error") for one in regions]
+    shares = [f"{format_share(one.share, 0)} of the {name}" for one, name in zip(regions, names, strict=True)]
+    return f"{enumerate_texts(shares)} error"
+
+
+def describe_moments(moments: Moments) -> str:
+    """When half of an error arises: the share of the time, and the spans with the largest shares."""
+    return (
+        f"half of the remaining squared {moments.quantity} error over {HORIZON_S:g} s arises in "
+        f"{format_share(moments.time_share, 0)} of the time; largest parts: "
+        f"{enumerate_texts([name_span(span) for span in moments.spans[:_SPANS]])}"
+    )
+
+
+def name_span(span: Span) -> str:
+    """A span with its share of the error."""
+    return f"{span.t_start:.0f} to {span.t_end:.0f} s ({format_share(span.share, 0)})"
+
+
+def format_excess(ratio: float) -> str:
+    """A remaining error in times the noise floor: `at`, `1.6 times`."""
+    text = format_digits(ratio)
+    return f"{text} times" if float(text) >= _KNOWN_TO else "at"
+
+
+def format_remaining_error(error_m: float, floor_m: float, explained: float) -> str:
+    """Sentence on the remaining error relative to the noise floor; empty where one of them is unknown.
+
+    Args:
+        error_m: held-out position error over 2 s with the model [m].
+        floor_m: the noise floor of that error [m].
+        explained: share of the error above the floor that the model removes; NaN where none was above.
+    """
+    if not math.isfinite(error_m + floor_m):
+        return ""
+    text, floor = f"remaining error {format_length(error_m)}", format_length(floor_m)
+    if error_m < floor_m if math.isnan(explained) else explained > _WHOLE:
+        return f"{text}, below the estimated noise floor of {floor}"
+    if error_m < ABOVE_FLOOR * floor_m:
+        beside = "" if floor == format_length(error_m) else f" ({floor})"
+        return f"{text}, {format_excess(error_m / floor_m)} the noise floor{beside}"
+    removed = (
+        f": the effects remove {format_share(max(explained, 0.0), 0)} of the error above the noise floor"
+    )
+    return f"{text}, noise floor {floor}{'' if math.isnan(explained) else removed}"
+
+
+def describe_structure(rest: Unexplained) -> str:
+    """On what the structure of the residual depends."""
+    if rest.kind == "formula":
+        return f"a formula removes {format_share(rest.share)} of the {ERROR_WORDS[rest.channel]}"
+    if rest.kind == "learned":
+        matters = (
+            f"; {rest.of} matters {rest.times:.0f} times as much as any other"
+            if rest.times >= _MATTERS
+            else ""
+        )
+        return (
+            f"a learned term removes {format_share(rest.share, 0)} of the {rest.quantity} error over 2 s: it "
+            f"depends most on {rest.of}{matters}"
+        )
+    if rest.kind == "lasting":
+        whose = "the wheels' " if rest.path == "wheels" else "the "
+        sizes = {
+            f"{whose}{ERROR_WORDS[one]}": f"({size:.2g} {_UNITS[one]})" for one, size in rest.sizes.items()
+        }
+        if len(sizes) == 1:
+            ((error, size),) = sizes.items()
+            return f"{error} wanders for seconds at a time {size}; nothing that was tried explains it"
+        said = enumerate_texts([" ".join(one) for one in sizes.items()])
+        return f"{said} wander for seconds at a time; nothing that was tried explains them"
+    return "" if rest.region is None else describe_region(rest.region)
+
+
+def describe_unexplained(rest: Unexplained) -> str:
+    """The structure of the residual that no effect explains, by what describes it."""
+    if rest.kind == "region":
+        return f"the {ERROR_WORDS[rest.channel]} is not spread evenly: {describe_structure(rest)}"
+    return describe_structure(rest) or f"{format_share(rest.share)} of the residual has an unknown structure"
+
+
+def describe_lead(run: RunDiagnosis) -> str:
+    """Where the remaining error is concentrated; empty where it is spread evenly."""
+    if run.concentrated is None:
+        return ""
+    return f"the remaining error is not spread evenly: {describe_region(run.concentrated)}"
+
+
+def describe_rest(run: RunDiagnosis) -> str:
+    """Sentence on the residual, apart from what is unexplained."""
+    if run.unexplained is not None:
+        return "Apart from this dependence, the residual is disturbance and localization noise"
+    error, floor = (
+        one.t_mrmse_m if one else math.nan for one in ((run.ladder or (None,))[-1], run.noise_floor)
+    )
+    if run.concentrated is None and floor > 0.0 and error / floor > ABOVE_FLOOR:
+        times = f"{error / floor:.1f} times the noise floor"
+        return f"The remaining error is {times}, and no term that was tried predicts it"
+    even = "The residual does not depend on any recorded signal: disturbance and localization noise"
+    return describe_lead(run) or even
+
+
+def describe_need(run: RunDiagnosis) -> str:
+    """How well the driven time determines the parameters of a diagnosis, and how much more is needed.
+
+    A value is known if the half-width of its interval is a twentieth of it, or of a typical value if larger.
+
+    Returns:
+        A sentence or two; empty where no identified effect has a growth curve.
+    """
+    need = run.need
+    if need is None:
+        return ""
+    # A run that is too short does not show what more driving brings.
+    is_brief = any(one.id == BREVITY for one in run.findings)
+    known, count = len(need.known), len(need.known) + need.open + (need.others + 1 if need.vague else 0)
+    verb = "is" if known == 1 else "are"
+    who = need.known[0] if known == count == 1 else f"{known} of {count} parameters"
+    sentences = [f"{who} {verb} known within {_GOAL}"]
+    if known == count:
+        sentences[0] += f", after {need.since_s:.0f} s of {need.driven_s:.0f} s"
+    if need.vague and not is_brief:
+        sentences.append(
+            f"{need.minutes} more minute{'s' * (need.minutes > 1)} of such driving for {_GOAL} of all"
+            if need.minutes
+            else "more such driving does not narrow the others"
+        )
+    if need.idle_share >= _LEAST_SHOWN and not is_brief:
+        text = f"the last {format_share(need.idle_share)} of the drive"
+        sentences.append(f"{text} narrowed no interval by more than a tenth")
+    return "; ".join(sentences)

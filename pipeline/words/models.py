@@ -1,0 +1,145 @@
+"""Fits of models as text: parameters, ladders, contests, and what a model is refused."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from pipeline.core import format_share
+from pipeline.models.parameter import AT_BOUND, UNDETERMINED
+from pipeline.results.reading import ERRORS_OVER_2S, format_rises
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping, Sequence
+
+    from pipeline.estimation.folds import Errors
+    from pipeline.estimation.ladder import Ladder, LadderStep
+    from pipeline.estimation.rivals import Contest, Rival
+    from pipeline.run import MotionRun
+
+_HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
+_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
+
+
+def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
+    """The ladder as a text table."""
+    heads, units = format_heads("held-out error of")
+    lines = [f"{heads}{'removed':>9}", units]
+    for number, (step, share) in enumerate(zip(ladder.steps, ladder.explained_shares(floor), strict=True)):
+        below = ladder.steps[max(number - 1, 0)]
+        added = ", ".join(name for name in step.effects if name not in below.effects)
+        removed = "" if share is None else f"{format_share(share, 0):>9}"
+        lines.append(f"{'ideal' if number == 0 else f'+ {added}':<30}{_columns(step.errors)}{removed}")
+        rises = format_rises(below.errors, step.errors)
+        lines += [f"  ! {rises}"] if rises else []
+    if floor is not None:
+        lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
+    if ladder.idle:
+        verb = "does" if len(ladder.idle) == 1 else "do"
+        lines.append(f"{', '.join(ladder.idle)} {verb} not reduce the held-out error")
+    return lines
+
+
+def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
+    """Change of the 2 s errors of the whole model, and the objection to it, if any."""
+    old, new = before.errors, after.errors
+    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
+    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
+    word = "added" if set(after.effects) > set(before.effects) else "changed"
+    line = f"{'all effects, before -> after':<30}{position}   {heading}"
+    note = refusal or format_rises(old, new)
+    return [line, f"  ! {note}: {word} as requested"] if note else [line]
+
+
+def format_measured_errors(name: str, errors: Errors) -> str:
+    """One row of errors."""
+    return f"{name:<30}{_columns(errors)}"
+
+
+def format_heads(name: str) -> tuple[str, str]:
+    """The headers of the error columns, and their units."""
+    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
+    return f"{name:<30}{heads}", f"{'':<30}{units}"
+
+
+def _columns(errors: Errors) -> str:
+    x, y, turn = errors.velocity_rms
+    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
+    values.append((math.degrees(errors.r_mrmse_rad), 2))
+    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)
+
+
+def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
+    """Corrections to and exclusions of poses; empty where there are none."""
+    lines = []
+    for run in runs:
+        spread, outlier_s = run.alignment.latency_spread_s, run.alignment.outlier_s
+        if spread > 0.0:
+            lines.append(f"{run.name}: the pose latency varies by {spread:.2g} s: corrected")
+        if outlier_s > 0.0:
+            lines.append(f"{run.name}: {outlier_s:.3g} s excluded: the localization contradicts the wheels")
+    return lines
+
+
+def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[str]:
+    """Parameters with intervals, one per line."""
+    lines = []
+    for label, entry in parameters.items():
+        rows = entry.get("runs")
+        for row in rows if isinstance(rows, list) else [entry]:
+            unit = "" if entry["unit"] == "1" else entry["unit"]
+            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
+            if row.get("low") is not None:
+                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            elif row.get("fitted"):
+                text += UNDETERMINED
+            marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
+            marks += ["not observable in these runs"] * (row.get("observable") is False)
+            text += "".join(f"  ({mark})" for mark in marks)
+            if "run" in row:
+                text += f"  run {row['run']}"
+            lines.append(text.rstrip())
+    return lines
+
+
+def _show(value: object) -> str:
+    return f"{value:.4g}" if isinstance(value, int | float) else "-"
+
+
+def format_contest(contest: Contest) -> list[str]:
+    """The table as text: `*` marks the smallest error, `=` errors that are not significantly larger."""
+    width = max(len(rival.name) for rival in contest.rivals)
+    best = {metric: contest.find_best(metric) for metric in ERRORS_OVER_2S}
+    lines = [f"{'held-out error over 2 s':<{width}}  numbers  position m   heading deg  fit s"]
+
+    def mark(rival: Rival, metric: str) -> str:
+        if rival is best[metric]:
+            return "*"
+        return "=" if contest.is_best(rival, metric) else " "
+
+    for rival in contest.rivals:
+        numbers = "" if rival.numbers is None else str(rival.numbers)
+        position, heading = (rival.read(metric) for metric in ERRORS_OVER_2S)
+        lines.append(
+            f"{rival.name:<{max(width, 23)}}  {numbers:>7}  "
+            f"{position:>10.4f} {mark(rival, 't_mrmse_m')} {math.degrees(heading):>10.2f} "
+            f"{mark(rival, 'r_mrmse_rad')} {rival.fit_s:>6.1f}"
+        )
+    lines += ["* smallest; = not significantly larger (95 % interval over stretches of 10 s)"]
+    for metric, (words, _) in ERRORS_OVER_2S.items():
+        tied = contest.ties[metric]
+        said = f"{best[metric].name} has the smallest error of {words}"
+        lines.append(f"{said}, not significantly different from {', '.join(tied)}" if tied else said)
+    return lines
+
+
+def format_refusals(refusals: Mapping[str, str]) -> str:
+    """Refusals in one clause: `slope_drift is not supported by the data (the reduction is not significant)`.
+
+    Args:
+        refusals: reasons by id, at least one.
+    """
+    reasons = list(dict.fromkeys(refusals.values()))
+    said = reasons[0] if len(reasons) == 1 else "; ".join(f"{name}: {why}" for name, why in refusals.items())
+    verb = "is" if len(refusals) == 1 else "are"
+    return f"{', '.join(refusals)} {verb} not supported by the data ({said})"

@@ -1,0 +1,73 @@
+"""The JSON of a diagnosis for people and scripts: its data with the sentences of each part."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+from pipeline.results import to_json
+from pipeline.words.effects import (
+    describe_clause,
+    describe_effect,
+    describe_separation,
+    list_readings,
+    suggest_drive,
+)
+from pipeline.words.errors import (
+    describe_moments,
+    describe_need,
+    describe_region,
+    describe_rest,
+    describe_structure,
+    name_region,
+    name_span,
+)
+from pipeline.words.verdict import format_verdict
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from pipeline.results import RunDiagnosis, Value
+
+
+def diagnosis_as_json(run: RunDiagnosis) -> dict[str, Any]:
+    """The documented keys of `slip diagnose --json` for one run, and more."""
+    content: dict[str, Any] = {"run": run.run, "verdict": format_verdict(run), **to_json(run)}
+    _describe_effects(run, content)
+    content["unobservable"] = list(run.unobservable_why)
+    for name, entry in content["unobservable_why"].items():
+        entry["manoeuvre"] = suggest_drive(name)
+    if run.unexplained is not None:
+        content["unexplained"]["where"] = describe_structure(run.unexplained)
+    for region, entry in zip(run.where, content["where"], strict=True):
+        entry["region"], entry["text"] = name_region(region), describe_region(region)
+    for moments, entry in zip(run.when, content["when"], strict=True):
+        entry["text"] = describe_moments(moments)
+        for span, part in zip(moments.spans, entry["spans"], strict=True):
+            part["text"] = name_span(span)
+    for key in ("noise_floor", "learned", "disturbance"):
+        content[key] = content[key] or {}
+    if run.disturbance is not None:
+        content["disturbance"]["text"] = describe_rest(run)
+    content["enough"] = describe_need(run) or None
+    return content
+
+
+def _describe_effects(run: RunDiagnosis, content: dict[str, Any]) -> None:
+    """Sentences of the effects, and of those that the log does not separate."""
+    content["joint_with"] = [name for name in run.joint if name != run.run]
+    for effect, entry in zip(run.effects, content["effects"], strict=True):
+        entry["sentence"], entry["clause"] = describe_effect(effect, run), describe_clause(effect, run)
+        entry["level"] = None
+        entry["could_be"] = [
+            {"level": one.level.value, "name": one.name, "text": one.text} for one in list_readings(effect)
+        ]
+        _mark(entry["parameters"], effect.parameters)
+    for item, entry in zip(run.undecided, content["undecided"], strict=True):
+        entry["separate_by"] = describe_separation(item)
+        for name, values in item.parameters.items():
+            _mark(entry["parameters"][name], values)
+
+
+def _mark(entries: dict[str, Any], values: Mapping[str, Value]) -> None:
+    for name, value in values.items():
+        entries[name]["undetermined"] = value.is_undetermined

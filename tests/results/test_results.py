@@ -1,0 +1,117 @@
+"""A diagnosis is data: what is stored is read back as it was, also what an earlier version stored."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import msgspec
+import pytest
+from drawn_diagnoses import draw_diagnosis
+
+from pipeline.results import (
+    DataNeed,
+    Finding,
+    Growth,
+    Interval,
+    Named,
+    Narrowing,
+    Region,
+    RunDiagnosis,
+    Value,
+    read_result,
+    to_json,
+)
+from pipeline.results.reading import find_refusal, has_no_pose, measure_excess, read_findings, read_model
+from pipeline.words.objects import diagnosis_as_json
+from pipeline.words.verdict import format_verdict
+
+DRAWN = draw_diagnosis({"effective_track": {"k": 1.79}}, [(1.06, 0.96), (0.44, 0.14)])
+OPEN = Named(
+    "drive_lag",
+    {"tau": Value(0.3, unit="s", another_run=Interval(0.1, 0.5))},
+    growth=Growth(None, {"tau": Narrowing((10.0, 20.0), (math.nan, 0.1))}),
+)
+
+
+def store(run: RunDiagnosis) -> dict[str, Any]:
+    stored: dict[str, Any] = json.loads(json.dumps(to_json(run)))
+    return stored
+
+
+def test_what_is_stored_is_read_back_as_it_was() -> None:
+    """NaN is no equal of itself: compared as text."""
+    run = msgspec.structs.replace(
+        DRAWN,
+        run="field/run",
+        effects=(*DRAWN.effects, OPEN),
+        where=(Region("w", "time", "between", (0.0, 30.0), 0.9, 0.2),),
+        need=DataNeed(known=("effective_track.k",), since_s=20.0, driven_s=60.0),
+        findings=(Finding("stuck", "it was stuck", severity="warning", t_start=1.0, t_end=2.0),),
+    )
+    assert repr(read_result(store(run), RunDiagnosis)) == repr(run)
+    stored = store(run)
+    assert stored["effects"][1]["parameters"]["tau"]["low"] is None
+    assert stored["effects"][1]["growth"]["parameters"]["tau"]["half_width"] == [None, 0.1]
+
+
+def test_no_sentence_is_stored_but_those_of_findings() -> None:
+    stored, shown = store(DRAWN), diagnosis_as_json(DRAWN)
+    assert {"verdict", "enough"} & stored.keys() == set()
+    assert {"sentence", "clause"} & stored["effects"][0].keys() == set()
+    assert shown["verdict"] == format_verdict(DRAWN)
+    assert shown["effects"][0]["sentence"].startswith("Effective track ")
+
+
+def test_what_people_get_is_read_back_too() -> None:
+    """As `slip watch` does with the answer of `slip analyze --json`."""
+    shown = json.loads(json.dumps(diagnosis_as_json(DRAWN)))
+    assert format_verdict(read_result(shown, RunDiagnosis)) == format_verdict(DRAWN)
+
+
+def test_a_diagnosis_of_an_earlier_version_is_read_with_what_it_has() -> None:
+    earlier = {
+        "run": "field/run",
+        "verdict": "Over 2 s the ideal model is 1.06 m off.",
+        "input": "command",
+        "effects": [
+            {
+                "id": "gone_effect",
+                "sentence": "It did something that no effect does today.",
+                "parameters": {"k": {"value": 1.8, "low": None, "high": None, "unit": "1"}},
+                "gain": None,
+                "growth": None,
+            }
+        ],
+        "unobservable": ["slope_creep"],
+        "unexplained": {"share": 0.3, "channel": "w", "where": "a sentence", "formula": None},
+        "ladder": [
+            {"effects": [], "t_mrmse_m": 1.06, "r_mrmse_rad": 0.96},
+            {"effects": ["gone_effect"], "t_mrmse_m": 0.1, "r_mrmse_rad": 0.02, "explained_share": None},
+        ],
+        "noise_floor": {"t_mrmse_m": 0.05, "r_mrmse_rad": 0.02},
+        "where": [{"channel": "w", "kind": "time", "region": "from 0 to 30 s", "share": 0.9}],
+        "timing": {},
+        "learned": {"kept": False, "reason": "none", "explained_share": {"t_mrmse_m": None}},
+        "lines": [["verdict", "a sentence"]],
+        "model": "this is no model file",
+    }
+    run = read_result(earlier, RunDiagnosis)
+    assert [one.id for one in run.effects] == ["gone_effect"]
+    assert measure_excess(run) == pytest.approx(2.0)
+    assert read_model(run) is None
+    assert "With one effect in the model 10 cm" in format_verdict(run)
+    assert diagnosis_as_json(run)["effects"][0]["sentence"] == "gone effect"
+
+
+def test_a_file_that_is_no_diagnosis_is_refused() -> None:
+    with pytest.raises(msgspec.ValidationError, match="ladder"):
+        read_result({"ladder": 5}, RunDiagnosis)
+
+
+def test_findings_of_untrusted_results_are_texts() -> None:
+    findings = read_findings({"findings": [{"id": 5, "text": None}, "no object", {"id": "not_moving"}]})
+    assert findings == (Finding("5", "", ""), Finding("not_moving", "", ""))
+    assert find_refusal([Finding("not_moving", "it stands")]) == "it stands"
+    assert not has_no_pose(findings)

@@ -1,0 +1,86 @@
+"""Lines of a diagnosis: few by default, each idea once."""
+
+from __future__ import annotations
+
+import pytest
+from drawn_diagnoses import draw_diagnosis
+from msgspec.structs import replace
+
+from pipeline.results import DataNeed, Finding, Region, RunDiagnosis, Unexplained
+from pipeline.words.diagnosis import describe, list_findings, list_lines
+from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
+
+MANY = (
+    "effective_track",
+    "drive_lag",
+    "lateral_skid",
+    "wheel_asymmetry",
+    "icr_offset",
+    "deadband",
+    "yaw_drift",
+)
+WARNINGS = [Finding(f"w{number}", f"warning {number}", severity="warning") for number in range(5)]
+
+
+def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
+    errors = [(1.0 - 0.12 * count, 0.5) for count in range(len(MANY) + 1)]
+    drawn = draw_diagnosis({name: {} for name in MANY}, errors)
+    run = replace(drawn, run="field/run", input="command", findings=tuple(WARNINGS))
+    shown = [text for label, text in list_lines(run) if label != "verdict"]
+    assert [text.split()[-1] for text in shown[:5]] == list(MANY[:5])
+    assert shown[5] == "2 smaller effects (--all)"
+    assert shown[6:] == ["!  warning 0", "!  warning 1", "!  warning 2", "   2 more (--all)"]
+    everything = describe([run], everything=True)
+    assert all(name in everything for name in (*MANY, "warning 4"))
+    assert "(--all)" not in everything
+
+
+def test_a_finding_of_many_runs_is_said_once_with_its_count() -> None:
+    alike = Finding("hold", "no command had arrived", severity="warning")
+    runs = {f"run{number}": [alike] for number in range(48)}
+    runs["run3"] = [alike, Finding("stuck", "it was stuck", severity="error")]
+    assert list_findings(runs, "", everything=False) == [
+        ("findings", "!! run3: it was stuck"),
+        ("", "!  no command had arrived (48 runs)"),
+    ]
+
+
+def test_incidents_of_a_kind_are_one_finding() -> None:
+    slides = [
+        Finding("slid", "it slid", severity="warning", t_start=start, t_end=end)
+        for start, end in ((3.0, 4.0), (10.0, 12.5))
+    ]
+    ((_, text),) = list_findings({"": slides}, "", everything=False)
+    assert text == "!  2 incidents, the longest from 10.0 to 12.5 s: it slid"
+
+
+def test_a_region_of_two_errors_is_said_once() -> None:
+    regions = [
+        Region(channel, "command", "driving", (1.2,), share, 0.39)
+        for channel, share in (("y", 0.68), ("x", 0.65))
+    ]
+    assert describe_regions(regions) == [
+        "above 1.2 m/s (39 % of the time): 68 % of the lateral and 65 % of the forward error"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("need", "said"),
+    [
+        (DataNeed(("a.k", "b.k"), 20.0, 60.0), "2 of 2 parameters are known within 5 %, after 20 s of 60 s"),
+        (
+            DataNeed(("a.k",) * 4, 286.0, 424.0, vague="b.k", half_width=0.3, others=11, minutes=7),
+            "4 of 16 parameters are known within 5 %; 7 more minutes of such driving for 5 % of all",
+        ),
+        (DataNeed(open=1), "0 of 1 parameters are known within 5 %"),
+    ],
+)
+def test_how_much_is_known_is_one_sentence(need: DataNeed, said: str) -> None:
+    assert describe_need(RunDiagnosis(need=need)) == said
+
+
+def test_motion_that_lasts_is_one_short_sentence() -> None:
+    lasting = Unexplained("lasting", 0.98, "w", ("w",), "command", sizes={"w": 0.19})
+    assert describe_unexplained(lasting) == (
+        "the yaw error wanders for seconds at a time (0.19 rad/s); nothing that was tried explains it"
+    )
