@@ -31,8 +31,8 @@ SOURCES = {
     "message-types.md": "pipeline/sources/message_types",
     "targets.md": "pipeline/export",
 }
-"""What a generated page is made of, in the repository. A page written by hand links to this, which a reader of a
-checkout can open; in the built handbook the link leads to the page."""
+"""What a generated page is made of, in the repository. A page written by hand links to this, which a reader
+of a checkout can open; in the built handbook the link leads to the page."""
 
 _FIELDS = ("field", "name", "velocity", "position", "orientation", "angle", "rate")
 _META = ("--help", "-h", "--version", "--install-completion")

@@ -1,4 +1,4 @@
-"""Every link of README, handbook and the other texts leads somewhere, in a checkout and in the built handbook."""
+"""Every link of README and handbook leads somewhere, in a checkout and in the built handbook."""
 
 from __future__ import annotations
 
@@ -42,9 +42,7 @@ def find_dead(path: Path) -> list[str]:
             continue
         name, _, anchor = link.partition("#")
         target = path.parent / name if name else path
-        if not target.exists() or (
-            anchor and anchor not in list_anchors(target.read_text(encoding="utf-8"))
-        ):
+        if not target.exists() or (anchor and anchor not in list_anchors(target.read_text(encoding="utf-8"))):
             dead.append(link)
     return dead
 
