@@ -10,8 +10,8 @@ OUT    ?= results
 # Values reach the shell through its environment, so that a path may hold spaces and quotes.
 export LOG LOGS OUT VEHICLE ARGS NAME MINUTES
 
-# Exit code 3 means done, but the log had losses: they are on the screen, and make has not failed.
-FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses (see above)" >&2 || exit $$code; }
+# Exit code 3 means done, but a log had losses or was refused: that is on the screen, and make has not failed.
+FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses or logs that were refused (see above)" >&2 || exit $$code; }
 
 # A benchmark has one core, and others come first.
 ONE_CORE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10
@@ -106,7 +106,7 @@ lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
 		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra live --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra live --extra pandas --extra s3 --extra sim \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 $(VENV)/bin/python:
