@@ -34,7 +34,7 @@ def test_the_wheel_carries_presets_contracts_and_pages(wheel: Path) -> None:
         ("pipeline/sources/presets", "*.toml"),
         ("pipeline/logs/text_folders", "*.toml"),
         ("schemas", "*.py"),
-        ("slip", "*"),
+        ("slip", "*.*"),
         ("pipeline/report", "page.*"),
         ("pipeline/report", "*.js"),
         ("pipeline/report/templates", "**/*.html"),
