@@ -1,4 +1,4 @@
-"""Measure what the tables of README and handbook say, and write the tables.
+"""Measure what the tables of the handbook say, and write the tables.
 
 What is done is kept in build/measured/<version of the diagnosis>: stopped at any
 moment, the same command goes on. Each file of benchmarks/measured is written when its measurement is

@@ -1,4 +1,4 @@
-"""Tables of README and handbook from what was measured: rendered, and held against the pages.
+"""Tables of the handbook from what was measured: rendered, and held against the pages.
 
 What a command measured stands in a file of
 benchmarks/measured: its rows, the command, the commit, the date, and the versions of the program that its
@@ -20,13 +20,14 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 MEASURED = ROOT / "benchmarks" / "measured"
-PAGES = (ROOT / "README.md", *sorted((ROOT / "docs" / "pages").glob("**/*.md")))
+PAGES_FOLDER = ROOT / "docs" / "pages"
+PAGES = sorted(PAGES_FOLDER.rglob("*.md"))
 BLOCK = re.compile(r"(<!-- measured: (?P<name>[^>]*?) -->\n)(?P<text>.*?)(<!-- /measured -->)", re.DOTALL)
 ALLOWED_VERSIONS = 1
 """Versions by which a table may be older than the program: a mend does not ask for hours of measurement."""
 
 WIDTH = 100
-"""Columns of a line of README."""
+"""Columns of a line of a page."""
 
 INPUTS = {"command": "commands", "measured": "wheels"}
 PLACES = {

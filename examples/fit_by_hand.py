@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 
-import pipeline as slip
+import slip
 
 results, name, *effects = sys.argv[1:]
 run = slip.load(name, results=results)

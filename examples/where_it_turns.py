@@ -9,7 +9,7 @@ import sys
 
 import polars as pl
 
-import pipeline as slip
+import slip
 
 steps = slip.table("slip", results=sys.argv[1] if len(sys.argv) > 1 else "results")
 turning = (pl.col("f_w").abs() / 0.25).floor() * 0.25  # rad/s, lower edge

@@ -1,6 +1,6 @@
 """From the MCAP logs of field robots to knowledge about their motion.
 
-In Python: ``import pipeline as slip``. What `__all__` lists is for everybody; all else may change.
+In Python: ``import slip``, which has what `__all__` lists here; all else may change.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The mystery logs of data_samples, and their truths beside a diagnosis.
 
-    make mysteries
-    make reveal LOG=data_samples/mystery_1.mcap
+    make samples
+    make bench NAME=game/mystery ARGS="reveal data_samples/mystery_1.mcap results"
 
 The truth of `mystery_1.mcap` is in `mystery_1.spoiler.json`, for nobody to read by accident.
 """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import posixpath
+import re
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,15 +12,17 @@ from mkdocs.structure.files import File
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from reference import write_reference
+from reference import find_page, write_reference
 
 from pipeline.models import list_effects
 
 if TYPE_CHECKING:
     from mkdocs.config.defaults import MkDocsConfig
     from mkdocs.structure.files import Files
+    from mkdocs.structure.pages import Page
 
 
+_PAGES = "docs/pages"
 _NAMED = 'class="md-search" data-md-component="search" role="dialog" aria-label="Search"'
 
 
@@ -37,6 +41,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         text = notebook.read_text(encoding="utf-8")
         files.append(File.generated(config, f"notebooks/{notebook.name}", content=text))
     return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, **_: object) -> str:
+    """A link to a source of the repository leads to the page that is made of it."""
+    folder = posixpath.dirname(page.file.src_uri)
+
+    def lead(link: re.Match[str]) -> str:
+        found = find_page(posixpath.normpath(posixpath.join(_PAGES, folder, link[1])))
+        return link[0] if found is None else f"]({posixpath.relpath(found, folder or '.')}"
+
+    return re.sub(r"\]\((\.\./[^)#\s]+)", lead, markdown)
 
 
 def on_post_page(output: str, **_: object) -> str:

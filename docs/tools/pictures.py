@@ -1,4 +1,4 @@
-"""Pictures of the report and of the workbench, made by the current code from a sample log: `make pictures`.
+"""Pictures of the report and of the workbench, made by the current code from a sample log.
 
 python docs/tools/pictures.py [FOLDER]
 """

@@ -22,6 +22,18 @@ from pipeline.sources import Configuration, list_presets
 if TYPE_CHECKING:
     from cyclopts import App
 
+SOURCES = {
+    "effects/index.md": "pipeline/models/effects",
+    "verbs.md": "pipeline/cli",
+    "configuration-keys.md": "pipeline/sources/configuration.py",
+    "tables.md": "schemas",
+    "vehicles.md": "pipeline/sources/presets",
+    "message-types.md": "pipeline/sources/message_types",
+    "targets.md": "pipeline/export",
+}
+"""What a generated page is made of, in the repository. A page written by hand links to this, which a reader
+of a checkout can open; in the built handbook the link leads to the page."""
+
 _FIELDS = ("field", "name", "velocity", "position", "orientation", "angle", "rate")
 _META = ("--help", "-h", "--version", "--install-completion")
 
@@ -37,6 +49,15 @@ def write_reference() -> dict[str, str]:
         "message-types.md": write_message_types(),
         "targets.md": write_targets(),
     }
+
+
+def find_page(path: str) -> str | None:
+    """The page of the handbook that shows a file or folder of the repository; None where none does."""
+    found = {source: page for page, source in SOURCES.items()}.get(path)
+    folder, _, name = path.rpartition("/")
+    if folder == SOURCES["effects/index.md"]:
+        return f"effects/{name.removesuffix('.py')}.md"
+    return f"notebooks/{name}" if folder == "examples" and name.endswith(".ipynb") else found
 
 
 def list_verbs(app: App | None = None, before: str = "slip") -> dict[str, App]:

@@ -1,4 +1,4 @@
-"""What `make screenshots` looks at, and the states of the workbench with what a person does to reach them."""
+"""What screenshots.py looks at, and the states of the workbench with what a person does to reach them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every page on a phone and a laptop, light and dark, and what is wrong with it: `make screenshots`.
+"""Every page on a phone and a laptop, light and dark, and what is wrong with it.
 
 python docs/tools/screenshots.py FOLDER [--results RESULTS] [--logs LOGS] [--only NAME ...]
 

@@ -1,6 +1,6 @@
 """A season in which anything may stand: what becomes of each kind of entry, and of the log beside it.
 
-    python tests/batch/damage_season.py            (make damage-season)
+    python tests/batch/damage_season.py
 
 Every kind of entry is put beside one good log; the batch must do the good one, name the bad one, and end.
 """

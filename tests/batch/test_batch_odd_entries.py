@@ -58,7 +58,6 @@ def test_everything_at_once_costs_itself_and_nothing_else(mess: Path, tmp_path: 
 
 @pytest.mark.long
 def test_each_alone_costs_itself_and_nothing_else(capsys: pytest.CaptureFixture[str]) -> None:
-    """`make damage-season`."""
     assert damage_season.main() == 0, capsys.readouterr().out
 
 

@@ -47,7 +47,7 @@ def test_the_pictures_show_the_current_pages(chrome: Chrome, tmp_path: Path) -> 
     assert {path.name for path in FOLDER.glob("*.png")} == {path.name for path in made}
     for one, other in zip(made, kept, strict=True):
         assert other.stat().st_size < 300_000
-        assert _difference(chrome, one, other) < MOST, f"{other.name} is old: run `make pictures`"
+        assert _difference(chrome, one, other) < MOST, f"{other.name} is old: run docs/tools/pictures.py"
     assert _difference(chrome, made[0], kept[1]) > MOST
 
 
