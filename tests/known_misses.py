@@ -11,8 +11,6 @@ MISSES = {
         "fitted without a search on motion without noise it ends 37 % off",
     "tests/models/test_motion_effects.py::test_a_parameter_put_into_simulated_data_comes_back[wheel_servo]":
         "fitted without a search on motion without noise it ends away from the truth",
-    "tests/models/test_motion_effects.py::test_a_parameter_put_into_simulated_data_comes_back[contact_friction]":
-        "its estimate is 4 standard errors off",
     "tests/models/test_motion_fit.py::test_without_a_gyro_the_poses_own_heading_serves":
         "the heading's delay is .076 to .087 s in place of .1 s: steps of .25 s say little of a clock",
     "tests/models/test_motion_fit.py::test_every_rung_is_what_its_effects_are_as_a_model":

@@ -163,8 +163,20 @@ class Candidate:
         return self.reading.explained is not None and self.reading.explained.is_sure
 
     def sign(self, axis: Axis) -> int:
-        """Sign against the pose; zero where it is not clear."""
-        return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
+        """Sign against the pose; zero where it is not clear.
+
+        A body that turns far more than a motion that is given in full rotates by something else, as wheels
+        that slip: a wrong sign changes no size.
+        """
+        explained = self.reading.explained
+        if explained is None:
+            return 0
+        is_far = self.reading.form == "body" and abs(float(explained.turned.gains[0])) > _MOST_GAIN
+        return 0 if axis == "turned" and is_far else explained.sign(axis)
+
+
+_MOST_GAIN = 2.0
+"""Largest turn of a body over that which a signal states as its motion."""
 
 
 class Examination:

@@ -51,7 +51,7 @@ def test_a_wrong_line_of_the_configuration_is_corrected_or_told(
     (tmp_path / "run.toml").write_text(text)
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
     vehicle, recording = read_recording(manifest)
-    said = {str(f["id"]): str(f["text"]) for f in recording.list_findings()}
+    said = {f.id: f.text for f in recording.list_findings()}
     ours = {name for name in said if name in FAULTS or name.endswith("_corrected")}
     assert ours == ({found} if found else set())
     if found:
@@ -119,7 +119,7 @@ def test_poses_in_north_east_down_are_not_taken_for_a_wrong_command(
     log = write_run(tmp_path / "run.mcap", layout, **changes)
     manifest = analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False)).manifest
     vehicle, recording = read_recording(manifest)
-    findings = {str(one["id"]): str(one["text"]) for one in recording.list_findings()}
+    findings = {one.id: one.text for one in recording.list_findings()}
     assert found in findings
     for word in words:
         assert word in findings[found]
@@ -133,7 +133,7 @@ def test_poses_in_north_east_down_are_not_taken_for_a_wrong_command(
             (tmp_path / "run.toml").write_text('[pose]\nup = "-z"\n')
             options = Options(out=tmp_path / "mended", report=False, diagnosis=False)
             vehicle, recording = read_recording(analyze_log(log, options).manifest)
-            assert not {one["id"] for one in recording.list_findings()} & set(FAULTS)
+            assert not {one.id for one in recording.list_findings()} & set(FAULTS)
             (run,) = diagnose_runs([recording], vehicle).runs
         (effect,) = [one for one in run.effects if one.id == "effective_track"]
         assert effect.parameters["k"].value == pytest.approx(1.3, rel=0.02)
