@@ -36,9 +36,8 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _EXACTLY_SAME = 0.005, 1e-7
-"""Difference of chi-square at which the likelihood of both numbers has converged, and that of a model that
-is written. Where one of them says nothing, as the correlation of no disturbance, it may be anything."""
+_SAME, _MOST_ROUNDS = 0.005, 80
+"""Difference of chi-square at which the likelihood of both numbers has converged, and rounds until then."""
 _FARTHEST = 8.0
 """Largest logit of a share or a correlation."""
 _SCALE_ROUNDS = 30
@@ -144,7 +143,7 @@ def learn_noise(
         steps: the steps.
         channels: those that say anything.
         start: noise of nearly the same residuals.
-        exact: whether its numbers must converge, not only the likelihood.
+        exact: whether they must depend on the residuals alone, and not on the start.
     """
     step_s, runs = float(np.median(steps.spans)), int(steps.run[-1]) + 1
     correlation, share, scale = np.zeros(3), np.zeros(3), np.full((runs, 3), np.inf)
@@ -203,7 +202,7 @@ def _maximize(
         return _find_cost(flat, steps.fresh, steps.spans, step_s, *read(at.tolist()), size)
 
     starts, width = [(2.0, -2.0), (0.0, 1.0)], 1.2
-    if known is not None:
+    if known is not None and not exact:
         logits = (math.log(max(one, 1e-9) / max(1.0 - one, 1e-9)) for one in (known[0] / most, known[1]))
         # Near the ends the likelihood is flat, and nothing would lead away from there.
         first, second = (min(max(one, -_FARTHEST / 2.0), _FARTHEST / 2.0) for one in logits)
@@ -214,8 +213,10 @@ def _maximize(
             np.array(start),
             method="Nelder-Mead",
             options={
+                # Where one of them says nothing, as the correlation of no disturbance, it may be anything.
+                "maxiter": _MOST_ROUNDS,
                 "xatol": math.inf,
-                "fatol": _EXACTLY_SAME if exact else _SAME,
+                "fatol": _SAME,
                 "initial_simplex": np.add(start, [[0.0, 0.0], [-width, 0.0], [0.0, -width]]),
             },
         )

@@ -63,7 +63,7 @@ def write_function(model: Model) -> str:
         if stage is Place.BODY:
             parts.append("\n        v_x, v_y, v_w = v0, s0, w0")
         parts += [
-            f"\n        {line}" for place, one in steps if place is stage for line in one.step.splitlines()
+            f"\n        {line}" for owner, one in steps if owner is stage for line in one.step.splitlines()
         ]
     lever_m = vehicle.kinematics.lever_m(vehicle)
     if lever_m:

@@ -212,7 +212,7 @@ class Effect(ABC):
             vehicle: its nominal geometry.
             beside: all effects of the model, for numbers that depend on other effects.
         """
-        said = self._say(vehicle, beside)
+        said = self._make_sentences(vehicle, beside)
         if said.words.motion:
             return said.describe_motion()
         known = [p for p in self.parameters if p.name not in self.open_numbers]
@@ -221,11 +221,11 @@ class Effect(ABC):
 
     def describe_clause(self, vehicle: Vehicle, beside: Iterable[Effect] = ()) -> str:
         """What the vehicle does, with numbers, as a clause of a sentence."""
-        said = self._say(vehicle, beside)
+        said = self._make_sentences(vehicle, beside)
         does = said.describe_clause() if said.words.motion else ""
         return does or f"shows signs of {self.id.replace('_', ' ')}"
 
-    def _say(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
+    def _make_sentences(self, vehicle: Vehicle, beside: Iterable[Effect]) -> Sentences:
         others = {one.id: next(iter(one.values.values()), 1.0) for one in beside}
         title = self.id.replace("_", " ").capitalize()
         return Sentences(title, find_words(self.id), self.values, vehicle, self.open_numbers, others)

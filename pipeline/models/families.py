@@ -224,8 +224,8 @@ class Written(Effect):
             cls.id, cls.choose_lines(kind), tuple((p.name, p.unit) for p in cls.parameters)
         )
 
-    def _compute(self, expression: Expression, now: _Now, **more: Any) -> Any:  # noqa: ANN401 - a signal
-        known = {**self.known, **more}
+    def _compute(self, expression: Expression, now: _Now, **extra: Any) -> Any:  # noqa: ANN401 - a signal
+        known = {**self.known, **extra}
         for name in expression.names - known.keys():
             known[name] = _SIGNALS[name][1](now)
         return expression.evaluate(known)
@@ -251,8 +251,8 @@ class Written(Effect):
 
     def _change_wheel(self, expression: Expression, now: _Now, wheel: Floats) -> Floats:
         radius = now.context.vehicle.wheel_radius_m
-        more = {"turning": radius * np.abs(wheel) > LEAST_RIM_SPEED} if "turning" in expression.names else {}
-        changed: Floats = self._compute(expression, now, Omega=wheel, **more)
+        extra = {"turning": radius * np.abs(wheel) > LEAST_RIM_SPEED} if "turning" in expression.names else {}
+        changed: Floats = self._compute(expression, now, Omega=wheel, **extra)
         return changed
 
 
@@ -518,14 +518,14 @@ def _choose_family(first: str, facts: Mapping[str, Any]) -> tuple[type[Written],
     channel, sign = (match[1], match[2]) if (match := _EQUATION.fullmatch(first)) else ("", "")
     if sign == "+=":
         return _WrittenTerm, {}
-    place = facts.get("place", _PLACES.get(channel, Place.LOCALIZATION))
+    stage = facts.get("place", _PLACES.get(channel, Place.LOCALIZATION))
     families: dict[Place, type[Written]] = {
         Place.COMMAND: _WrittenCommand,
         Place.DRIVE: _WrittenDrive,
         Place.KINEMATICS: _WrittenRolling,
         Place.LOCALIZATION: _WrittenReport,
     }
-    return families[place], {}
+    return families[stage], {}
 
 
 def check_formula(made: type[Effect]) -> None:

@@ -116,13 +116,13 @@ class Sentences:
 
         chosen = next((text for text in templates if is_known(text)), templates[-1])
         name, colon, numbers = chosen.rpartition(": ")
-        kept = "".join(filter(is_known, _PART.split(numbers))).removeprefix(", ")
+        text = "".join(filter(is_known, _PART.split(numbers))).removeprefix(", ")
         if colon:
             head = name if is_known(name) else self.title
-            kept = head + (kept and f": {kept}")
-        kept = kept.replace("{with}", named and f", with {named}")
+            text = head + (text and f": {text}")
+        text = text.replace("{with}", named and f", with {named}")
         return _FIELD.sub(
-            lambda match: _format(_parse(match[1], tuple(values)).evaluate(values), match[2]), kept
+            lambda match: _format(_parse(match[1], tuple(values)).evaluate(values), match[2]), text
         )
 
 

@@ -43,7 +43,6 @@ PUBLIC = {
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"kept"},
-    "pipeline/report/figures/slip_figures.py": {"place"},  # a column of a figure's rows
     "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column
 }
@@ -55,7 +54,7 @@ _WORD = re.compile(r"[A-Z][a-z]+")
 
 
 def list_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
-    """Line and text of every identifier, without an effect's attribute `place`, which is public."""
+    """Line and text of every identifier, without an effect's `place`, which is public."""
     public = {id(node) for node in ast.walk(tree) if isinstance(node, ast.Attribute) and node.attr == "place"}
     for kind in ast.walk(tree):
         for line in kind.body if isinstance(kind, ast.ClassDef) else ():
@@ -64,6 +63,8 @@ def list_names(tree: ast.AST) -> Iterator[tuple[int, str]]:
     for node in ast.walk(tree):
         match node:
             case _ if id(node) in public:
+                pass
+            case ast.keyword(arg="place"):
                 pass
             case ast.Name(id=name) | ast.arg(arg=name) | ast.Attribute(attr=name):
                 yield node.lineno, name

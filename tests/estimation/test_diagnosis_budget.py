@@ -34,7 +34,7 @@ def test_a_search_that_is_cut_says_so_and_gives_the_best_answer_so_far(tmp_path:
     assert "o known effect" not in verdict
     assert "search_cut" not in [finding.id for finding in whole.findings]
     assert len(cut.effects) < len(whole.effects)
-    assert cut.ladder[-1]["t_mrmse_m"] <= cut.ladder[0]["t_mrmse_m"]
+    assert cut.ladder[-1].t_mrmse_m <= cut.ladder[0].t_mrmse_m
     assert cut.ladder[0] == whole.ladder[0]
     assert any(": effective_track (" in line for line in told)
 
@@ -64,7 +64,7 @@ def test_a_run_without_a_noise_floor_is_diagnosed(tmp_path: Path, monkeypatch: p
     monkeypatch.setattr("pipeline.estimation.conclude.find_main_region", lambda *_: None)
     diagnosis = diagnose_runs([recording], vehicle)
     (run,) = diagnosis.runs
-    assert run.noise_floor["t_mrmse_m"] == 0.0
+    assert run.noise_floor.t_mrmse_m == 0.0
     assert run.effects
     text = describe(diagnosis.runs, everything=True)
     assert not {"inf", "nan"} & set(re.findall(r"[a-z]+", text))
