@@ -163,16 +163,22 @@ class Candidate:
         return self.reading.explained is not None and self.reading.explained.is_sure
 
     def sign(self, axis: Axis) -> int:
-        """Sign against the pose; zero where it is not clear.
+        """Sign against the pose; zero where it is not clear."""
+        return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
 
-        A body that turns far more than a motion that is given in full rotates by something else, as wheels
-        that slip: a wrong sign changes no size.
+    def sign_as_motion(self, axis: Axis) -> int:
+        """The same of a signal that states a motion.
+
+        A body that turns far more than it states turns by something else, as wheels that slip: a wrong sign
+        changes no size.
         """
         explained = self.reading.explained
-        if explained is None:
-            return 0
-        is_far = self.reading.form == "body" and abs(float(explained.turned.gains[0])) > _MOST_GAIN
-        return 0 if axis == "turned" and is_far else explained.sign(axis)
+        is_far = (
+            explained is not None
+            and self.reading.form == "body"
+            and abs(float(explained.turned.gains[0])) > _MOST_GAIN
+        )
+        return 0 if axis == "turned" and is_far else self.sign(axis)
 
 
 _MOST_GAIN = 2.0
@@ -541,7 +547,8 @@ class Examination:
         for name, drive in (("command", command), ("wheels", wheels)):
             if drive is not None:
                 axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
-                signs |= {(name, axis): drive.sign(axis) for axis in axes}
+                sign = drive.sign if drive is command else drive.sign_as_motion
+                signs |= {(name, axis): sign(axis) for axis in axes}
         if gyro is not None and gyro.explained is not None:
             signs["gyro", "turned"] = gyro.explained.sign("turned")
         up, offset = motion.up, motion.offset_deg

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import published
 import pytest
+from verbs import run_verb
 
 import pipeline as slip
 
@@ -72,3 +73,12 @@ def test_models_are_off_by_what_was_published(tmp_path: Path) -> None:
     position_m, heading_deg = published.find_largest(runs, {"named_model": calibrated})
     assert position_m < 0.035
     assert heading_deg < published.HEADING_DEG
+
+
+@pytest.mark.skipif(not published.PUBLISHED.is_dir(), reason="../shared/published is not here")
+@pytest.mark.parametrize("run", ["green_06", "green_48"])
+def test_wheels_that_slip_on_a_smooth_floor_are_not_said_to_count_backward(run: str) -> None:
+    """They turn the body three to five times as far as their odometry says, and the other way."""
+    shown = run_verb("inspect", published.PUBLISHED / "robotino_surfaces" / f"{run}.mcap")
+    assert shown.returncode == 0
+    assert "backward" not in shown.stdout
