@@ -58,9 +58,9 @@ _MOST_EFFECTS = 8
 _SINGLES, _PAIRS = 4, 3
 """Extensions by one effect and by two that are fitted in each round."""
 _ROUGH = 3
-"""Steps of a rough fit of an effect in the place of its special cases."""
+"""Steps of a rough fit, which shows whether a model may come near the best one."""
 _NEAR = 0.2
-"""Share of what those explain that it may lack after them to be fitted to the end."""
+"""Share of what the best one explains that it may lack after them to be fitted to the end."""
 _DRAWS = 400
 """Resamples of blocks: a frequency near 0.95 has a standard error of 0.01."""
 

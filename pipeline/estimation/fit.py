@@ -34,6 +34,8 @@ _NEWS = 1.0
 _MOST_STEPS = 30
 _GRID_ROUNDS = 4
 """Rounds of a grid, each a third as wide as the one before."""
+_MOST_WALKS = 4
+"""Times that numbers without derivatives are searched in turn with the others."""
 _LOOSEST, _STIFFEST = 1e-6, 30.0
 """Damping relative to the diagonal at first, and above which no further step is tried."""
 _FEWEST_HELD = 3
@@ -220,7 +222,7 @@ def fit_part(
     if not free:
         return fit
     fit = _descend(fit, most, exact=exact)
-    for _ in range(_GRID_ROUNDS if len(fit.smooth) < len(free) else 0):
+    for _ in range(_MOST_WALKS if len(fit.smooth) < len(free) else 0):
         before = fit.score
         for number in free:
             if not number.is_smooth:
