@@ -30,8 +30,8 @@ from game.draw import draw_riddle
 from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
+from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.estimation import Recording, diagnose_runs
-from pipeline.fleet.changes import AFTER, BEFORE
 from pipeline.job.check import Check, compare, find_usual_spread
 from pipeline.job.check_sides import Sides, read_under, unite_effects
 from pipeline.job.run_results import find_diagnosis, load_vehicle

@@ -22,7 +22,7 @@ import numpy as np
 from measuring import read_rows
 
 from pipeline.core.arrays import Floats
-from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
+from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
 from pipeline.job.check import find_usual_spread
 from pipeline.job.check_text import LIKELY
 from pipeline.job.stored_fits import USUAL_LOGARITHMS

@@ -25,10 +25,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from motion_runs import make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.forecast import RUNS_SHARE, decide_level, fit_fleet, forecast_vehicle
+from pipeline.datasets.levels import draw_run, split_levels
 from pipeline.estimation import Recording, diagnose_runs
-from pipeline.fleet.confidence import Interval
-from pipeline.fleet.forecast import RUNS_SHARE, decide_level, fit_fleet, forecast_vehicle
-from pipeline.fleet.levels import draw_run, split_levels
 from pipeline.simulate import find_vehicle, simulate_run
 
 TERRAINS = ("asphalt", "gravel", "sand", "ice")

@@ -11,7 +11,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 ROOMS = ("pipeline", "schemas")
-EXPLAINED = ("core", "run", "stages", "models", "estimation", "fleet")
+EXPLAINED = ("core", "run", "stages", "models", "estimation", "datasets")
 """Rooms whose numbers decide answers."""
 
 

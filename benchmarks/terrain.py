@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from measuring import RECORDINGS, add_row
 
-from pipeline.fleet.terrain import PassEffect
+from pipeline.datasets.terrain import PassEffect
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.terrain_map import draw_up_terrain

@@ -16,8 +16,8 @@ from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError
 
 if TYPE_CHECKING:
     from pipeline.cli.verb_model import On
+    from pipeline.datasets.forecast import Forecast
     from pipeline.estimation.problem import Problem
-    from pipeline.fleet.forecast import Forecast
     from pipeline.job.keys import Owner
     from pipeline.models.literature import LiteratureModel
     from pipeline.models.model import Model

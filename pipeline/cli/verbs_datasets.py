@@ -16,7 +16,7 @@ from pipeline.job import FigureFormat
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.fleet.pairs import Answer
+    from pipeline.datasets.pairs import Answer
     from pipeline.job.compare import Question
     from pipeline.store import Store
 
@@ -113,9 +113,9 @@ _MOST_PAIRS = 10
 
 
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
-    from pipeline.fleet import MEASURES  # noqa: PLC0415 - heavy
-    from pipeline.fleet.answer_lines import list_lines, title_line  # noqa: PLC0415 - heavy
-    from pipeline.fleet.pairs import compare_orders  # noqa: PLC0415 - heavy
+    from pipeline.datasets import MEASURES  # noqa: PLC0415 - heavy
+    from pipeline.datasets.answer_lines import list_lines, title_line  # noqa: PLC0415 - heavy
+    from pipeline.datasets.pairs import compare_orders  # noqa: PLC0415 - heavy
     from pipeline.job.compare import list_shown_notes  # noqa: PLC0415 - heavy
 
     lines: list[str] = []
@@ -174,7 +174,7 @@ def _format_ends(row: Mapping[str, object]) -> str:
 
 def _format_pairs(answer: Answer, name: str) -> list[str]:
     """One line a pair, the surest first."""
-    from pipeline.fleet.answer_lines import list_pairs  # noqa: PLC0415 - heavy
+    from pipeline.datasets.answer_lines import list_pairs  # noqa: PLC0415 - heavy
 
     rows = [
         (
@@ -248,8 +248,8 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.deployments import ZONES  # noqa: PLC0415 - heavy
-    from pipeline.fleet.exchange import read_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets.deployments import ZONES  # noqa: PLC0415 - heavy
+    from pipeline.datasets.exchange import read_features  # noqa: PLC0415 - heavy
     from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -296,7 +296,7 @@ def draw(  # noqa: D417 - arguments document themselves
 
 def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
     """Write the terrain map of slip by position."""
-    from pipeline.fleet.terrain import CELL_M  # noqa: PLC0415 - heavy
+    from pipeline.datasets.terrain import CELL_M  # noqa: PLC0415 - heavy
     from pipeline.job.terrain_map import describe_terrain, draw_up_terrain, list_lines, write_terrain  # noqa: PLC0415 - heavy
 
     store = open_results(results).open_store()
@@ -324,7 +324,7 @@ def add(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.datasets.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
 
     table = add_deployment(file, entry)
     write_deployments(table, file)
@@ -354,7 +354,7 @@ def merge(  # noqa: D417 - arguments document themselves
     """
     if _are_features(first, second):
         return _merge_features(first, second, file or Path("features.parquet"), json=json, quiet=quiet)
-    from pipeline.fleet.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.datasets.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
     file = file or _OWN
     table = merge_deployments(first, second)
@@ -372,7 +372,7 @@ def _are_features(*paths: Path) -> bool:
 
 
 def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
-    from pipeline.fleet.exchange import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets.exchange import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
     write_features(merged, path)
@@ -403,7 +403,7 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.fleet.exchange import write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets.exchange import write_features  # noqa: PLC0415 - heavy
     from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 

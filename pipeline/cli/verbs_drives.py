@@ -28,8 +28,8 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
+    from pipeline.datasets.forecast import Forecast
     from pipeline.estimation import Recording
-    from pipeline.fleet.forecast import Forecast
     from pipeline.job import Options
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed

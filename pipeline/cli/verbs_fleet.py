@@ -32,7 +32,7 @@ from pipeline.cli.model_runs import open_model
 from pipeline.core import SlipError, format_interval, suffix_unit
 
 if TYPE_CHECKING:
-    from pipeline.fleet.trend import Trend
+    from pipeline.datasets.trend import Trend
     from pipeline.job import Options
     from pipeline.job.check import Check
     from pipeline.job.check_sides import Baseline
@@ -444,7 +444,7 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _format_trend(followed: Trend, page: Path) -> list[str]:
-    from pipeline.fleet.trend import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
+    from pipeline.datasets.trend import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]

@@ -382,7 +382,7 @@ def update_datasets(store: Store) -> None:
 
     Columns that only `slip compare` computes are null until it has run.
     """
-    from pipeline.fleet import gather_runs, pool_runs  # noqa: PLC0415 - heavy
+    from pipeline.datasets import gather_runs, pool_runs  # noqa: PLC0415 - heavy
     from pipeline.job.compared_runs import find_material  # noqa: PLC0415 - heavy
     from pipeline.report import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.core import NORMAL_95, finite_or_none, format_interval, format_share, guess_names, shorten
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
-from pipeline.fleet.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
+from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.job import JobError
 from pipeline.job.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.job.stored_fits import (

@@ -18,8 +18,8 @@ import numpy as np
 from pipeline.core import NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import read_bounded
+from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.estimation.comparison import Input, choose_input
-from pipeline.fleet.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.job import INPUTS, JobError
 from pipeline.job.compared_runs import find_run_refusal
 from pipeline.job.keys import UNKNOWN, agree_on_vehicle

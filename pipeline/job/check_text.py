@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
 from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
-from pipeline.fleet.changes import Change
+from pipeline.datasets.changes import Change
 from pipeline.job.check import Check, find_pace
 from pipeline.job.stored_fits import (
     ERRORS,

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, read_version
 from pipeline.core.arrays import Ints
-from pipeline.fleet import (
+from pipeline.datasets import (
     OVER_RUNS,
     THIS_RUN,
     add_measures,
@@ -21,12 +21,12 @@ from pipeline.fleet import (
     pool_runs,
     spread_windows,
 )
-from pipeline.fleet.answer_lines import list_lines
-from pipeline.fleet.causes import find_carriers
-from pipeline.fleet.confidence import Interval
-from pipeline.fleet.equal_driving import Overlap, find_overlap, level_runs, measure_bins
-from pipeline.fleet.exchange import check_features, follow_published, read_limits
-from pipeline.fleet.pairs import (
+from pipeline.datasets.answer_lines import list_lines
+from pipeline.datasets.causes import find_carriers
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.equal_driving import Overlap, find_overlap, level_runs, measure_bins
+from pipeline.datasets.exchange import check_features, follow_published, read_limits
+from pipeline.datasets.pairs import (
     ABOUT_UNIT,
     AS_DRIVEN,
     AS_PUBLISHED,
@@ -44,8 +44,8 @@ from pipeline.fleet.pairs import (
     write_csv,
     write_latex,
 )
-from pipeline.fleet.pooled_tests import bound_levels
-from pipeline.fleet.rank_tests import connect_groups
+from pipeline.datasets.pooled_tests import bound_levels
+from pipeline.datasets.rank_tests import connect_groups
 from pipeline.job import ANALYZE_FIRST, FigureFormat, JobError, lack_runs
 from pipeline.job.compared_runs import (
     ComparedRuns,

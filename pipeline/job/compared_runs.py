@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import polars as pl
 
 from pipeline.core import guess_names
-from pipeline.fleet import ComparisonError, label_runs
+from pipeline.datasets import ComparisonError, label_runs
 from pipeline.job.run_results import DIAGNOSED, DIAGNOSIS
 from pipeline.models.catalogue import list_effects
 from pipeline.results.reading import find_refusal, read_findings

@@ -15,14 +15,14 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.core import SlipError
+from pipeline.datasets.forecast import Forecast, forecast_vehicle, join_evidence, list_held
+from pipeline.datasets.joint_levels import RunEvidence
 from pipeline.estimation import Recording
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
-from pipeline.fleet.forecast import Forecast, forecast_vehicle, join_evidence, list_held
-from pipeline.fleet.joint_levels import RunEvidence
 from pipeline.job.prediction import find_estimates
 from pipeline.job.run_results import load_vehicle
 from pipeline.models.effect import Effect, Late

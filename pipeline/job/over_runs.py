@@ -11,17 +11,17 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
 from pipeline.core.untrusted import read_bounded
-from pipeline.fleet import MEASURES, ComparisonError, gather_runs, pool_runs
-from pipeline.fleet.causes import Budget, Causes, Difference, compare_causes
-from pipeline.fleet.deployments import (
+from pipeline.datasets import MEASURES, ComparisonError, gather_runs, pool_runs
+from pipeline.datasets.causes import Budget, Causes, Difference, compare_causes
+from pipeline.datasets.deployments import (
     DeploymentMap,
     find_own_table,
     rank_datasets,
     rank_deployments,
     read_deployments,
 )
-from pipeline.fleet.rank_tests import LEVEL
-from pipeline.fleet.trend import (
+from pipeline.datasets.rank_tests import LEVEL
+from pipeline.datasets.trend import (
     FEWEST_RUNS,
     ParameterTrend,
     Series,

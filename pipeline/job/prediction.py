@@ -23,12 +23,12 @@ from pipeline.core import (
 )
 from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
 from pipeline.core.untrusted import read_bounded
+from pipeline.datasets import UNKNOWN
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
+from pipeline.datasets.levels import draw_run
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.fleet import UNKNOWN
-from pipeline.fleet.confidence import Interval
-from pipeline.fleet.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
-from pipeline.fleet.levels import draw_run
 from pipeline.job import JobError, lack_runs
 from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.job.run_results import load_vehicle, read_length_scale
@@ -57,7 +57,7 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
     Raises:
         JobError: ``nothing_to_fit``: no run has estimates, or none is on a known terrain.
     """
-    from pipeline.fleet.forecast import fit_fleet  # noqa: PLC0415 - heavy
+    from pipeline.datasets.forecast import fit_fleet  # noqa: PLC0415 - heavy
 
     compared = _find_runs(store)
     if not compared.manifests:

@@ -12,6 +12,7 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
 from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows, jackknife_deviation, student_quantile
+from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import InputChoice, choose_input
@@ -32,7 +33,6 @@ from pipeline.estimation.rivals import (
     list_learners,
     time_fit,
 )
-from pipeline.fleet.changes import RunNumbers, Side
 from pipeline.job import JobError
 from pipeline.job.compared_runs import find_run_refusal
 from pipeline.job.keys import Owner, agree_on_vehicle

@@ -14,7 +14,7 @@ import polars as pl
 
 from pipeline.core import SlipError, finite_or_none, format_share
 from pipeline.core.arrays import Floats, interpolate_linearly
-from pipeline.fleet.terrain import (
+from pipeline.datasets.terrain import (
     CELL_M,
     LARGEST_CELL_M,
     SMALLEST_CELL_M,

@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, format_duration
-from pipeline.fleet import MEASURES, THIS_RUN
-from pipeline.fleet.answer_lines import Line, list_lines, list_pairs, title_line
-from pipeline.fleet.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
-from pipeline.fleet.pairs import (
+from pipeline.datasets import MEASURES, THIS_RUN
+from pipeline.datasets.answer_lines import Line, list_lines, list_pairs, title_line
+from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
+from pipeline.datasets.pairs import (
     ABOUT_BLOCKS,
     ABOUT_UNIT,
     AS_DRIVEN,
@@ -23,7 +23,7 @@ from pipeline.fleet.pairs import (
     compare_orders,
     judge_pair,
 )
-from pipeline.fleet.rank_tests import kendall_tau, list_swaps
+from pipeline.datasets.rank_tests import kendall_tau, list_swaps
 from pipeline.report import (
     MISSING,
     Cell,

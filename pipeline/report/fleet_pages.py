@@ -10,8 +10,8 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, format_share, suffix_unit
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.fleet.causes import Budget, Causes, Difference
-from pipeline.fleet.terrain import SHARE_DIGITS, PassEffect, TerrainMap
+from pipeline.datasets.causes import Budget, Causes, Difference
+from pipeline.datasets.terrain import SHARE_DIGITS, PassEffect, TerrainMap
 from pipeline.models.catalogue import name_parameter
 from pipeline.report import (
     MISSING,

@@ -10,8 +10,8 @@ from typing import Any
 import polars as pl
 
 from pipeline.core import INPUT_WORDS
-from pipeline.fleet import Measure
-from pipeline.fleet.deployments import ZONES, DeploymentMap
+from pipeline.datasets import Measure
+from pipeline.datasets.deployments import ZONES, DeploymentMap
 from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures

@@ -9,8 +9,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.fleet import WHISKER_REACH
-from pipeline.fleet.trend import (
+from pipeline.datasets import WHISKER_REACH
+from pipeline.datasets.trend import (
     ParameterTrend,
     Series,
     Trend,

@@ -10,8 +10,8 @@ import pytest
 
 import pipeline
 from pipeline.core.untrusted import format_csv, unquote_formulas
-from pipeline.fleet.deployments import find_own_table, read_deployments, write_deployments
-from pipeline.fleet.pairs import write_csv
+from pipeline.datasets.deployments import find_own_table, read_deployments, write_deployments
+from pipeline.datasets.pairs import write_csv
 
 TEXTS = ["=1+1", "+1", "-x", "@x", "\tx", "\rx", "\nx", "\uff1d1", "'=1", "''=1"]
 PLAIN = ["", "a=b", "'x", "x-y", " =1", None]

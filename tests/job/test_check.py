@@ -11,7 +11,7 @@ from xml.etree import ElementTree as ET
 import pytest
 from motion_runs import simulate, vehicle_of
 
-from pipeline.fleet.changes import AFTER, BEFORE
+from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.job import JobError
 from pipeline.job.check import (
     BROKEN,

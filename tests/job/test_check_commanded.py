@@ -9,7 +9,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.changes import AFTER, BEFORE
+from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.check import (

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from pipeline.fleet.pooled_tests import bound_levels, compare_means, do_spreads_differ
-from pipeline.fleet.rank_tests import StatisticsError, adjust_max_t
+from pipeline.datasets.pooled_tests import bound_levels, compare_means, do_spreads_differ
+from pipeline.datasets.rank_tests import StatisticsError, adjust_max_t
 
 PAIRS = list(combinations(range(3), 2))
 

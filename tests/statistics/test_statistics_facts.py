@@ -11,14 +11,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from pipeline.fleet.confidence import (
+from pipeline.datasets.confidence import (
     bootstrap_median,
     compare_blocks,
     integrated_time,
     number_blocks,
 )
-from pipeline.fleet.joint_levels import find_changes
-from pipeline.fleet.rank_tests import (
+from pipeline.datasets.joint_levels import find_changes
+from pipeline.datasets.rank_tests import (
     StatisticsError,
     adjust_holm,
     adjust_max_t,

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import f_oneway, t
 
-from pipeline.fleet.levels import split_levels
-from pipeline.fleet.rank_tests import StatisticsError
+from pipeline.datasets.levels import split_levels
+from pipeline.datasets.rank_tests import StatisticsError
 
 TINY = 1e-6
 

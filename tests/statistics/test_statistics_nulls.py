@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from simulated_runs import RATE, simulate_runs
 
-from pipeline.fleet.confidence import bootstrap_median, cut_blocks
-from pipeline.fleet.joint_levels import find_changes
-from pipeline.fleet.pooled_tests import Difference, MeansTest, bound_levels, compare_means
-from pipeline.fleet.rank_tests import (
+from pipeline.datasets.confidence import bootstrap_median, cut_blocks
+from pipeline.datasets.joint_levels import find_changes
+from pipeline.datasets.pooled_tests import Difference, MeansTest, bound_levels, compare_means
+from pipeline.datasets.rank_tests import (
     adjust_holm,
     adjust_max_t,
     find_testable,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from pipeline.fleet.levels import draw_run
-from pipeline.fleet.rank_tests import StatisticsError
+from pipeline.datasets.levels import draw_run
+from pipeline.datasets.rank_tests import StatisticsError
 
 GROUPS = ("asphalt", "gravel", "ice")
 

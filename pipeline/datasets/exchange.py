@@ -21,7 +21,7 @@ import polars as pl
 
 from pipeline.core import arrays, make_plain, naming_os_errors
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
-from pipeline.fleet import ComparisonError
+from pipeline.datasets import ComparisonError
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.stages.slip_stage import PUBLISHED_SAMPLES
 from schemas import Features, contract_of

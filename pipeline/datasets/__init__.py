@@ -1,8 +1,8 @@
 """Comparison of deployments: datasets, pairs, difficulty, trends, and the map of the literature.
 
-Input and output are tables; `pipeline.fleet.rank_tests` holds the significance tests. Other packages read the
-results and draw the pages. Here are the data of each run (labels, medians, measures of difficulty) and the
-datasets into which runs are pooled.
+Input and output are tables; `pipeline.datasets.rank_tests` holds the significance tests. Other packages read
+the results and draw the pages. Here are the data of each run (labels, medians, measures of difficulty) and
+the datasets into which runs are pooled.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pipeline.run.signals import MOVING_MPS
 from pipeline.stages.slip_stage import find_fastest
 
 if TYPE_CHECKING:
-    from pipeline.fleet.confidence import Interval
+    from pipeline.datasets.confidence import Interval
 
 
 class ComparisonError(SlipError):
@@ -403,7 +403,7 @@ def _bound_groups(
 
     The spread between runs is pooled over the groups of a vehicle.
     """
-    from pipeline.fleet.pooled_tests import bound_levels  # noqa: PLC0415 - heavy
+    from pipeline.datasets.pooled_tests import bound_levels  # noqa: PLC0415 - heavy
 
     low, high, about = names
     bounds: list[tuple[float | None, float | None, str]] = [(None, None, "")] * grouped.height

@@ -15,8 +15,8 @@ import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
-from pipeline.fleet import ComparisonError
-from pipeline.fleet.exchange import merge_features, read_features, write_features
+from pipeline.datasets import ComparisonError
+from pipeline.datasets.exchange import merge_features, read_features, write_features
 from pipeline.job.compare import gather_features
 from pipeline.job.over_runs import draw_up_map
 from pipeline.store import Store

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 
 from pipeline.cli import main
-from pipeline.fleet import ComparisonError
-from pipeline.fleet.deployments import (
+from pipeline.datasets import ComparisonError
+from pipeline.datasets.deployments import (
     add_deployment,
     find_own_table,
     merge_deployments,

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.fleet.equal_driving import Overlap
-from pipeline.fleet.pairs import Answer, Group, Samples, compare_groups, compare_orders
+from pipeline.datasets.equal_driving import Overlap
+from pipeline.datasets.pairs import Answer, Group, Samples, compare_groups, compare_orders
 from pipeline.job.compare import Question, compare_results, write_answer
 from pipeline.store import Store
 

@@ -20,8 +20,8 @@ from numpy.typing import ArrayLike
 
 from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, Ints, student_quantile
-from pipeline.fleet.confidence import Interval
-from pipeline.fleet.rank_tests import StatisticsError, check_values
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.rank_tests import StatisticsError, check_values
 
 _NORMAL = 1e6
 """Degrees of freedom of a known variance: Student's t is then normal."""

@@ -11,7 +11,7 @@ import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
-from pipeline.fleet.trend import Trend
+from pipeline.datasets.trend import Trend
 from pipeline.job.over_runs import follow_trend, write_trend
 from pipeline.store import Store
 from pipeline.store.names import read_day

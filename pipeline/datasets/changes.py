@@ -23,7 +23,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from pipeline.core.arrays import Flags, Floats
-from pipeline.fleet.levels import weigh_run_spreads
+from pipeline.datasets.levels import weigh_run_spreads
 
 CHANCE = 0.02
 """Level of a check's tests, so that it reports any change where there is none in at most one of forty checks:

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, pick, suffix_unit
-from pipeline.fleet import UNKNOWN
-from pipeline.fleet.forecast import leave_out_odd, list_numbers
-from pipeline.fleet.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
-from pipeline.fleet.rank_tests import LEVEL
+from pipeline.datasets import UNKNOWN
+from pipeline.datasets.forecast import leave_out_odd, list_numbers
+from pipeline.datasets.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
+from pipeline.datasets.rank_tests import LEVEL
 from pipeline.models.catalogue import find_effect
 from pipeline.models.parameter import UNDETERMINED, Level, cut_interval
 

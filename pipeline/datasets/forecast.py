@@ -10,9 +10,9 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, format_interval
 from pipeline.core.arrays import Floats
-from pipeline.fleet import UNKNOWN, ComparisonError
-from pipeline.fleet.joint_levels import RunEvidence, draw_joint_run
-from pipeline.fleet.levels import LevelFit, draw_run, find_outlier, split_levels
+from pipeline.datasets import UNKNOWN, ComparisonError
+from pipeline.datasets.joint_levels import RunEvidence, draw_joint_run
+from pipeline.datasets.levels import LevelFit, draw_run, find_outlier, split_levels
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect, Late, Place
 from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound
@@ -20,9 +20,9 @@ from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_
 # Parameters of a fleet by level: vehicle, terrain or run.
 #
 # A parameter of an effect in a run is the sum of the vehicle's value, the terrain's contribution on that
-# vehicle, the run's own contribution, and the error of the estimate (`pipeline.fleet.levels`). Several runs
-# identify the level where one run cannot: wheels that are too small are so on every terrain, slipping wheels
-# are not.
+# vehicle, the run's own contribution, and the error of the estimate (`pipeline.datasets.levels`). Several
+# runs identify the level where one run cannot: wheels that are too small are so on every terrain, slipping
+# wheels are not.
 
 SURE = 0.01
 """Significance level for differences: of fleets with ten parameters per vehicle, nine in ten show no false

@@ -10,7 +10,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, enumerate_texts, format_share
 from pipeline.core.untrusted import number_in
-from pipeline.fleet.pairs import (
+from pipeline.datasets.pairs import (
     ALIKE,
     AS_PUBLISHED,
     DIFFERENT,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pipeline.core.arrays import Floats
-from pipeline.fleet.changes import AFTER, BEFORE, CHANCE, Change, RunNumbers, compare_sides
+from pipeline.datasets.changes import AFTER, BEFORE, CHANCE, Change, RunNumbers, compare_sides
 
 COUNT = 4
 USUAL = np.full(COUNT, 0.3)

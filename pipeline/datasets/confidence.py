@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipeline.core import CONFIDENCE, TIMES_PER_BLOCK
 from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
-from pipeline.fleet.rank_tests import (
+from pipeline.datasets.rank_tests import (
     DRAWS,
     PermutationTest,
     bound_permuted,

@@ -8,8 +8,8 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.causes import compare_causes
-from pipeline.fleet.pairs import RUNS
+from pipeline.datasets.causes import compare_causes
+from pipeline.datasets.pairs import RUNS
 
 ASPHALT = {"effective_track": 0.8, "turn_lag": 0.3, "disturbance": 0.1, "localization_noise": 0.05}
 ICE = {"effective_track": 0.8, "wheel_radius": 1.5, "disturbance": 0.4, "localization_noise": 0.05}

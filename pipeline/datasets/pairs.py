@@ -13,8 +13,8 @@ import polars.selectors as cs
 from pipeline.core import CONFIDENCE, pick
 from pipeline.core.arrays import Floats, Ints
 from pipeline.core.untrusted import format_csv, number_in
-from pipeline.fleet import MEASURES
-from pipeline.fleet.confidence import (
+from pipeline.datasets import MEASURES
+from pipeline.datasets.confidence import (
     Blocks,
     Comparison,
     Interval,
@@ -23,9 +23,9 @@ from pipeline.fleet.confidence import (
     cut_blocks,
     spread_ratio,
 )
-from pipeline.fleet.equal_driving import Overlap
-from pipeline.fleet.pooled_tests import compare_means, exponentiate, pool_spread, take_logarithms
-from pipeline.fleet.rank_tests import (
+from pipeline.datasets.equal_driving import Overlap
+from pipeline.datasets.pooled_tests import compare_means, exponentiate, pool_spread, take_logarithms
+from pipeline.datasets.rank_tests import (
     DRAWS,
     FEWER_DRAWS,
     LEVEL,

@@ -10,9 +10,9 @@ import polars as pl
 import pytest
 from comparison_store import Run, make_budget, write_run
 
-from pipeline.fleet.answer_lines import list_lines, list_pairs
-from pipeline.fleet.equal_driving import find_overlap, level_runs, measure_bins
-from pipeline.fleet.pooled_tests import compare_means
+from pipeline.datasets.answer_lines import list_lines, list_pairs
+from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
+from pipeline.datasets.pooled_tests import compare_means
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results
@@ -21,7 +21,7 @@ from pipeline.store import Store
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from pipeline.fleet.pairs import Answer
+    from pipeline.datasets.pairs import Answer
 
 RATE = 20.0
 FACTORS = {"command": 1.0, "measured": 0.5}

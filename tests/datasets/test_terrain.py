@@ -9,7 +9,7 @@ import polars as pl
 import pytest
 
 from pipeline.core.arrays import Floats
-from pipeline.fleet.terrain import (
+from pipeline.datasets.terrain import (
     Drive,
     PassEffect,
     list_crossings,

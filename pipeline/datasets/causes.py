@@ -17,9 +17,9 @@ import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, format_share
 from pipeline.core.arrays import Floats
+from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
+from pipeline.datasets.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
 from pipeline.estimation.apportion import jackknife_ratio
-from pipeline.fleet.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
-from pipeline.fleet.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
 
 _LEAST_SHOWN = 0.05
 """Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""

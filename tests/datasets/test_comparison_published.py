@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.exchange import Limits, follow_published
+from pipeline.datasets.exchange import Limits, follow_published
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compare import Question, compare_results

@@ -20,14 +20,14 @@ from numpy.typing import ArrayLike
 
 from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
-from pipeline.fleet.levels import (
+from pipeline.datasets.levels import (
     Sample,
     draw_spreads,
     find_outlier,
     make_sample,
     maximize_likelihood,
 )
-from pipeline.fleet.rank_tests import FEWER_DRAWS, LEVEL, TIE, check_values
+from pipeline.datasets.rank_tests import FEWER_DRAWS, LEVEL, TIE, check_values
 
 _VAGUE = 10.0
 """Prior standard deviation of a parameter in usual sizes: keeps unidentified parameters finite."""

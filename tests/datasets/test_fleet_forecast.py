@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
-from pipeline.fleet.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
-from pipeline.fleet.joint_levels import RunEvidence
+from pipeline.datasets.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
+from pipeline.datasets.joint_levels import RunEvidence
 from pipeline.models.parameter import Level
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 import pytest
 
-from pipeline.fleet.trend import ParameterTrend, follow_parameters, format_change
+from pipeline.datasets.trend import ParameterTrend, follow_parameters, format_change
 
 GROUNDS = {"asphalt": 1.76, "gravel": 1.7, "sand": 1.92}
 

@@ -14,7 +14,7 @@ from comparison_store import Run, write_run
 from verbs import run_slip
 
 from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
-from pipeline.fleet.forecast import FleetNumber, fit_fleet
+from pipeline.datasets.forecast import FleetNumber, fit_fleet
 from pipeline.job.compare import Question, compare_results
 from pipeline.job.over_runs import follow_trend
 from pipeline.job.prediction import fit_results

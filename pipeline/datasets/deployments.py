@@ -9,7 +9,7 @@ import polars as pl
 
 from pipeline.core import naming_os_errors
 from pipeline.core.untrusted import format_csv, read_bounded_text, unquote_formulas
-from pipeline.fleet import ComparisonError, Measure
+from pipeline.datasets import ComparisonError, Measure
 from schemas import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.

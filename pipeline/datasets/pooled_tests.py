@@ -15,8 +15,8 @@ import numpy as np
 
 from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
 from pipeline.core.arrays import Floats, student_quantile
-from pipeline.fleet.confidence import Interval
-from pipeline.fleet.rank_tests import (
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.rank_tests import (
     DRAWS,
     FEWER_DRAWS,
     LARGEST_EXACT,
