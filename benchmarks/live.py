@@ -20,7 +20,7 @@ import time
 from pathlib import Path
 from typing import cast
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "job"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "live"))
 
 from live_servers import FoxgloveServer, read_messages
 
@@ -54,9 +54,7 @@ def sample(number: int) -> tuple[float, float, str]:
     except OSError:
         return 0.0, 0.0, "gone"
     memory = next((int(line.split()[1]) for line in status.splitlines() if line.startswith("VmRSS")), 0)
-    kind = next(
-        (k for k in ("live_receiver", "analyze", "watch") if any(k.encode() in w for w in words)), "-"
-    )
+    kind = next((k for k in ("receiver", "analyze", "watch") if any(k.encode() in w for w in words)), "-")
     return sum(map(int, fields[11:15])) / _TICKS, memory / 1024, kind
 
 
@@ -123,7 +121,7 @@ def measure(minutes: float, speed: float, seed: int) -> None:
         sent, kept = open_log(log), open_log(run)
         print(f"log of {minutes:g} min played {speed:g} times as fast: {sent.message_count} messages")
         print(f"recorded {kept.message_count}, {'complete' if kept.complete else kept.losses}")
-        for kind in ("all", "watch", "live_receiver", "analyze"):
+        for kind in ("all", "watch", "receiver", "analyze"):
             rows = seen.get(kind, [])
             if len(rows) < 2:
                 continue

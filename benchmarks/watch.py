@@ -22,8 +22,8 @@ from measuring import add_row, read_rows
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.running_log import list_passing, list_stated
-from pipeline.job.watch import measure_cpu
+from pipeline.live.running_log import list_passing, list_stated
+from pipeline.live.watch import measure_cpu
 from pipeline.results import RunDiagnosis, read_result, to_json
 
 Content = Mapping[str, object]

@@ -42,7 +42,7 @@ from pipeline.job import FigureFormat, Options
 if TYPE_CHECKING:
     from pipeline.job.analyze import Outcome
     from pipeline.job.keys import Inspection, TopicHealth
-    from pipeline.job.watch import Watch
+    from pipeline.live.watch import Watch
     from pipeline.recording import Recording
     from pipeline.stages.pose_choice import PoseRating
 
@@ -408,8 +408,8 @@ def watch(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object a line instead of the screen.
     """
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.job.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
-    from pipeline.job.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
+    from pipeline.live.running_log import parse_address, receive_live  # noqa: PLC0415 - heavy
+    from pipeline.live.watch import Watch, choose_recording, write_statement  # noqa: PLC0415 - heavy
 
     options = build_options(choices)
     address = parse_address(str(log))
@@ -496,7 +496,7 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     """Diagnose the whole log with the command `slip diagnose`."""
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
-    from pipeline.job.watch import write_statement  # noqa: PLC0415 - heavy
+    from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
     taken = io.StringIO()
     with contextlib.redirect_stdout(taken):

@@ -19,7 +19,6 @@ import numpy as np
 from pipeline.core import SlipError, guess_names
 from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
 from pipeline.job import ANALYZE_FIRST, STAGES, JobError, Options
-from pipeline.job.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.logs import (
     TRANSFORM_TYPES,
     ChannelInfo,
@@ -36,6 +35,7 @@ from pipeline.logs import (
     stem_of,
     to_location,
 )
+from pipeline.recording.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.run import Alignment
 from pipeline.sources import (
     Configuration,

@@ -24,7 +24,7 @@ from uvicorn.server import ServerState
 
 from pipeline.core.untrusted import PathError, resolve_inside
 from pipeline.job.analyze import PREVIEW, REPORT
-from pipeline.job.watch import read_statements
+from pipeline.live.watch import read_statements
 from pipeline.report import CATALOGUE, PAGES, PLANS, is_page
 from pipeline.report.theme import load_bundle, warm_bundle
 from pipeline.sources import list_presets

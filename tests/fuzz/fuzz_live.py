@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any, cast
 
 ROOT = Path(__file__).parents[2]
-sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures"), str(ROOT / "tests" / "job")]
+sys.path[:0] = [str(ROOT), str(ROOT / "tests" / "fixtures"), str(ROOT / "tests" / "live")]
 
 from fuzzing import peak_mb  # noqa: E402 - the repository is put on the path first
 from live_servers import (  # noqa: E402 - as above
@@ -40,10 +40,11 @@ from live_servers import (  # noqa: E402 - as above
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402 - as above
 
 from pipeline.core import SlipError  # noqa: E402 - as above
-from pipeline.job import Options, live_receiver  # noqa: E402 - as above
+from pipeline.job import Options  # noqa: E402 - as above
 from pipeline.job.analyze import analyze_log  # noqa: E402 - as above
-from pipeline.job.live_receiver import LiveReceiver  # noqa: E402 - as above
-from pipeline.job.watch import Watch  # noqa: E402 - as above
+from pipeline.live import receiver as live_receiver  # noqa: E402 - as above
+from pipeline.live.receiver import LiveReceiver  # noqa: E402 - as above
+from pipeline.live.watch import Watch  # noqa: E402 - as above
 from pipeline.logs import open_log  # noqa: E402 - as above
 from pipeline.logs.live_recording import LiveRecording  # noqa: E402 - as above
 from pipeline.simulate import Scenario, simulate_run, write_log  # noqa: E402 - as above

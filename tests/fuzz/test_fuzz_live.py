@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import pytest
 from fuzz_live import PATCHES, prepare, run_case
 
-from pipeline.job import live_receiver
-from pipeline.job.live_receiver import LiveReceiver
-from pipeline.job.watch import Watch
+from pipeline.live import receiver as live_receiver
+from pipeline.live.receiver import LiveReceiver
+from pipeline.live.watch import Watch
 
 if TYPE_CHECKING:
     from pathlib import Path

@@ -9,10 +9,11 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from pipeline.job import Options, log_choice
+from pipeline.job import Options
 from pipeline.job.keys import inspect_log
-from pipeline.job.log_choice import MOST_POSES
 from pipeline.logs.writer import LogWriter
+from pipeline.recording import log_choice
+from pipeline.recording.log_choice import MOST_POSES
 from pipeline.simulate import simulate_case
 from pipeline.stages import pose_choice
 

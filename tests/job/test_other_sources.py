@@ -15,8 +15,8 @@ from mcap_ros2.writer import Writer
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.log_choice import Choice, choose
 from pipeline.logs import definition_text, open_log
+from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.platforms import (
     Fields,

@@ -9,8 +9,8 @@ from platforms import hidden_effects, try_platform
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.log_choice import Choice, choose
 from pipeline.logs import Wanted, open_log, read_topics
+from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate import PLATFORMS, simulate_case
 from pipeline.sources import load_configuration
 

@@ -10,8 +10,8 @@ import pytest
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.log_choice import choose
 from pipeline.logs import open_log
+from pipeline.recording.log_choice import choose
 from pipeline.simulate import PLATFORMS, make_scenario, simulate_case, simulate_run, write_log
 from pipeline.sources import load_configuration
 

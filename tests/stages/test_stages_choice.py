@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from stage_logs import FIELD, PLAIN, TakeThrough
 
-from pipeline.job.log_choice import Choice, choose
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns, open_log, read_topics
 from pipeline.logs.writer import LogWriter
+from pipeline.recording.log_choice import Choice, choose
 from pipeline.simulate import (
     Clock,
     PoseSensor,

@@ -13,7 +13,7 @@ import pytest
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from pipeline.job.watch import read_statements, write_statement
+from pipeline.live.watch import read_statements, write_statement
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store
 

@@ -20,8 +20,8 @@ from verbs import run_verb
 
 from pipeline.cli.screen import format_watch
 from pipeline.job import Options
-from pipeline.job.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
-from pipeline.job.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
+from pipeline.live.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
+from pipeline.live.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import GrowingLog
 from pipeline.logs.reader import Wanted
@@ -217,7 +217,7 @@ def test_a_full_disk_under_what_is_shown_is_one_line_and_the_watch_goes_on(
             raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Watch, "follow", follow)
-    place = "pipeline.cli.verbs_log._write_page" if full == "page" else "pipeline.job.watch.write_statement"
+    place = "pipeline.cli.verbs_log._write_page" if full == "page" else "pipeline.live.watch.write_statement"
     monkeypatch.setattr(place, fill)
     told = run_verb("watch", log, "--page", tmp_path / "page.html", "--results", tmp_path / "out")
     assert looks == [0, 1, 2]

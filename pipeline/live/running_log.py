@@ -29,8 +29,8 @@ import numpy as np
 from pipeline.core import pick_finite, python_command
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.driving_need import find_goal
-from pipeline.job import JobError
-from pipeline.job.live_receiver import ReceiverOrder, ReceiverState
+from pipeline.live import LiveError
+from pipeline.live.receiver import ReceiverOrder, ReceiverState
 from pipeline.logs.index import LISTING, GrowingLog, list_files
 from pipeline.logs.live_recording import lock_folder
 from pipeline.results import Named, RunDiagnosis, Value
@@ -75,7 +75,7 @@ def parse_address(text: str) -> LiveAddress | None:
         text: text of the user; a slash that `Path` has removed may be missing.
 
     Raises:
-        JobError: ``bad_address``; ``not_this_machine``.
+        LiveError: ``bad_address``; ``not_this_machine``.
     """
     match = _SCHEME.match(text)
     if match is None:
@@ -86,12 +86,12 @@ def parse_address(text: str) -> LiveAddress | None:
         parts = urlsplit(text)
         name, port = parts.hostname or "", parts.port or _DEFAULT_PORT
     except ValueError as error:
-        raise JobError(
+        raise LiveError(
             "bad_address", f"the address cannot be read ({error})", where=text, hint=hint
         ) from error
     if parts.scheme == "wss" or parts.username or parts.query or parts.fragment or not name:
         what = "only a plain address can be watched: ws://, a host and a port"
-        raise JobError("bad_address", what, where=text, hint=hint)
+        raise LiveError("bad_address", what, where=text, hint=hint)
     # Another program may listen on the other address of that name.
     host = "127.0.0.1" if name == "localhost" else name
     try:
@@ -102,7 +102,7 @@ def parse_address(text: str) -> LiveAddress | None:
         what = "only a server on this machine is watched: the connection has no password and no encryption"
         tunnel = f"ssh -L {port}:127.0.0.1:{port} {name}"
         hint = f"Fetch its port here with `{tunnel}`, then watch ws://127.0.0.1:{port}"
-        raise JobError("not_this_machine", what, where=text, hint=hint)
+        raise LiveError("not_this_machine", what, where=text, hint=hint)
     return LiveAddress(host, port, parts.path or "/")
 
 
@@ -157,7 +157,7 @@ class ReceivingProcess:
     def __init__(self, address: LiveAddress, folder: Path, topics: dict[str, str]) -> None:
         self.state = ReceiverState()
         self._process = subprocess.Popen(  # noqa: S603 - this program itself
-            python_command("-m", "pipeline.job.live_receiver"),
+            python_command("-m", "pipeline.live.receiver"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             # The watch handles Ctrl-C and then ends the recording.
@@ -186,23 +186,23 @@ class ReceivingProcess:
         """Raise an error if the process has ended.
 
         Raises:
-            JobError: the error that has ended it.
+            LiveError: the error that has ended it.
         """
         self.raise_error()
         if self._process.poll() is not None:
             what = "the process that receives from the server has ended"
             hint = "Start the watch again: it goes on with the recording"
-            raise JobError("receiver_lost", what, hint=hint)
+            raise LiveError("receiver_lost", what, hint=hint)
 
     def raise_error(self) -> None:
         """Raise the error that the process has reported, if any.
 
         Raises:
-            JobError: that error.
+            LiveError: that error.
         """
         state = self.state
         if state.code:
-            raise JobError(state.code, state.what, where=state.where, hint=state.hint)
+            raise LiveError(state.code, state.what, where=state.where, hint=state.hint)
 
     def stop(self) -> None:
         """End the recording, and wait for it."""
@@ -236,7 +236,7 @@ class LiveLog(GrowingLog):
         """Index data added since the last call; return whether there were any.
 
         Raises:
-            JobError: the error that has ended the receiver; ``nothing_received``.
+            LiveError: the error that has ended the receiver; ``nothing_received``.
         """
         self._receiver.check()
         if list_files(self.path):
@@ -244,7 +244,7 @@ class LiveLog(GrowingLog):
         if time.monotonic() - self._begin > self._quiet_s:
             what = f"no message of motion came for {self._quiet_s:g} s ({self.note})"
             hint = "Start the robot's nodes, name topics with --topic, or wait longer with --for SECONDS"
-            raise JobError("nothing_received", what, hint=hint)
+            raise LiveError("nothing_received", what, hint=hint)
         return False
 
     @property
@@ -276,7 +276,7 @@ def receive_live(
         quiet_s: see `LiveLog`.
 
     Raises:
-        JobError: error of the receiver: ``no_live_server``, ``recording_unwritable``, ...
+        LiveError: error of the receiver: ``no_live_server``, ``recording_unwritable``, ...
     """
     path = folder or name_folder(address, Path())
     receiver = ReceivingProcess(address, path, parse_topics(topics))

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 import msgspec
 
 from pipeline.core import SlipError
-from pipeline.job import JobError
+from pipeline.live import LiveError
 from pipeline.logs import TRANSFORM_TYPES
 from pipeline.logs.live_recording import (
     FOXGLOVE_NAMES,
@@ -136,7 +136,7 @@ class LiveReceiver:
         """Receive messages, and reconnect after lost connections.
 
         Raises:
-            JobError: ``needs_live``; ``no_live_server`` at the first connection; ``not_a_live_server``.
+            LiveError: ``needs_live``; ``no_live_server`` at the first connection; ``not_a_live_server``.
             LogError: ``recording_unwritable``.
         """
         # A wrong address is an error at the start; later the server may disappear and return.
@@ -147,7 +147,7 @@ class LiveReceiver:
             try:
                 with held or self._connect():
                     self._receive()
-            except JobError as error:
+            except LiveError as error:
                 if error.code != "no_live_server":
                     raise
                 self._reason = error.what
@@ -171,7 +171,7 @@ class LiveReceiver:
         except ImportError as error:
             what = "watching a server needs another package"
             hint = "Install the extra `live`: pip install 'slip-pipeline[live]'"
-            raise JobError("needs_live", what, where=self.address, hint=hint) from error
+            raise LiveError("needs_live", what, where=self.address, hint=hint) from error
         parts = urlsplit(self.address)
         try:
             with ExitStack() as stack:
@@ -196,7 +196,7 @@ class LiveReceiver:
         except (ValueError, *_list_failures()) as error:
             what = f"no server answers there: {_explain_end(error)}"
             hint = "Start foxglove_bridge or rosbridge, or check the port"
-            raise JobError("no_live_server", what, where=self.address, hint=hint) from error
+            raise LiveError("no_live_server", what, where=self.address, hint=hint) from error
 
     def _receive(self) -> None:
         given = {topic: kind for topic, kind in self._topics.items() if kind}
@@ -212,7 +212,7 @@ class LiveReceiver:
             if not protocol.is_recognized and now - begin > OPEN_S and not given:
                 what = "the server speaks neither the Foxglove WebSocket protocol nor rosbridge with rosapi"
                 hint = "Check the port; without rosapi give the topics: --topic /odom=nav_msgs/msg/Odometry"
-                raise JobError("not_a_live_server", what, where=self.address, hint=hint)
+                raise LiveError("not_a_live_server", what, where=self.address, hint=hint)
             try:
                 frame = connection.recv(timeout=_POLL_S)
             except TimeoutError:

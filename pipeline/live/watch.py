@@ -19,9 +19,10 @@ import msgspec
 from pipeline.core import SlipError, make_plain, shorten
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
-from pipeline.job import JobError, Options
+from pipeline.job import Options
 from pipeline.job.keys import LogSetup, set_up_log
 from pipeline.job.work import add_model, as_recorded, identify
+from pipeline.live import LiveError
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.models import read_model
@@ -266,7 +267,7 @@ class Watch:
             return
         what = f"nothing was written to it for {self._quiet_s:g} s"
         hint = "Start the recorder, or wait longer with --for SECONDS"
-        raise JobError("never_grows", what, where=str(self.path), hint=hint)
+        raise LiveError("never_grows", what, where=str(self.path), hint=hint)
 
     @property
     def _is_behind(self) -> bool:
@@ -390,7 +391,7 @@ class Watch:
 
     def _collect(self, scratch: Path) -> bool:
         """Collect the result of a finished diagnosis."""
-        from pipeline.job.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
+        from pipeline.live.running_log import summarize_knowledge  # noqa: PLC0415 - heavy
 
         running = self._diagnosing
         if running is None or running.process.poll() is None:

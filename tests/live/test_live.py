@@ -31,9 +31,9 @@ from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.rosbag2 import Reader
 from verbs import run_verb
 
-from pipeline.job import JobError
-from pipeline.job.live_receiver import LiveReceiver
-from pipeline.job.running_log import LiveLog, name_folder, parse_address, receive_live
+from pipeline.live import LiveError
+from pipeline.live.receiver import LiveReceiver
+from pipeline.live.running_log import LiveLog, name_folder, parse_address, receive_live
 from pipeline.logs import LogError, open_log, read_topics
 from pipeline.logs.index import LISTING
 from pipeline.logs.live_recording import (
@@ -280,14 +280,14 @@ def test_a_clock_that_is_set_begins_a_file_and_costs_no_message(
     ],
 )
 def test_only_a_plain_address_of_this_machine_is_watched(address: str, code: str) -> None:
-    with pytest.raises(JobError) as refused:
+    with pytest.raises(LiveError) as refused:
         parse_address(address)
     assert refused.value.code == code
     assert "\n" not in str(refused.value)
 
 
 def test_an_address_is_shown_with_the_slash_that_a_path_takes_from_it() -> None:
-    with pytest.raises(JobError) as refused:
+    with pytest.raises(LiveError) as refused:
         parse_address(str(Path("ws://192.168.1.20:8765")))
     assert refused.value.where == "ws://192.168.1.20:8765"
 
@@ -345,7 +345,7 @@ def test_without_the_extra_one_line_says_what_to_install(
 ) -> None:
     monkeypatch.setitem(sys.modules, "websockets.sync.client", None)
     receiver = LiveReceiver("ws://127.0.0.1:1/", LiveRecording(tmp_path / "run"), {})
-    with pytest.raises(JobError, match=r"needs another package. Install the extra `live`"):
+    with pytest.raises(LiveError, match=r"needs another package. Install the extra `live`"):
         receiver.run()
 
 
@@ -356,7 +356,7 @@ def test_rosbridge_without_rosapi_takes_topics_with_types(source: Path, tmp_path
     try:
         with receive(server.port, tmp_path / "none", quiet_s=1.5) as log:
             wait_for(lambda: "--topic NAME=TYPE" in log.note)
-            with pytest.raises(JobError, match=r"no message of motion came for 1.5 s"):
+            with pytest.raises(LiveError, match=r"no message of motion came for 1.5 s"):
                 wait_for(log.update)
         topic = (f"{ODOMETRY}=nav_msgs/msg/Odometry",)
         with receive(server.port, tmp_path / "run", topic) as log, playing(server, messages, 10.0):
