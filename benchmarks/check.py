@@ -32,18 +32,18 @@ from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 from pipeline.core import SlipError
 from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.job.check import Check, compare, find_usual_spread
 from pipeline.job.check_sides import Sides, read_under, unite_effects
-from pipeline.job.run_results import find_diagnosis, load_vehicle
 from pipeline.job.stored_fits import ERRORS, RunReading
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import load_motion_run
 from pipeline.results.reading import read_model
-from pipeline.run import MotionRun, load_run
+from pipeline.run import MotionRun, load_motion_run, load_run
 from pipeline.run.windows import cut_run
 from pipeline.simulate import Disturbance, Program, Scenario, find_vehicle, simulate_run
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Store
 
 KINDS = ("closed", "natural", "sets")

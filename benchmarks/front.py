@@ -21,7 +21,7 @@ from rewritten_logs import Change, Roles, list_changes, read, write
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.keys import set_up_log
+from pipeline.recording.log_setup import set_up_log
 from pipeline.simulate import PLATFORMS, simulate_case
 
 SAMPLES = Path(__file__).parents[1] / "data_samples"

@@ -27,9 +27,9 @@ from measuring import RECORDINGS, add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 

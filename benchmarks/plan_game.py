@@ -21,10 +21,10 @@ from measuring import add_row, read_rows
 
 from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.next_drive import ALL, Wish, plan_drive, study
-from pipeline.job.run_results import read_recording
 from pipeline.plan import parse_area
 from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import check_plan, read_promises, write_plan

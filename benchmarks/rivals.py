@@ -45,14 +45,15 @@ from pipeline.estimation.rivals import (
     score_learned,
     time_fit,
 )
+from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import find_diagnosis, load_vehicle
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models
-from pipeline.report.motion_view import load_motion_run
 from pipeline.results.reading import read_model
+from pipeline.run import load_motion_run
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Manifest, Store
 
 NAMED, IDEAL, TREES, BEYOND = "named physics", "ideal", "learned_trees", "named + trees"

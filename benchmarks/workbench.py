@@ -27,10 +27,10 @@ from pipeline.estimation import Problem, choose_input, fit_model
 from pipeline.estimation.folds import score
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import load_vehicle
 from pipeline.models import Model, find_effect
-from pipeline.report.motion_view import load_motion_run
+from pipeline.run import load_motion_run
 from pipeline.simulate import simulate_case
+from pipeline.sources.one_vehicle import load_vehicle
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 

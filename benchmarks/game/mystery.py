@@ -21,8 +21,8 @@ from game.play import score_runs
 from game.score import TaskScore
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import DIAGNOSIS
 from pipeline.simulate import list_effects
+from pipeline.store.stored_runs import DIAGNOSIS
 
 _DRAWN: tuple[tuple[Category, int], ...] = (("single", 901), ("sets", 902), ("odd", 903))
 _LONGEST_S = 150.0

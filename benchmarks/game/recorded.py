@@ -40,8 +40,8 @@ from game.rings import (
 from pipeline.core import SlipError
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import load_vehicle
 from pipeline.logs.writer import LogWriter
+from pipeline.sources.one_vehicle import load_vehicle
 
 Floats = NDArray[np.float64]
 Json = dict[str, Any]

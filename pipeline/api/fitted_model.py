@@ -34,7 +34,7 @@ from pipeline.words.models import format_ladder, format_parameters
 
 if TYPE_CHECKING:
     from pipeline.api import Run
-    from pipeline.job.keys import Owner
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")

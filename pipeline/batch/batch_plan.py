@@ -15,14 +15,16 @@ from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.core import SlipError
 from pipeline.core.untrusted import read_bounded, walk_files
-from pipeline.job import Options, run_results
-from pipeline.job.keys import VERSIONS, hash_json, name_plainly
+from pipeline.estimation.stored_diagnosis import STAGE, VERSION
+from pipeline.job import Options
+from pipeline.job.keys import VERSIONS
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets
 from pipeline.sources.message_types import read_tables
 from pipeline.store import LogIdentities, LogSighting, Manifest, Store, StoreError, see_log
 from pipeline.store.mirror import Mirror
 from pipeline.store.names import path_unread
+from pipeline.store.stored_runs import hash_json, name_plainly
 
 # Basis of a log: a hash of everything that its results depend on except the log itself.
 #
@@ -69,7 +71,7 @@ def _fingerprint_program() -> object:
     from schemas import list_contracts  # noqa: PLC0415
 
     return [
-        {**VERSIONS, run_results.STAGE: run_results.VERSION},
+        {**VERSIONS, STAGE: VERSION},
         {contract.name: contract.version for contract in list_contracts()},
         [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
         msgspec.to_builtins(read_tables()),

@@ -240,7 +240,7 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 def _format_losses(outcome: Outcome) -> str:
     from pipeline.core.untrusted import objects_in  # noqa: PLC0415 - heavy
-    from pipeline.job.work import stored_contexts  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import stored_contexts  # noqa: PLC0415 - heavy
 
     losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
     return "; ".join(str(loss.get("text")) for loss in losses)

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.core import SlipError, measure_memory
-from pipeline.job import INPUTS, STAGE_WORDS, Options
+from pipeline.core import INPUTS, SlipError, measure_memory
+from pipeline.job import STAGE_WORDS, Options
 
 if TYPE_CHECKING:
     from pipeline.job.analyze import OpenedRun

@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from pipeline.cli.verb_model import On
     from pipeline.datasets.forecast import Forecast
     from pipeline.estimation.problem import Problem
-    from pipeline.job.keys import Owner
     from pipeline.models.literature import LiteratureModel
     from pipeline.models.model import Model
     from pipeline.models.model_file import ModelFile
     from pipeline.run import MotionRun
     from pipeline.sources import Vehicle
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest
 
 

@@ -10,8 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Results, format_value, open_results, print_result
-from pipeline.core import INPUT_WORDS, SlipError, format_part
-from pipeline.job import FigureFormat
+from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part
 
 if TYPE_CHECKING:
     import polars as pl

@@ -207,8 +207,8 @@ def _gather(
     names: Sequence[str], options: Options, *, quiet: bool, known: _Gathered | None = None
 ) -> _Gathered:
     """Runs of one vehicle, each once, after those that are known already."""
+    from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
     from pipeline.job.next_drive import read_command  # noqa: PLC0415 - heavy
-    from pipeline.job.run_results import read_recording  # noqa: PLC0415 - heavy
 
     recordings = [] if known is None else [*known.recordings]
     manifests = [] if known is None else [*known.manifests]

@@ -30,17 +30,17 @@ from pipeline.cli.conventions import (
     spell_flags,
     summarize_error,
 )
-from pipeline.core import SlipError
+from pipeline.core import INPUTS, SlipError
 from pipeline.core.untrusted import resolve_inside
-from pipeline.job import INPUTS, Options
+from pipeline.job import Options
 
 if TYPE_CHECKING:
     from pipeline.estimation import Diagnosis, Recording
-    from pipeline.job.keys import Owner
     from pipeline.models import Model, ModelFile
     from pipeline.models.effect import Effect
     from pipeline.results import RunDiagnosis
     from pipeline.sources import Vehicle
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest
 
 
@@ -150,7 +150,8 @@ def _gather(
 
     ``at_work`` receives the name of the current log, ``opened`` the data read of each run.
     """
-    from pipeline.job.run_results import read_choices, read_recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import read_choices  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
@@ -197,7 +198,7 @@ def _answer(
     search: Callable[[], Diagnosis], opened: Sequence[_Opened], results: Path, *, keeps: bool, quiet: bool
 ) -> _Answer:
     """The result of a search, or with ``keeps`` the stored result of an earlier one."""
-    from pipeline.job.run_results import find_diagnosis  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import find_diagnosis  # noqa: PLC0415 - heavy
     from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
 
     if keeps and (stored := find_diagnosis(results, opened[0].manifest)) is not None:
@@ -210,7 +211,7 @@ def _answer(
 
 def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: bool) -> None:
     """Store an answer with the results; if they cannot be written, only print a note."""
-    from pipeline.job.run_results import keep_diagnosis  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import keep_diagnosis  # noqa: PLC0415 - heavy
 
     (run,) = diagnosis.runs
     try:
@@ -233,7 +234,7 @@ def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
 def _agree(
     known: ModelFile | None, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None
 ) -> Vehicle:
-    from pipeline.job.keys import agree_on_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.sources.one_vehicle import agree_on_vehicle  # noqa: PLC0415 - heavy
 
     if known is None:
         return vehicle
@@ -372,11 +373,11 @@ def export(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
     from pipeline.report import viewer_files  # noqa: PLC0415
     from pipeline.report.export_source import ExportSource  # noqa: PLC0415
     from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
     known = _open_model(model, trust_code=trust_code)
@@ -400,7 +401,7 @@ def export(  # noqa: D417 - the results folder documents itself
 
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
     """The model of the run's diagnosis, and its input; None if there is none."""
-    from pipeline.job.run_results import read_stored_diagnosis  # noqa: PLC0415 - heavy
+    from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
     from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
 
     diagnosis = read_stored_diagnosis(manifest)

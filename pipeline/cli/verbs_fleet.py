@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from pipeline.job import Options
     from pipeline.job.check import Check
     from pipeline.job.check_sides import Baseline
-    from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
     from pipeline.models.parameter import Parameter as ModelParameter
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest
 
 

@@ -36,14 +36,14 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import trust_named
-from pipeline.core import SlipError, format_duration, format_share, naming_os_errors
-from pipeline.job import FigureFormat, Options
+from pipeline.core import FigureFormat, SlipError, format_duration, format_share, naming_os_errors
+from pipeline.job import Options
 
 if TYPE_CHECKING:
     from pipeline.job.analyze import Outcome
-    from pipeline.job.keys import Inspection, TopicHealth
     from pipeline.live.watch import Watch
     from pipeline.recording import Recording
+    from pipeline.recording.inspection import Inspection, TopicHealth
     from pipeline.stages.pose_choice import PoseRating
 
     Content = Mapping[str, object]
@@ -177,7 +177,7 @@ def inspect(  # noqa: D417 - the shared choices document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.job.keys import inspect_log  # noqa: PLC0415 - heavy
+    from pipeline.recording.inspection import inspect_log  # noqa: PLC0415 - heavy
 
     seen = inspect_log(log, build_options(choices))
     print_result(_log_as_json(seen), lambda: _format_log(seen), json=json)
@@ -351,7 +351,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
         quiet: print nothing.
     """
     from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
-    from pipeline.job.keys import find_log  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import find_log  # noqa: PLC0415 - heavy
 
     options = replace(build_options(choices), force=force, through=name)
     path = find_log(log, options.out)

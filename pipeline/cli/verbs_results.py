@@ -337,8 +337,8 @@ def explain(  # noqa: D417 - arguments document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.job.keys import find_run  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
     about = _list_column(column) if column else {}

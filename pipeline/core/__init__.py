@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import Any, Literal, get_args
 
 _READABLE = 300
 """Maximum number of characters of quoted text in a sentence: four lines of a screen."""
@@ -109,8 +109,12 @@ _LEAST_PART = 0.001
 _NEARLY_ALL = 0.95
 """Share of the recording below which the compared duration is shown as well."""
 
+INPUTS = ("command", "measured")
 INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
 """Text for each input of the ideal model."""
+
+FigureFormat = Literal["svg", "pdf", "png"]
+FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)
 
 
 def suffix_unit(unit: object) -> str:

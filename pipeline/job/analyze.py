@@ -12,35 +12,29 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
-from pipeline.core import SlipError, read_version
+from pipeline.core import FIGURES, INPUTS, FigureFormat, SlipError, read_version
 from pipeline.core.untrusted import PathError, read_bounded, read_bounded_text, resolve_inside
-from pipeline.job import FIGURES, INPUTS, STAGES, FigureFormat, Options
-from pipeline.job.keys import (
-    LogSetup,
-    find_recorded_log,
-    find_run,
-    hash_json,
-    key_stages,
-    name_run,
-    set_up_log,
-)
-from pipeline.job.run_results import (
-    DIAGNOSIS,
-    diagnose_work,
-    find_peers,
-    has_diagnosis,
-    judge_run,
-    key_diagnosis,
-    list_versions,
-    summarize_run,
-)
-from pipeline.job.work import Progress, Work, hash_model, read_wanted, stored_contexts, stored_keys
+from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
+from pipeline.job import STAGES, Options
+from pipeline.job.keys import key_stages
+from pipeline.job.run_results import diagnose_work, find_peers, judge_run, list_versions, summarize_run
+from pipeline.job.work import Progress, Work, hash_model, read_wanted
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
+from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.report import PLANS, lead_to, lead_up
 from pipeline.results import RunDiagnosis
 from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
 from pipeline.store.files import make_folder, replace_file
 from pipeline.store.names import encode_run
+from pipeline.store.stored_runs import (
+    DIAGNOSIS,
+    find_recorded_log,
+    find_run,
+    hash_json,
+    name_run,
+    stored_contexts,
+    stored_keys,
+)
 
 if TYPE_CHECKING:
     from pipeline.plan.plan import Plan

@@ -32,9 +32,9 @@ from pipeline.job.stored_fits import (
 from pipeline.models import write_text
 
 if TYPE_CHECKING:
-    from pipeline.job.keys import Owner
     from pipeline.models.model_file import ModelFile
     from pipeline.models.parameter import Parameter
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest, Store
 
 Outcome = Literal["kept", "broken", "undetermined"]

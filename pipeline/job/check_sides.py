@@ -15,15 +15,14 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import NORMAL_95, SlipError, finite_or_none, shorten
+from pipeline.core import INPUTS, NORMAL_95, SlipError, finite_or_none, shorten
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import read_bounded
 from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.estimation.comparison import Input, choose_input
-from pipeline.job import INPUTS, JobError
+from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
+from pipeline.job import JobError
 from pipeline.job.compared_runs import find_run_refusal
-from pipeline.job.keys import UNKNOWN, agree_on_vehicle
-from pipeline.job.run_results import diagnose_stored, find_diagnosis, keep_diagnosis, load_vehicle
 from pipeline.job.stored_fits import (
     COMMANDED,
     LOGARITHMS,
@@ -40,13 +39,15 @@ from pipeline.models.formula import FormulaEffect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.parameter import is_of_one_run
-from pipeline.report.motion_view import load_motion_run
+from pipeline.recording.log_setup import UNKNOWN
 from pipeline.results.reading import read_model
+from pipeline.run import load_motion_run
+from pipeline.sources.one_vehicle import agree_on_vehicle, load_vehicle
 
 if TYPE_CHECKING:
-    from pipeline.job.keys import Owner
     from pipeline.models.effect import Effect
     from pipeline.run import MotionRun
+    from pipeline.sources.one_vehicle import Owner
     from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, read_version
+from pipeline.core import FEWEST_OF_SPREAD, FigureFormat, read_version
 from pipeline.core.arrays import Ints
 from pipeline.datasets import (
     OVER_RUNS,
@@ -46,7 +46,6 @@ from pipeline.datasets.pairs import (
 )
 from pipeline.datasets.pooled_tests import bound_levels
 from pipeline.datasets.rank_tests import connect_groups
-from pipeline.job import ANALYZE_FIRST, FigureFormat, JobError, lack_runs
 from pipeline.job.compared_runs import (
     ComparedRuns,
     can_read,
@@ -60,6 +59,7 @@ from pipeline.models.catalogue import list_effects, name_effect
 from pipeline.report import Picture
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.store import Store
+from pipeline.store.stored_runs import ANALYZE_FIRST, NoRunsError, lack_runs
 from pipeline.words.effects import CAUSE_NAMES
 from schemas import Features
 
@@ -499,7 +499,7 @@ def find_level_names(store: Store) -> dict[str, str]:
     """Names of effects that the fleet model labels by their level, or by all candidate levels."""
     names_by_effect: dict[str, set[str]] = {}
     # Without estimates effects have no levels.
-    with contextlib.suppress(JobError):
+    with contextlib.suppress(NoRunsError):
         for number in fit_results(store)[0].numbers:
             names_by_effect.setdefault(number.effect, set()).add(number.name)
     called = {

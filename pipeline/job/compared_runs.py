@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.core import guess_names
 from pipeline.datasets import ComparisonError, label_runs
-from pipeline.job.run_results import DIAGNOSED, DIAGNOSIS
+from pipeline.estimation.stored_diagnosis import DIAGNOSED
 from pipeline.models.catalogue import list_effects
 from pipeline.results.reading import find_refusal, read_findings
 from pipeline.run.signals import GROUND_UNOBSERVABLE
@@ -15,6 +15,7 @@ from pipeline.stages.checks import find_gain, is_grip
 from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.names import date_runs
 from pipeline.store.parquet_tables import scan_table
+from pipeline.store.stored_runs import DIAGNOSIS
 from schemas import contract_of
 
 _DATES = ("day", "month", "year")

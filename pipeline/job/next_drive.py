@@ -24,7 +24,6 @@ from pipeline.estimation.decision import find_cost
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
 from pipeline.job.prediction import find_estimates
-from pipeline.job.run_results import load_vehicle
 from pipeline.models.effect import Effect, Late
 from pipeline.models.model import Model
 from pipeline.plan import Area, Limits, is_steered
@@ -32,9 +31,10 @@ from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question
 from pipeline.plan.rehearsal import Knowledge
-from pipeline.report.motion_view import load_motion_run
 from pipeline.results import RunDiagnosis
+from pipeline.run import load_motion_run
 from pipeline.sources import Vehicle
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Manifest
 
 if TYPE_CHECKING:
@@ -386,7 +386,7 @@ def ask(
 
 def read_command(manifest: Manifest) -> dict[str, object]:
     """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
-    from pipeline.job.run_results import read_choices  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import read_choices  # noqa: PLC0415 - heavy
 
     configuration = manifest.details.get("configuration")
     source = configuration.get("command") if isinstance(configuration, dict) else None

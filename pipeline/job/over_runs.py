@@ -9,7 +9,7 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, finite_or_none, guess_names, pick, pick_finite
+from pipeline.core import INPUT_WORDS, FigureFormat, finite_or_none, guess_names, pick, pick_finite
 from pipeline.core.untrusted import read_bounded
 from pipeline.datasets import MEASURES, ComparisonError, gather_runs, pool_runs
 from pipeline.datasets.causes import Budget, Causes, Difference, compare_causes
@@ -34,7 +34,7 @@ from pipeline.datasets.trend import (
     raise_alerts,
     summarize_parameter,
 )
-from pipeline.job import FigureFormat, JobError, lack_runs
+from pipeline.job import JobError
 from pipeline.job.compare import (
     Question,
     choose_input,
@@ -50,6 +50,7 @@ from pipeline.job.compare import (
 from pipeline.job.compared_runs import ComparedRuns, choose_runs, find_material, keep_runs, read_digest
 from pipeline.models.catalogue import list_effects
 from pipeline.store import Store
+from pipeline.store.stored_runs import NoRunsError, lack_runs
 
 _EFFECT = "effect"
 
@@ -418,7 +419,7 @@ def update_trend(store: Store) -> None:
     if not all(math.isfinite(value) for value in (threshold, *limits.values())):
         return
     # No run with a date, or no such column to group by.
-    with contextlib.suppress(JobError, ComparisonError):
+    with contextlib.suppress(NoRunsError, ComparisonError):
         write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
 
 

@@ -29,18 +29,19 @@ from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast,
 from pipeline.datasets.levels import draw_run
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.job import JobError, lack_runs
+from pipeline.job import JobError
 from pipeline.job.compared_runs import ComparedRuns, find_material, read_digest
-from pipeline.job.run_results import load_vehicle, read_length_scale
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect
 from pipeline.models.model import Model, Timing
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import COLUMNS, load_motion_run
-from pipeline.run import MotionError
+from pipeline.run import TABLE_COLUMNS as COLUMNS
+from pipeline.run import MotionError, load_motion_run
 from pipeline.sources import Vehicle
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Manifest, Store
 from pipeline.store.names import no_results, read_day
+from pipeline.store.stored_runs import NoRunsError, lack_runs, read_length_scale
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)
@@ -121,7 +122,7 @@ def update_fleet(store: Store) -> None:
     The model stays unchanged if no run has estimates.
     """
     if (store.root / FLEET).is_file():
-        with contextlib.suppress(JobError):
+        with contextlib.suppress(NoRunsError):
             write_fleet(store, *fit_results(store))
 
 

@@ -4,43 +4,43 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
-from pathlib import Path
 from typing import TYPE_CHECKING
-
-import msgspec
-import polars as pl
 
 from pipeline.core import PACKAGE, SlipError, read_version
 from pipeline.core.untrusted import (
-    PathError,
     mapping_in,
     number_in,
     objects_in,
-    read_bounded,
     read_object,
-    resolve_inside,
 )
-from pipeline.job import INPUTS, JobError
-from pipeline.job.keys import LogSetup, Owner, agree_on_vehicle, hash_json
-from pipeline.job.work import Work, add_model, remove_model, stored_contexts, stored_keys
+from pipeline.estimation.stored_diagnosis import (
+    DIAGNOSED,
+    STAGE,
+    _make_recording,
+    _read_stored,
+    has_diagnosis,
+    key_diagnosis,
+    show_model,
+)
+from pipeline.job.work import Work
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
+from pipeline.recording.log_setup import LogSetup
 from pipeline.results import Finding, RunDiagnosis, read_result, to_json
-from pipeline.results.reading import read_findings, read_model
+from pipeline.results.reading import read_findings
 from pipeline.stages.reading import list_wanted
-from pipeline.stages.slip_stage import set_residuals
-from pipeline.store import JSON, Generation, Manifest, Store, StoreError
+from pipeline.stages.slip_stage import SUMMARY_DIGITS, pick_row, round_number, summarize_inputs
+from pipeline.store import JSON, Store, StoreError
 from pipeline.store.checksums import load_manifest
-from pipeline.store.files import make_folder, replace_file
-from pipeline.store.names import encode_run
+from pipeline.store.stored_runs import (
+    DIAGNOSIS,
+    SUMMARY,
+)
 
 if TYPE_CHECKING:
-    from pipeline.estimation import Recording
-    from pipeline.models import Model
-    from pipeline.sources import Vehicle
+    import polars as pl
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")
@@ -76,31 +76,6 @@ def _look_up(name: str) -> str:
     return version(name)
 
 
-STAGE = "diagnosis"
-DIAGNOSIS = "diagnosis.json"
-_SUMMARY = "summary.json"
-_TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
-VERSION = 47
-DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
-
-
-def key_diagnosis(keys: Mapping[str, str]) -> str:
-    """Key of the diagnosis of a run whose stages have these keys."""
-    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
-
-    # An effect is searched for by being there.
-    effects = sorted(path.name for path in (Path(__file__).parents[1] / "models" / "effects").glob("*.py"))
-    contracts = [contract_of(table).version for table in DIAGNOSED]
-    return hash_json([keys["slip"], STAGE, VERSION, effects, *contracts])
-
-
-def has_diagnosis(manifest: Manifest | None, key: str) -> bool:
-    """Whether results contain the diagnosis with this key."""
-    if manifest is None or DIAGNOSIS not in manifest.files:
-        return False
-    return manifest.part("stages", STAGE).get("key") == key
-
-
 def diagnose_work(work: Work) -> RunDiagnosis | None:
     """The run's diagnosis: reused if nothing has changed, else computed if it is requested.
 
@@ -134,89 +109,6 @@ def diagnose_work(work: Work) -> RunDiagnosis | None:
     work.keys = {**work.keys, STAGE: key}
     work.contexts[STAGE] = {}
     return diagnosis
-
-
-def show_model(
-    generation: Generation, diagnosis: RunDiagnosis | None, vehicle: Vehicle, length: float
-) -> None:
-    """Fill the model columns of table `slip`, and their medians, with the model that a diagnosis judged.
-
-    Args:
-        generation: generation with the tables of all stages.
-        diagnosis: of the run; where it has no model, the columns become empty.
-        vehicle: vehicle of the run.
-        length: length scale L [m] of the moduli.
-    """
-    slip = generation.read_table("slip")
-    file = None if diagnosis is None else read_model(diagnosis)
-    if file is not None:
-        tables = {name: generation.read_table(name) for name in generation.table_names if name in _TABLES}
-        slip, _ = add_model(slip, tables, file, vehicle, length=length, where=generation.run)
-    elif slip["model_x"].null_count() < slip.height:
-        slip = remove_model(slip)
-    else:
-        return
-    generation.replace_table("slip", slip)
-    generation.replace_table("aggregates", set_residuals(generation.read_table("aggregates"), slip))
-
-
-def read_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
-    """Diagnosis that `diagnose_work` stored.
-
-    Returns:
-        None if it is missing, of another version, not of both inputs, or of a log that cannot be diagnosed;
-        a new diagnosis then reports the reason.
-    """
-    keys = stored_keys(manifest)
-    is_whole = "slip" in keys and manifest.details.get("inputs") == list(INPUTS)
-    if not is_whole or not has_diagnosis(manifest, key_diagnosis(keys)):
-        return None
-    diagnosis = read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
-    return diagnosis if diagnosis.input else None
-
-
-def read_stored_diagnosis(manifest: Manifest) -> RunDiagnosis | None:
-    """The diagnosis in the results of a run, also one of an earlier version.
-
-    Returns:
-        None if there is none, or one of a version that this one cannot read.
-
-    Raises:
-        StoreError: it is damaged.
-    """
-    if DIAGNOSIS not in manifest.files:
-        return None
-    with suppress(msgspec.ValidationError):
-        return read_result(manifest.read_json(DIAGNOSIS), RunDiagnosis)
-    return None
-
-
-def diagnose_stored(
-    manifests: Sequence[Manifest],
-    inputs: tuple[str, ...],
-    known: Model | None,
-    owner: Owner | None,
-    budget_s: float | None,
-) -> RunDiagnosis:
-    """Diagnose stored runs jointly; return the diagnosis of the first.
-
-    Args:
-        manifests: manifests of the runs.
-        inputs: allowed inputs of the model.
-        known: base model to extend; None for the ideal model of the first run's vehicle.
-        owner: geometry to use where vehicles differ.
-        budget_s: CPU time limit of the search [s]; None for the default.
-
-    Raises:
-        SlipError: a run has insufficient data, or vehicles differ.
-    """
-    from pipeline.estimation import diagnose_runs  # noqa: PLC0415 - heavy
-
-    read = [read_recording(manifest) for manifest in manifests]
-    vehicles = {recording.name: vehicle for vehicle, recording in read}
-    vehicle = agree_on_vehicle(None if known is None else known.vehicle, vehicles, owner)
-    recordings = [recording for _, recording in read]
-    return diagnose_runs(recordings, vehicle, inputs=inputs, model=known, budget_s=budget_s).runs[0]
 
 
 def _diagnose(work: Work) -> RunDiagnosis:
@@ -255,72 +147,6 @@ def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
     return format_verdict(diagnosis)
 
 
-def load_vehicle(manifest: Manifest) -> Vehicle:
-    """Vehicle that a run was analyzed with.
-
-    Raises:
-        JobError: ``no_vehicle``, the results do not contain it.
-    """
-    from pipeline.sources import Vehicle  # noqa: PLC0415 - heavy
-
-    try:
-        return msgspec.convert(manifest.details.get("vehicle"), Vehicle, strict=False)
-    except msgspec.ValidationError as error:
-        hint = "Analyze the log again with --force."
-        raise JobError(
-            "no_vehicle", "the results do not say which vehicle the run is of", where=manifest.run, hint=hint
-        ) from error
-
-
-def read_recording(manifest: Manifest) -> tuple[Vehicle, Recording]:
-    """Vehicle and input data of a diagnosis from a stored run.
-
-    Raises:
-        SlipError: the results do not contain the vehicle, or a table cannot be read.
-    """
-    recording = _make_recording(
-        manifest.run,
-        (manifest.tables, manifest.read),
-        manifest.part("log"),
-        read_length_scale(manifest),
-    )
-    return load_vehicle(manifest), recording
-
-
-def read_choices(manifest: Manifest) -> dict[str, object]:
-    """Topics and vehicle that were chosen for a stored run: ``choices`` and ``vehicle_source``."""
-    summary = manifest.read_json(_SUMMARY) if _SUMMARY in manifest.files else {}
-    return {key: summary[key] for key in ("choices", "vehicle_source") if key in summary}
-
-
-def _make_recording(
-    run: str,
-    tables: tuple[Iterable[str], Callable[[str], pl.DataFrame]],
-    log: Mapping[str, JSON],
-    length_scale_m: float,
-) -> Recording:
-    """Tables for a diagnosis, with their origin."""
-    from pipeline.estimation import Recording  # noqa: PLC0415 - heavy
-
-    names, read = tables
-    return Recording(
-        run,
-        {name: read(name) for name in names if name in _TABLES},
-        sha256=str(log.get("sha256", "")),
-        path=str(log.get("path", "")),
-        length_scale_m=length_scale_m,
-    )
-
-
-def read_length_scale(manifest: Manifest) -> float:
-    """Length scale of the slip modulus that a run was analyzed with [m]."""
-    scale = manifest.part("configuration", "slip").get("length_scale_m")
-    return float(scale) if isinstance(scale, int | float) else 1.0
-
-
-_DIGITS = 6
-
-
 def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     """The documented keys of `slip analyze --json` for one run, and additional ones.
 
@@ -331,9 +157,9 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     setup, generation = work.setup, work.generation
     aggregates = generation.read_table("aggregates")
     velocities = generation.read_table("velocities")
-    by_input = _summarize_inputs(aggregates)
+    by_input = summarize_inputs(aggregates)
     leading = "command" if "command" in by_input else "measured"
-    whole = _row(aggregates, leading, "all")
+    whole = pick_row(aggregates, leading, "all")
     asked = "both" if len(work.options.inputs) > 1 else work.options.inputs[0]
     return {
         "run": work.run,
@@ -353,10 +179,10 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
         "length_scale_m": setup.configuration.slip.length_scale_m,
         "by_input": by_input,
         "split": _split(whole),
-        "distance_m": _rounded(whole["distance"]),
-        "duration_s": _rounded(whole["duration"]),
-        "height_rate_mps": _rounded(whole["height_rate"]),
-        "largest_kinetic_energy_j": _rounded(whole["largest_kinetic_energy"]),
+        "distance_m": round_number(whole["distance"]),
+        "duration_s": round_number(whole["duration"]),
+        "height_rate_mps": round_number(whole["height_rate"]),
+        "largest_kinetic_energy_j": round_number(whole["largest_kinetic_energy"]),
         "held_poses": work.contexts["extract"].get("held_poses"),
         "timing": {
             "clocks": work.contexts["extract"].get("clocks"),
@@ -369,34 +195,6 @@ def summarize_run(work: Work, log: Mapping[str, JSON]) -> dict[str, JSON]:
     }
 
 
-def _summarize_inputs(aggregates: pl.DataFrame) -> dict[str, dict[str, JSON]]:
-    names = aggregates["input"].unique(maintain_order=True)
-    return {name: _summarize_input(aggregates, name) for name in names}
-
-
-def _summarize_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
-    rows = {subset: _row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
-    whole = rows["all"]
-    return {
-        "samples": int(whole["samples"] or 0),
-        "windows": int(whole["windows"] or 0),
-        "median_modulus": _rounded(whole["median_modulus"]),
-        "median_window_norm": _rounded(whole["median_window_norm"]),
-        "median_residual_modulus": _rounded(whole["median_residual_modulus"]),
-        "rms": [_rounded(whole[f"rms_{axis}"]) for axis in "xyw"],
-        "transitory_median_modulus": _rounded(rows["transitory"]["median_modulus"]),
-        "steady_median_modulus": _rounded(rows["steady"]["median_modulus"]),
-    }
-
-
-def _row(aggregates: pl.DataFrame, name: str, subset: str) -> dict[str, float | None]:
-    return aggregates.filter((pl.col("input") == name) & (pl.col("subset") == subset)).row(0, named=True)
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(float(value), _DIGITS)
-
-
 def _split(row: Mapping[str, float | None]) -> JSON:
     """Fractions of the mean square slip on command: drivetrain, ground, and twice their product."""
     parts = {name: row[f"{name}_mean_square"] for name in ("drivetrain", "ground", "cross")}
@@ -404,7 +202,7 @@ def _split(row: Mapping[str, float | None]) -> JSON:
     total = sum(present.values())
     if len(present) < len(parts) or total <= 0.0:
         return None
-    return {name: round(value / total, _DIGITS) for name, value in present.items()}
+    return {name: round(value / total, SUMMARY_DIGITS) for name, value in present.items()}
 
 
 def _summarize_topics(work: Work) -> dict[str, JSON]:
@@ -452,7 +250,7 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
             continue
         if manifest.details.get("dataset") != summary.get("dataset"):
             continue
-        other = read_object(manifest.path(_SUMMARY)) if _SUMMARY in manifest.files else {}
+        other = read_object(manifest.path(SUMMARY)) if SUMMARY in manifest.files else {}
         sha256 = manifest.part("log").get("sha256")
         if (
             sha256 in seen
@@ -470,87 +268,3 @@ def find_peers(store: Store, summary: Mapping[str, JSON]) -> dict[str, list[floa
 
 def _is_doubtful(summary: Mapping[str, object]) -> bool:
     return any(finding.get("severity") == "error" for finding in objects_in(summary, "findings"))
-
-
-FOLDER = "workbench"
-"""Folder in the results for data of the workbench: sessions, models and requested diagnoses."""
-UPLOADS = f"{FOLDER}/uploads"
-"""Folder of logs uploaded through the page; each is deleted after its analysis."""
-
-
-class _StoredDiagnosis(msgspec.Struct, frozen=True):
-    """A diagnosis and the key of its inputs."""
-
-    key: str
-    diagnosis: dict[str, object]
-
-
-def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
-    """Path of a workbench file of a run, in results that are untrusted.
-
-    Raises:
-        PathError: a link leads out of the results, or the path is a pipe or device.
-    """
-    encoded = encode_run(run)
-    return resolve_inside(results, f"{FOLDER}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
-
-
-def find_diagnosis(results: Path, manifest: Manifest) -> RunDiagnosis | None:
-    """The diagnosis of a run from both inputs: that of `read_diagnosis`, or one of `keep_diagnosis`.
-
-    Returns:
-        None if neither exists for these tables and this version.
-    """
-    diagnosis = read_diagnosis(manifest)
-    if diagnosis is not None or not _is_of(results, manifest):
-        return diagnosis
-    return _read_stored(results, manifest.run, _key_of(manifest))
-
-
-def _read_stored(results: Path, run: str, key: str) -> RunDiagnosis | None:
-    """What `keep_diagnosis` stored of a run under a key."""
-    try:
-        path = locate_beside(results, "diagnoses", run, ".json")
-        stored = msgspec.json.decode(read_bounded(path), type=_StoredDiagnosis)
-    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
-        return None
-    return read_result(stored.diagnosis, RunDiagnosis) if stored.key == key else None
-
-
-def keep_diagnosis(results: Path, manifest: Manifest, diagnosis: RunDiagnosis) -> None:
-    """Store the diagnosis of a run from both inputs for later requests.
-
-    Table `slip` is given its model, unless the run was analyzed with another one. Nothing is stored for a run
-    that is not of these results, as it was analyzed with other options.
-
-    Raises:
-        OSError: the results cannot be written.
-        SlipError: another process writes them, or a link leads out of them.
-    """
-    if not _is_of(results, manifest):
-        return
-    path = locate_beside(results, "diagnoses", manifest.run, ".json")
-    make_folder(path.parent)
-    replace_file(path, json.dumps({"key": _key_of(manifest), "diagnosis": to_json(diagnosis)}).encode())
-    if stored_contexts(manifest)["slip"].get("model") is not None or _SUMMARY not in manifest.files:
-        return
-    with Store(results).open_generation(manifest.run, manifest.key) as generation:
-        current = generation.previous
-        if current is None or current.key != manifest.key:
-            return
-        generation.reuse_all(_SUMMARY)
-        show_model(generation, diagnosis, load_vehicle(current), read_length_scale(current))
-        by_input = _summarize_inputs(generation.read_table("aggregates"))
-        summary = {**current.read_json(_SUMMARY), "by_input": by_input}
-        generation.write_text(_SUMMARY, json.dumps(summary, indent=1) + "\n")
-        generation.commit(current.details)
-
-
-def _is_of(results: Path, manifest: Manifest) -> bool:
-    """Whether the results hold this run as it was analyzed, if with other diagnoses or reports."""
-    current = Store(results).manifest(manifest.run)
-    return "slip" in stored_keys(manifest) and current is not None and current.key == manifest.key
-
-
-def _key_of(manifest: Manifest) -> str:
-    return key_diagnosis(stored_keys(manifest))

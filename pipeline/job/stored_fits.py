@@ -35,16 +35,14 @@ from pipeline.estimation.rivals import (
 )
 from pipeline.job import JobError
 from pipeline.job.compared_runs import find_run_refusal
-from pipeline.job.keys import Owner, agree_on_vehicle
-from pipeline.job.run_results import load_vehicle
 from pipeline.models.effect import Effect, Late, Parameter
 from pipeline.models.learned_term import drop_learned, find_learned
 from pipeline.models.literature import list_models
 from pipeline.models.model_file import ModelFile
 from pipeline.models.parameter import is_of_one_run
-from pipeline.report.motion_view import load_motion_run
-from pipeline.run import MotionError, MotionRun
+from pipeline.run import MotionError, MotionRun, load_motion_run
 from pipeline.sources import Vehicle
+from pipeline.sources.one_vehicle import Owner, agree_on_vehicle, load_vehicle
 from pipeline.store import Manifest
 from pipeline.words.models import format_contest
 

@@ -27,14 +27,14 @@ from pipeline.datasets.terrain import (
     name_frames,
     sum_cells,
 )
-from pipeline.job import JobError, lack_runs
+from pipeline.job import JobError
 from pipeline.job.compare import measure_runs
 from pipeline.job.compared_runs import find_material
-from pipeline.job.keys import find_recorded_log
 from pipeline.logs import LogIndex, TopicColumns, Wanted, open_log, read_topics
 from pipeline.sources.message_types import find_type
 from pipeline.stages.reading import FEWEST_MESSAGES, read_fixes
 from pipeline.stages.satellite import from_local_plane, to_local_plane
+from pipeline.store.stored_runs import find_recorded_log, lack_runs
 
 if TYPE_CHECKING:
     from pipeline.store import Manifest, Store

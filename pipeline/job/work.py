@@ -6,18 +6,18 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
-import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError, naming_os_errors, pick
+from pipeline.core import naming_os_errors, pick
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_bounded
+from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.job import STAGES, JobError, Options
-from pipeline.job.keys import TABLES, LogSetup
+from pipeline.job.keys import TABLES
 from pipeline.logs import LogData, Loss, read_topics
+from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, read_alignment, read_drive
 from pipeline.sources import Vehicle
 from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velocity
@@ -26,12 +26,8 @@ from pipeline.stages.extract import extract_tables
 from pipeline.stages.reading import list_wanted
 from pipeline.store import JSON, Generation, Manifest, TableReport
 from pipeline.store.parquet_tables import CheckedTable, check_table
+from pipeline.store.stored_runs import stored_contexts, stored_keys
 from schemas import contract_of
-
-if TYPE_CHECKING:
-    from pipeline.models import ModelFile
-
-COLUMNS = ("model_x", "model_y", "model_w", "residual_modulus")
 
 
 def hash_model(path: Path | None) -> str | None:
@@ -51,66 +47,6 @@ def hash_model(path: Path | None) -> str | None:
     from pipeline.models import read_model  # noqa: PLC0415 - heavy
 
     return hashlib.sha256(content + "".join(read_model(path).code).encode()).hexdigest()
-
-
-def add_model(
-    slip: pl.DataFrame,
-    tables: Mapping[str, pl.DataFrame],
-    file: ModelFile,
-    vehicle: Vehicle,
-    *,
-    length: float,
-    where: str,
-) -> tuple[pl.DataFrame, tuple[Finding, ...]]:
-    """Table `slip` with the velocity of a model and the modulus of the residual, and findings on failures.
-
-    Args:
-        slip: table `slip`; what its model columns hold is replaced.
-        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, as far as the log has them.
-        file: the model.
-        vehicle: vehicle of the run; the model must be of its kind.
-        length: length scale L [m] of the modulus.
-        where: the model's origin, for errors.
-
-    Raises:
-        JobError: the model is of another kind of vehicle.
-    """
-    from pipeline.estimation import Input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.problem import predict_at  # noqa: PLC0415 - heavy
-    from pipeline.run import load_run  # noqa: PLC0415 - heavy
-
-    slip, model = remove_model(slip), file.model
-    findings = [
-        Finding("model_code_left_out", "warning", warning, where="model") for warning in file.warnings
-    ]
-    if model.vehicle.kind != vehicle.kind:
-        what = f"the model is of a vehicle of kind {model.vehicle.kind!r}, the run's is {vehicle.kind!r}"
-        raise JobError("wrong_model", what, where=where, hint="Give a model of this vehicle.")
-    run = load_run({**tables, "slip": slip}, model.vehicle, name=where)
-    parts = []
-    for name in slip["input"].unique(maintain_order=True):
-        part = slip.filter(pl.col("input") == name)
-        try:
-            predicted = predict_at(model, run, Input(name), part["t"].to_numpy())
-        except SlipError as error:
-            # For example dead encoders: the input exists, but a model cannot be computed from it.
-            findings.append(Finding("model_not_followed", "warning", f"{name}: {error}", where="model"))
-            parts.append(part)
-            continue
-        columns = [*predicted.T, slip_stage.find_residual_modulus(predicted, part, length=length)]
-        known = np.isfinite(np.stack(columns)).all(axis=0)
-        parts.append(
-            part.with_columns(
-                pl.Series(column, np.where(known, values, np.nan)).fill_nan(None)
-                for column, values in zip(COLUMNS, columns, strict=True)
-            )
-        )
-    return pl.concat(parts), tuple(findings)
-
-
-def remove_model(slip: pl.DataFrame) -> pl.DataFrame:
-    """Table `slip` with empty model columns."""
-    return slip.with_columns(pl.lit(None, pl.Float64).alias(name) for name in COLUMNS)
 
 
 # Stages of one run: each reads the tables of the previous one and writes its own.
@@ -412,19 +348,4 @@ def summarize_loss(loss: Loss, start_ns: int) -> dict[str, JSON]:
         "start_s": since(loss.start_ns),
         "end_s": since(loss.end_ns),
         "text": loss.text,
-    }
-
-
-def stored_keys(manifest: Manifest | None) -> dict[str, str]:
-    """Stage keys of the existing results."""
-    stages = manifest.part("stages") if manifest is not None else {}
-    return {name: str(entry["key"]) for name, entry in stages.items() if isinstance(entry, dict)}
-
-
-def stored_contexts(manifest: Manifest) -> dict[str, Mapping[str, JSON]]:
-    """Stage contexts of the existing results."""
-    return {
-        name: entry["context"]
-        for name, entry in manifest.part("stages").items()
-        if isinstance(entry, dict) and isinstance(entry.get("context"), dict)
     }

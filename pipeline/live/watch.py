@@ -19,13 +19,14 @@ import msgspec
 from pipeline.core import SlipError, make_plain, shorten
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
+from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.job import Options
-from pipeline.job.keys import LogSetup, set_up_log
-from pipeline.job.work import add_model, as_recorded, identify
+from pipeline.job.work import as_recorded, identify
 from pipeline.live import LiveError
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts
 from pipeline.models import read_model
+from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import read_drive
 from pipeline.stages import Finding, slip_stage, velocity

@@ -5,13 +5,42 @@ run.toml that decides otherwise, and nothing decides it again. The completed con
 so that the stages after read a recording as a user could have described it by hand.
 """
 
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from pipeline.core import INPUTS, SlipError
 
 if TYPE_CHECKING:
     from pipeline.recording.drive_alone import examine_drive
     from pipeline.recording.examination import Recording, examine
 
-__all__ = ["FAULTS", "Recording", "examine", "examine_drive"]
+__all__ = ["FAULTS", "LogOptions", "Recording", "RecordingError", "examine", "examine_drive"]
+
+
+class RecordingError(SlipError):
+    """A log that lacks what an analysis needs: messages, a pose, or commands and measured wheels."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LogOptions:
+    """What a user says of a log before it is read.
+
+    Attributes:
+        config: configuration file to use instead of the one beside the log.
+        fleet: fleet file to apply to the log wherever it is, in addition to those in the folders above it.
+        overrides: configuration values from the command line, nested like the file.
+        inputs: inputs to compute slip for.
+        max_inflated: limit of the decompressed size of a log's chunks [bytes]; None for one by its file size.
+    """
+
+    config: Path | None = None
+    fleet: Path | None = None
+    overrides: Mapping[str, object] = field(default_factory=dict)
+    inputs: tuple[str, ...] = INPUTS
+    max_inflated: int | None = None
+
 
 FAULTS = (
     "signs_contradict",

@@ -14,9 +14,9 @@ from pipeline.estimation import Comparison, Prediction, choose_input, predict_at
 from pipeline.logs.writer import Given, LogWriter
 from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
-from pipeline.report.motion_view import COLUMNS, make_motion_run
 from pipeline.report.scene import CAP_QUANTILE, INPUTS
-from pipeline.run import MotionError, MotionRun
+from pipeline.run import TABLE_COLUMNS as COLUMNS
+from pipeline.run import MotionError, MotionRun, make_motion_run
 from pipeline.store import Manifest
 from pipeline.store.names import name_damage
 

@@ -14,65 +14,13 @@ from pipeline.core.arrays import Floats
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
 from pipeline.models import Timing
-from pipeline.report import ReportError
 from pipeline.results import Errors, RunDiagnosis, Step
 from pipeline.results.reading import read_model
-from pipeline.run import MotionError, MotionRun, load_run
+from pipeline.run import MotionError, load_run
 
 if TYPE_CHECKING:
     from pipeline.estimation.effect_signature import Signature
     from pipeline.sources import Vehicle
-    from pipeline.store import Manifest
-
-_ALIGNED = tuple(f"{name}_aligned" for name in ("left", "right", "sideways", "speed"))
-COLUMNS: Mapping[str, tuple[str, ...]] = {
-    "poses": (
-        *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
-        *("latency", "held", "active", "terrain"),
-    ),
-    "alignments": (
-        *("hold_time", "command_scale", "command_turn_scale", "track_multiplier", "body_multiplier"),
-        *("gyro_scale", "gyro_bias", "heading_delay"),
-        *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
-    ),
-    "commands": ("t", *_ALIGNED, "steering", "followed"),
-    "wheels": ("t", *_ALIGNED, "steering_aligned", "latency"),
-    "imu": ("t", "rate_z"),
-    "slip": ("t", "input", "step", "suspect"),
-}
-"""Columns of a run's tables that models need."""
-
-
-def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
-    """Load the tables of a run as arrays for models.
-
-    Raises:
-        MotionError: ``no_poses``.
-        ReportError: ``no_poses``, the run has no table of poses.
-    """
-    tables = {name: manifest.read(name) for name in (*COLUMNS, "findings") if name in manifest.tables}
-    return make_motion_run(manifest, vehicle, tables)
-
-
-def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, pl.DataFrame]) -> MotionRun:
-    """As `load_motion_run`, from tables already in memory, or from a stretch of each.
-
-    Args:
-        manifest: the run.
-        vehicle: geometry.
-        tables: tables by name, with at least the columns of `COLUMNS`.
-
-    Raises:
-        MotionError: ``no_poses``.
-        ReportError: ``no_poses``, there is no table of poses.
-    """
-    if "poses" not in tables:
-        hint = "Check the pose topic with `slip inspect`."
-        raise ReportError(
-            "no_poses", "the run has no poses to compare a model with", where=manifest.run, hint=hint
-        )
-    sha256 = str(manifest.part("log").get("sha256", ""))
-    return load_run(tables, vehicle, name=manifest.run, sha256=sha256)
 
 
 # Comparison of a model with the ideal one on a run, as rows for figures.

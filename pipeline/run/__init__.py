@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from pipeline.sources import Vehicle
+    from pipeline.store import Manifest
 
 
 class MotionError(SlipError):
@@ -512,3 +513,52 @@ def _read_steps(slip: pl.DataFrame | None, streams: Floats) -> tuple[Floats, Flo
             steps = np.arange(np.ceil((begin - first) / 0.05 - 1e-6), np.ceil((end - first) / 0.05))
             excluded.append(first + steps * 0.05)
     return starts, np.unique(np.concatenate(excluded))
+
+
+_ALIGNED_INPUTS = tuple(f"{name}_aligned" for name in ("left", "right", "sideways", "speed"))
+TABLE_COLUMNS: Mapping[str, tuple[str, ...]] = {
+    "poses": (
+        *("t", "segment", "x", "y", "z", "q_x", "q_y", "q_z", "q_w"),
+        *("latency", "held", "active", "terrain"),
+    ),
+    "alignments": (
+        *("hold_time", "command_scale", "command_turn_scale", "track_multiplier", "body_multiplier"),
+        *("gyro_scale", "gyro_bias", "heading_delay"),
+        *("heading_delay_error", "wheel_delay", "gyro_residual", "latency_spread", "outlier_time"),
+    ),
+    "commands": ("t", *_ALIGNED_INPUTS, "steering", "followed"),
+    "wheels": ("t", *_ALIGNED_INPUTS, "steering_aligned", "latency"),
+    "imu": ("t", "rate_z"),
+    "slip": ("t", "input", "step", "suspect"),
+}
+"""Columns of a run's tables that models need."""
+
+
+def load_motion_run(manifest: Manifest, vehicle: Vehicle) -> MotionRun:
+    """Load the tables of a run as arrays for models.
+
+    Raises:
+        MotionError: ``no_poses``.
+    """
+    tables = {name: manifest.read(name) for name in (*TABLE_COLUMNS, "findings") if name in manifest.tables}
+    return make_motion_run(manifest, vehicle, tables)
+
+
+def make_motion_run(manifest: Manifest, vehicle: Vehicle, tables: Mapping[str, pl.DataFrame]) -> MotionRun:
+    """As `load_motion_run`, from tables already in memory, or from a stretch of each.
+
+    Args:
+        manifest: the run.
+        vehicle: geometry.
+        tables: tables by name, with at least the columns of `TABLE_COLUMNS`.
+
+    Raises:
+        MotionError: ``no_poses``.
+    """
+    if "poses" not in tables:
+        hint = "Check the pose topic with `slip inspect`."
+        raise MotionError(
+            "no_poses", "the run has no poses to compare a model with", where=manifest.run, hint=hint
+        )
+    sha256 = str(manifest.part("log").get("sha256", ""))
+    return load_run(tables, vehicle, name=manifest.run, sha256=sha256)

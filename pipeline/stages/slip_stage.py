@@ -16,6 +16,7 @@ from pipeline.stages import Finding, StageError
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, read_inputs
 from pipeline.stages.spans import find_spans
 from pipeline.stages.velocity import MotionEvents, find_events
+from pipeline.store import JSON
 
 PUBLISHED_SAMPLES = 40
 """Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
@@ -338,3 +339,37 @@ def _height_rate(velocities: pl.DataFrame) -> float | None:
             later = np.interp(times + _ROUGHNESS_S, times, height)
             pieces.append(np.abs(later - height)[times <= times[-1] - _ROUGHNESS_S] / _ROUGHNESS_S)
     return float(np.median(np.concatenate(pieces))) if pieces else None
+
+
+SUMMARY_DIGITS = 6
+
+
+def summarize_inputs(aggregates: pl.DataFrame) -> dict[str, dict[str, JSON]]:
+    """Samples and medians of every input, for the summary of a run; see table `aggregates`."""
+    names = aggregates["input"].unique(maintain_order=True)
+    return {name: _summarize_input(aggregates, name) for name in names}
+
+
+def _summarize_input(aggregates: pl.DataFrame, name: str) -> dict[str, JSON]:
+    rows = {subset: pick_row(aggregates, name, subset) for subset in ("all", "transitory", "steady")}
+    whole = rows["all"]
+    return {
+        "samples": int(whole["samples"] or 0),
+        "windows": int(whole["windows"] or 0),
+        "median_modulus": round_number(whole["median_modulus"]),
+        "median_window_norm": round_number(whole["median_window_norm"]),
+        "median_residual_modulus": round_number(whole["median_residual_modulus"]),
+        "rms": [round_number(whole[f"rms_{axis}"]) for axis in "xyw"],
+        "transitory_median_modulus": round_number(rows["transitory"]["median_modulus"]),
+        "steady_median_modulus": round_number(rows["steady"]["median_modulus"]),
+    }
+
+
+def pick_row(aggregates: pl.DataFrame, name: str, subset: str) -> dict[str, float | None]:
+    """The row of an input's subset: `all`, `transitory` or `steady`."""
+    return aggregates.filter((pl.col("input") == name) & (pl.col("subset") == subset)).row(0, named=True)
+
+
+def round_number(value: float | None) -> float | None:
+    """A number of a summary, with six decimals."""
+    return None if value is None else round(float(value), SUMMARY_DIGITS)

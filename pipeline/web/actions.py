@@ -34,13 +34,13 @@ from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.problem import predict_at_from
-from pipeline.job.run_results import load_vehicle
 from pipeline.models import Effect, Model, Timing, find_effect
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import MotionStage, MotionView, load_motion_run
+from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.results import SlipBudget, read_result
-from pipeline.run import MotionRun
+from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Vehicle
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Manifest
 from pipeline.web import WorkbenchError
 from pipeline.web.session import (

@@ -17,8 +17,8 @@ from pipeline.batch.batch_work import Entry, Report, Settings, Task
 from pipeline.batch.executors import LocalExecutor
 from pipeline.core import SlipError
 from pipeline.job import STAGE_WORDS, STAGES, Options
-from pipeline.job.keys import name_run
 from pipeline.store import LogSighting, Manifest, Store, see_log
+from pipeline.store.stored_runs import name_run
 from pipeline.web import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 

@@ -14,7 +14,6 @@ import msgspec
 
 from pipeline.core import naming_os_errors
 from pipeline.core.untrusted import read_bounded
-from pipeline.job.run_results import locate_beside
 from pipeline.models import Effect, Model, Parameter, format_model, list_effects
 from pipeline.models.catalogue import refuse_taken
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
@@ -23,6 +22,7 @@ from pipeline.models.model_file import ModelFile, parse_model
 from pipeline.models.parameter import stands_at_bound
 from pipeline.sources import Vehicle
 from pipeline.store.files import make_folder, replace_file
+from pipeline.store.stored_runs import locate_beside
 from pipeline.web import WorkbenchError
 
 SLOTS = ("a", "b")

@@ -13,22 +13,20 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core import SlipError, naming_os_errors
+from pipeline.core import INPUTS, SlipError, naming_os_errors
 from pipeline.core.untrusted import mapping_in, objects_in, read_object, resolve_inside
-from pipeline.job import INPUTS
-from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
-from pipeline.job.run_results import (
-    DIAGNOSIS,
-    UPLOADS,
+from pipeline.estimation.stored_diagnosis import (
     diagnose_stored,
     find_diagnosis,
     keep_diagnosis,
     read_recording,
 )
+from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import find_refusal, read_findings
 from pipeline.store import Manifest, Store
 from pipeline.store.files import hold_lock
+from pipeline.store.stored_runs import DIAGNOSIS, UPLOADS
 from pipeline.web import Limits, WorkbenchError
 
 _LONGEST = 500

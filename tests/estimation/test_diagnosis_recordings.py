@@ -11,9 +11,9 @@ import pytest
 from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.plausibility import find_implausible
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import Model, Timing, find_effect
 from pipeline.results import RunDiagnosis
 from pipeline.results.reading import read_model

@@ -12,9 +12,9 @@ from pipeline.estimation.context import prepare
 from pipeline.estimation.decision import Search
 from pipeline.estimation.fit import fit_part
 from pipeline.estimation.parts import BodyPart
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
     VEHICLES,

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from pipeline.estimation import diagnose_runs
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.results import RunDiagnosis
 from pipeline.simulate import make_scenario, simulate_run, write_log
 

@@ -12,9 +12,9 @@ import pytest
 
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.ladder import judge_model
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.models import read_model, write_model
 from pipeline.results import Value
 from pipeline.simulate import (

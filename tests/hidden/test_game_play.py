@@ -40,9 +40,9 @@ from game.true_model import Checked, Held
 
 from pipeline.core.rigid import rotate
 from pipeline.estimation import diagnose_runs
+from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import read_recording
 from pipeline.simulate import EffectSpec, State, list_effects, simulate_run
 
 

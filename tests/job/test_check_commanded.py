@@ -20,14 +20,14 @@ from pipeline.job.check import (
 )
 from pipeline.job.check_sides import Sides, read_under
 from pipeline.job.check_text import format_verdict, list_lines
-from pipeline.job.run_results import load_vehicle
 from pipeline.job.stored_fits import COMMANDED, MULTIPLIER
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.report.motion_view import load_motion_run
+from pipeline.run import load_motion_run
 from pipeline.simulate import make_scenario, simulate_run, write_log
 from pipeline.sources import find_preset
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.align import measure_body_multiplier
 
 if TYPE_CHECKING:

@@ -17,10 +17,10 @@ from pipeline.core import SlipError
 from pipeline.estimation import Recording as Diagnosed
 from pipeline.estimation import choose_input, diagnose_runs, load_recording
 from pipeline.estimation.context import DiagnosisError
+from pipeline.estimation.stored_diagnosis import read_diagnosis
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.compared_runs import find_material
-from pipeline.job.run_results import read_diagnosis
 from pipeline.logs import open_log, read_topics
 from pipeline.logs.writer import LogWriter
 from pipeline.models import find_effect

@@ -9,7 +9,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.job import Options, run_results
+from pipeline.estimation import stored_diagnosis
+from pipeline.job import Options
 from pipeline.job.analyze import Outcome, analyze_log
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.simulate import make_scenario, simulate_case, simulate_run, write_log
@@ -87,9 +88,9 @@ def test_slow_poses_are_the_reason_where_nothing_can_be_diagnosed(tmp_path: Path
 def test_a_new_effect_asks_for_a_new_diagnosis(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "models" / "effects"
     folder.mkdir(parents=True)
-    monkeypatch.setattr(run_results, "__file__", str(tmp_path / "job" / "run_results.py"))
+    monkeypatch.setattr(stored_diagnosis, "__file__", str(tmp_path / "estimation" / "stored_diagnosis.py"))
     (folder / "drive_lag.py").touch()
-    before = run_results.key_diagnosis({"slip": "key"})
-    assert run_results.key_diagnosis({"slip": "key"}) == before
+    before = stored_diagnosis.key_diagnosis({"slip": "key"})
+    assert stored_diagnosis.key_diagnosis({"slip": "key"}) == before
     (folder / "new_effect.py").touch()
-    assert run_results.key_diagnosis({"slip": "key"}) != before
+    assert stored_diagnosis.key_diagnosis({"slip": "key"}) != before

@@ -10,9 +10,9 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 
 from pipeline.job import Options
-from pipeline.job.keys import inspect_log
 from pipeline.logs.writer import LogWriter
 from pipeline.recording import log_choice
+from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_choice import MOST_POSES
 from pipeline.simulate import simulate_case
 from pipeline.stages import pose_choice

@@ -122,7 +122,7 @@ def test_without_a_diagnosis_there_is_no_model(
     assert plain.manifest.read("slip")["model_x"].null_count() == plain.manifest.read("slip").height
 
     # A diagnosis of an older version goes, and its model with it.
-    monkeypatch.setattr("pipeline.job.run_results.VERSION", 10_000)
+    monkeypatch.setattr("pipeline.estimation.stored_diagnosis.VERSION", 10_000)
     without = analyze(log, tmp_path, diagnosis=False, report=True)
     assert "diagnosis.json" not in without.manifest.files
     assert (

@@ -19,10 +19,10 @@ import pytest
 
 from pipeline.core import JSON_DIGITS, finite_or_none
 from pipeline.estimation.problem import average_sustained
+from pipeline.estimation.stored_diagnosis import read_diagnosis
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
 from pipeline.job.check import check_runs
-from pipeline.job.run_results import read_diagnosis
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT
 from pipeline.store import Store
 from pipeline.words.objects import diagnosis_as_json

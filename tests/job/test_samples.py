@@ -13,7 +13,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.keys import _measure_rate
+from pipeline.recording.inspection import _measure_rate
 from pipeline.simulate import write_samples
 
 ROW = re.compile(

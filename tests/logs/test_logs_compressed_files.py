@@ -10,10 +10,10 @@ import zstandard
 from mcap_files import read_small, write_small
 
 from pipeline.batch.recordings import find_recordings
-from pipeline.job.keys import name_plainly
 from pipeline.logs import LogError, compressed, hash_log, open_log
 from pipeline.logs.index import list_files
 from pipeline.sources import list_configuration_files
+from pipeline.store.stored_runs import name_plainly
 
 if TYPE_CHECKING:
     from collections.abc import Callable

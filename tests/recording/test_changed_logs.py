@@ -13,7 +13,7 @@ from front import Answer, ask, find_roles, judge
 from rewritten_logs import Change, Log, list_changes, read, write
 
 from pipeline.job import Options
-from pipeline.job.keys import set_up_log
+from pipeline.recording.log_setup import set_up_log
 from pipeline.simulate import simulate_case
 
 ROOT = Path(__file__).parents[2]

@@ -21,7 +21,6 @@ from rosbags.highlevel import AnyReader
 from pipeline.core import python_command
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import load_vehicle
 from pipeline.logs.writer import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report import viewer_files as derived_module
@@ -32,6 +31,7 @@ from pipeline.report.viewer_files import (
     write_foxglove_layout,
 )
 from pipeline.simulate import simulate_case
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.store import Store
 from pipeline.store.checksums import encode_manifest
 

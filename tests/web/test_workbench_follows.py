@@ -12,9 +12,9 @@ from workbench_server import RUN, Workbench
 
 from pipeline.estimation import Input
 from pipeline.estimation.problem import predict_at
-from pipeline.job.run_results import load_vehicle
 from pipeline.models import read_model
-from pipeline.report.motion_view import load_motion_run
+from pipeline.run import load_motion_run
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Store
 

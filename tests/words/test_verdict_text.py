@@ -12,11 +12,11 @@ from drawn_diagnoses import FLOOR, check_form, check_verdict, draw_diagnosis
 
 from pipeline.job import Options
 from pipeline.job.analyze import analyze_log
-from pipeline.job.run_results import load_vehicle
 from pipeline.models import find_effect, list_effects
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
+from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.words.effects import describe_clause
 from pipeline.words.errors import format_remaining_error
 from pipeline.words.verdict import format_verdict
