@@ -31,11 +31,11 @@ from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
 from pipeline.datasets.changes import AFTER, BEFORE
+from pipeline.datasets.check import Check, compare, find_usual_spread
+from pipeline.datasets.check_sides import Sides, read_under, unite_effects
+from pipeline.datasets.stored_fits import ERRORS, RunReading
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.estimation.stored_diagnosis import find_diagnosis
-from pipeline.job.check import Check, compare, find_usual_spread
-from pipeline.job.check_sides import Sides, read_under, unite_effects
-from pipeline.job.stored_fits import ERRORS, RunReading
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

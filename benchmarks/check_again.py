@@ -23,10 +23,10 @@ from measuring import read_rows
 
 from pipeline.core.arrays import Floats
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
-from pipeline.job.check import find_usual_spread
-from pipeline.job.check_text import LIKELY
-from pipeline.job.stored_fits import USUAL_LOGARITHMS
+from pipeline.datasets.check import find_usual_spread
+from pipeline.datasets.stored_fits import USUAL_LOGARITHMS
 from pipeline.models.catalogue import find_effect
+from pipeline.words.check import LIKELY
 
 KINDS = ("closed", "natural", "sets")
 CAUSES = ("drive_lag.tau", "effective_track.k", "wheel_radius.k", "lateral_skid.c", "icr_offset.x_icr")

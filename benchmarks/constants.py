@@ -22,9 +22,9 @@ import numpy as np
 import polars as pl
 from house import EXPLAINED, list_constants, read_sources
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 
 ROOT = Path(__file__).parents[1]
 LOGS = tuple(ROOT / "data_samples" / f"{name}.mcap" for name in ("husky_tile", "mystery_2", "warthog_ice"))

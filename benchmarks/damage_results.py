@@ -18,9 +18,9 @@ from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pipeline.analysis import Options
 from pipeline.batch import Request
 from pipeline.batch.season import run_batch
-from pipeline.job import Options
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store import verification as room

@@ -24,7 +24,7 @@ from measuring import measure_command, simulate_ten_minutes
 
 STAGES = {
     "import modules": ("_frozen_importlib._find_and_load",),
-    "read the log, its stages, store": ("pipeline.job.analyze.analyze_log",),
+    "read the log, its stages, store": ("pipeline.analysis.analyze.analyze_log",),
     "pages of the results folder": ("pipeline.report.write_page",),
     "read the tables": ("pipeline.estimation.stored_diagnosis.read_recording", "pipeline.run.load_run"),
     "make runs ready": ("pipeline.estimation.problem.Problem.__init__",),

@@ -17,8 +17,8 @@ import numpy as np
 import polars as pl
 from measuring import RECORDINGS
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import (
     VEHICLES,
     Disturbance,

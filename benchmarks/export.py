@@ -18,8 +18,8 @@ from pathlib import Path
 import polars as pl
 from measuring import RUNNER, Cost, measure_command
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
 from pipeline.store import Manifest, Store
 

@@ -18,9 +18,9 @@ from pathlib import Path
 from measuring import RECORDINGS
 from rewritten_logs import Change, Roles, list_changes, read, write
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.recording.log_setup import set_up_log
 from pipeline.simulate import PLATFORMS, simulate_case
 

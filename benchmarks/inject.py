@@ -25,11 +25,11 @@ from unittest.mock import patch
 from injections import Drive, Injection, list_injections
 from measuring import RECORDINGS, add_row, read_rows
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect
 from pipeline.stages.extract import extract_tables
 
@@ -121,7 +121,7 @@ def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
         drive = Drive(vehicle.wheel_radius_m, vehicle.track_width_m or math.nan)
         return replace(made, tables=dict(injection.change(made.tables, drive)))
 
-    with tempfile.TemporaryDirectory() as folder, patch("pipeline.job.work.extract_tables", changed):
+    with tempfile.TemporaryDirectory() as folder, patch("pipeline.analysis.work.extract_tables", changed):
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
         inputs = ("command", "measured") if both else ("measured",)

@@ -26,9 +26,9 @@ from measured_tables import MEASURED, ROOT, list_versions
 from measuring import RECORDINGS, RUNNER, read_rows
 from rivals import describe_sections
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.compare import Question, compare_results
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.datasets.compare import Question, compare_results
 from pipeline.store import Store
 
 CATEGORIES = (

@@ -53,8 +53,8 @@ def read_measured(name: str) -> Data:
 
 def list_versions() -> dict[str, int]:
     """Versions of the program that measured numbers depend on."""
+    from pipeline.analysis.work import VERSIONS  # noqa: PLC0415 - heavy
     from pipeline.estimation.stored_diagnosis import VERSION  # noqa: PLC0415 - heavy
-    from pipeline.job.keys import VERSIONS  # noqa: PLC0415 - heavy
 
     return {"diagnosis": VERSION, **VERSIONS}
 

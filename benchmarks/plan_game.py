@@ -19,13 +19,13 @@ import msgspec
 import numpy as np
 from measuring import add_row, read_rows
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.next_drive import ALL, Wish, plan_drive, study
 from pipeline.plan import parse_area
+from pipeline.plan.next_drive import ALL, Wish, plan_drive, study
 from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import check_plan, read_promises, write_plan
 from pipeline.results import Named

@@ -10,8 +10,8 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import PLATFORMS, Platform, simulate_case
 
 CAR = {"steering_offset": 0.05, "drive_lag": 0.3}

@@ -30,6 +30,8 @@ from measured_tables import render_section
 from measuring import RECORDINGS, add_row, read_rows
 from threadpoolctl import threadpool_limits
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
@@ -46,8 +48,6 @@ from pipeline.estimation.rivals import (
     time_fit,
 )
 from pipeline.estimation.stored_diagnosis import find_diagnosis
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models

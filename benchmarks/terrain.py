@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from measuring import RECORDINGS, add_row
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.terrain import PassEffect
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.terrain_map import draw_up_terrain
+from pipeline.datasets.terrain_map import draw_up_terrain
 from pipeline.simulate import VEHICLES, Disturbance, Program, Scenario, simulate_run, write_log
 from pipeline.simulate.path import CompactedGround
 from pipeline.simulate.programs import Commands

@@ -19,9 +19,9 @@ from typing import cast
 from game.draw import Category, draw_riddle, write_riddle
 from measuring import add_row, read_rows
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.live.running_log import list_passing, list_stated
 from pipeline.live.watch import measure_cpu
 from pipeline.results import RunDiagnosis, read_result, to_json

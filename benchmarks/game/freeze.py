@@ -34,11 +34,11 @@ from measuring import RECORDINGS
 from game.draw import CATEGORIES, Answer, Riddle, draw_riddle, write_riddle
 from game.play import THREADS, parse_seeds, score_runs
 from game.score import TaskScore, list_misses
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import INPUTS, SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.store import Store
 from pipeline.words.objects import diagnosis_as_json
 

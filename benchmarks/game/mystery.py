@@ -19,8 +19,8 @@ from game.draw import Answer, Category, Riddle, draw_riddle, write_riddle
 from game.odd import ODD
 from game.play import score_runs
 from game.score import TaskScore
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import list_effects
 from pipeline.store.stored_runs import DIAGNOSIS
 

@@ -36,11 +36,11 @@ from game.rings import describe_effect, make_truth
 from game.score import Answer as Claims
 from game.score import TaskScore, list_intervals, score_task
 from game.true_model import Checked, check_models
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.sources import Vehicle
 from pipeline.words.objects import diagnosis_as_json
 

@@ -37,9 +37,9 @@ from game.rings import (
     write_manifest,
     write_sheet,
 )
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.logs.writer import LogWriter
 from pipeline.sources.one_vehicle import load_vehicle
 

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Literal, TypeAlias, cast, overload
 import polars as pl
 from threadpoolctl import threadpool_limits
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import SUMMARY, analyze_log, open_run, update_datasets
+from pipeline.analysis.summary import find_peers
 from pipeline.api.fitted_model import (
     Fit,
     Model,
@@ -25,16 +28,12 @@ from pipeline.api.fitted_model import (
 from pipeline.batch.recordings import list_named
 from pipeline.core import INPUTS, SlipError, format_recorded
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
+from pipeline.datasets.check import Check as RunsCheck
+from pipeline.datasets.check import check_as_json, check_runs, keep_baseline, read_limits
+from pipeline.datasets.check_sides import Baseline, read_baseline
+from pipeline.datasets.stored_fits import Against, contest_models, read_runs
 from pipeline.estimation import parse_budget
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis
-from pipeline.job import Options
-from pipeline.job.analyze import REPORT, SUMMARY, analyze_log, open_run, update_datasets
-from pipeline.job.check import Check as RunsCheck
-from pipeline.job.check import check_as_json, check_runs, keep_baseline, read_limits
-from pipeline.job.check_sides import Baseline, read_baseline
-from pipeline.job.check_text import format_junit, format_markdown, list_lines
-from pipeline.job.run_results import find_peers
-from pipeline.job.stored_fits import Against, contest_models, read_runs
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report import format_distance
 from pipeline.report.motion_view import view_diagnosis
@@ -45,8 +44,9 @@ from pipeline.results.reading import ERRORS_OVER_2S
 from pipeline.results.reading import read_model as read_diagnosed_model
 from pipeline.sources.one_vehicle import Owner, load_vehicle
 from pipeline.store import Manifest, Store
-from pipeline.store.stored_runs import find_run, read_choices
+from pipeline.store.stored_runs import REPORT, find_run, read_choices
 from pipeline.words import diagnosis as words
+from pipeline.words.check import format_junit, format_markdown, list_lines
 from pipeline.words.objects import diagnosis_as_json
 from schemas import contract_of
 

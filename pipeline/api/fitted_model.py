@@ -14,12 +14,12 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import number_in, objects_in
+from pipeline.datasets.stored_fits import ModelFit, fit_to_runs, read_runs
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
 from pipeline.export import export_model, read_current
-from pipeline.job.stored_fits import ModelFit, fit_to_runs, read_runs
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
 from pipeline.models.catalogue import refuse_taken

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Literal
 from pipeline.core import SlipError, shorten
 
 if TYPE_CHECKING:
-    from pipeline.job import Options
+    from pipeline.analysis import Options
 
 
 class BatchError(SlipError):

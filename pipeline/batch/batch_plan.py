@@ -11,13 +11,13 @@ from pathlib import Path
 
 import msgspec
 
+from pipeline.analysis import Options
+from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.core import SlipError
 from pipeline.core.untrusted import read_bounded, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
-from pipeline.job import Options
-from pipeline.job.keys import VERSIONS
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets
 from pipeline.sources.message_types import read_tables
@@ -379,8 +379,8 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
     catalogue links them.
     """
-    from pipeline.job.over_runs import TREND  # noqa: PLC0415 - heavy
-    from pipeline.job.prediction import FLEET  # noqa: PLC0415 - heavy
+    from pipeline.datasets.over_runs import TREND  # noqa: PLC0415 - heavy
+    from pipeline.datasets.prediction import FLEET  # noqa: PLC0415 - heavy
     from pipeline.report import PAGES  # noqa: PLC0415 - heavy
 
     mirror.pull_index()
@@ -408,9 +408,9 @@ def _hash_runs(store: Store) -> str:
 
 def _write_pools(store: Store) -> None:
     # A batch without work needs none of these imports.
-    from pipeline.job.analyze import update_datasets  # noqa: PLC0415
-    from pipeline.job.over_runs import update_trend  # noqa: PLC0415
-    from pipeline.job.prediction import update_fleet  # noqa: PLC0415
+    from pipeline.analysis.analyze import update_datasets  # noqa: PLC0415
+    from pipeline.report.fleet_pages import update_fleet  # noqa: PLC0415
+    from pipeline.report.trend_page import update_trend  # noqa: PLC0415
 
     update_datasets(store)
     update_fleet(store)

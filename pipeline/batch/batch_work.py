@@ -27,8 +27,8 @@ from pipeline.store import JSON, LOG_NOTES, LogSighting, Store, StoreError
 from pipeline.store.mirror import Mirror
 
 if TYPE_CHECKING:
-    from pipeline.job import Options
-    from pipeline.job.analyze import Outcome
+    from pipeline.analysis import Options
+    from pipeline.analysis.analyze import Outcome
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
@@ -212,7 +212,8 @@ def work_on(task: Task) -> Report:
 
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
     # Workers without any work need no table library.
-    from pipeline.job.analyze import REPORT, analyze_log  # noqa: PLC0415
+    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415
+    from pipeline.store.stored_runs import REPORT  # noqa: PLC0415
 
     if mirror is not None:
         mirror.pull_run(entry.run)
@@ -371,7 +372,7 @@ def prepare_worker(parent: int) -> None:
 
 def load_libraries() -> None:
     """Load the libraries that every log needs, so that the first log does not include this time."""
-    import pipeline.job.analyze  # noqa: PLC0415 - only in workers
+    import pipeline.analysis.analyze  # noqa: PLC0415 - only in workers
     import pipeline.store.parquet_tables  # noqa: F401, PLC0415 - likewise
 
 

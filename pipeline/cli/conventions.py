@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline.analysis import STAGE_WORDS, Options
 from pipeline.core import INPUTS, SlipError, measure_memory
-from pipeline.job import STAGE_WORDS, Options
 
 if TYPE_CHECKING:
-    from pipeline.job.analyze import OpenedRun
+    from pipeline.analysis.analyze import OpenedRun
     from pipeline.store import Store
     from pipeline.store.mirror import Mirror
 
@@ -371,7 +371,7 @@ def open_shown(
     name: str, options: Options, *, quiet: bool, notify: Callable[[str], None] = print_note
 ) -> Iterator[OpenedRun]:
     """A run as `open_run` gives it, its progress shown; ``notify`` is given its note afterwards."""
-    from pipeline.job.analyze import open_run  # noqa: PLC0415 - heavy
+    from pipeline.analysis.analyze import open_run  # noqa: PLC0415 - heavy
 
     with (
         show_progress(Path(name).name, quiet=quiet) as progress,

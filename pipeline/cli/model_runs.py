@@ -195,8 +195,8 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.job import Options  # noqa: PLC0415
-    from pipeline.job.stored_fits import read_runs  # noqa: PLC0415 - heavy
+    from pipeline.analysis import Options  # noqa: PLC0415
+    from pipeline.datasets.stored_fits import read_runs  # noqa: PLC0415 - heavy
 
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
@@ -299,7 +299,7 @@ def forecast_runs(
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
     """
-    from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.plan.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -426,8 +426,9 @@ def compare_rivals(
         spoken: the runs, and how the answer is printed.
         against: what they are compared with.
     """
-    from pipeline.job.stored_fits import contest_models  # noqa: PLC0415 - heavy
+    from pipeline.datasets.stored_fits import contest_models  # noqa: PLC0415 - heavy
     from pipeline.models.literature import list_models  # noqa: PLC0415 - heavy
+    from pipeline.words.models import format_contest  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)
@@ -445,7 +446,10 @@ def compare_rivals(
     elif not spoken.quiet:
         words = INPUT_WORDS[contest.chosen.source.value]
         print_lines(
-            [f"{words} of {', '.join(contest.runs)} ({contest.chosen.reason})", *contest.format_lines()]
+            [
+                f"{words} of {', '.join(contest.runs)} ({contest.chosen.reason})",
+                *format_contest(contest.contest),
+            ]
         )
         for text in warnings:
             print_note(f"slip: {text}")

@@ -34,9 +34,9 @@ from pipeline.cli.model_runs import (
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
+    from pipeline.datasets.stored_fits import ModelFit
     from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.problem import Transfer
-    from pipeline.job.stored_fits import ModelFit
     from pipeline.models import Model
     from pipeline.models.model_file import ModelFile
     from pipeline.run import MotionRun
@@ -338,8 +338,8 @@ def _change(
     Raises:
         MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
+    from pipeline.datasets.stored_fits import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
-    from pipeline.job.stored_fits import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.models import format_model, write_model  # noqa: PLC0415
 
     # Excluded effects would be lost from the file: raise this error before a long fit.

@@ -15,8 +15,8 @@ from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part
 if TYPE_CHECKING:
     import polars as pl
 
+    from pipeline.datasets.compare import Question
     from pipeline.datasets.pairs import Answer
-    from pipeline.job.compare import Question
     from pipeline.store import Store
 
 
@@ -62,7 +62,8 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.job.compare import Question, compare_results, summarize_answer, write_answer  # noqa: PLC0415 - heavy
+    from pipeline.datasets.compare import Question, compare_results, summarize_answer  # noqa: PLC0415 - heavy
+    from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
@@ -83,7 +84,8 @@ def compare(  # noqa: D417 - arguments document themselves
 def _compare_causes(
     store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
 ) -> int:
-    from pipeline.job.over_runs import find_causes, summarize_causes, write_causes  # noqa: PLC0415 - heavy
+    from pipeline.datasets.over_runs import find_causes, summarize_causes  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
 
     causes = find_causes(store, question)
     written = write_causes(store, causes, figures)
@@ -114,8 +116,8 @@ _MOST_PAIRS = 10
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.datasets import MEASURES  # noqa: PLC0415 - heavy
     from pipeline.datasets.answer_lines import list_lines, title_line  # noqa: PLC0415 - heavy
+    from pipeline.datasets.compare import list_shown_notes  # noqa: PLC0415 - heavy
     from pipeline.datasets.pairs import compare_orders  # noqa: PLC0415 - heavy
-    from pipeline.job.compare import list_shown_notes  # noqa: PLC0415 - heavy
 
     lines: list[str] = []
     title = ""
@@ -249,7 +251,8 @@ def draw(  # noqa: D417 - arguments document themselves
     """
     from pipeline.datasets.deployments import ZONES  # noqa: PLC0415 - heavy
     from pipeline.datasets.exchange import read_features  # noqa: PLC0415 - heavy
-    from pipeline.job.over_runs import draw_up_map, write_map  # noqa: PLC0415 - heavy
+    from pipeline.datasets.over_runs import draw_up_map  # noqa: PLC0415 - heavy
+    from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if terrain:
@@ -296,7 +299,8 @@ def draw(  # noqa: D417 - arguments document themselves
 def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
     """Write the terrain map of slip by position."""
     from pipeline.datasets.terrain import CELL_M  # noqa: PLC0415 - heavy
-    from pipeline.job.terrain_map import describe_terrain, draw_up_terrain, list_lines, write_terrain  # noqa: PLC0415 - heavy
+    from pipeline.datasets.terrain_map import describe_terrain, draw_up_terrain, list_lines  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
 
     store = open_results(results).open_store()
     drawn = draw_up_terrain(store, cell_m=CELL_M if cell is None else cell, fed=fed)
@@ -402,8 +406,8 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
+    from pipeline.datasets.compare import gather_features  # noqa: PLC0415 - heavy
     from pipeline.datasets.exchange import write_features  # noqa: PLC0415 - heavy
-    from pipeline.job.compare import gather_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     features, notes = gather_features(Store(results))

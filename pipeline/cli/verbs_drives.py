@@ -28,9 +28,9 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
+    from pipeline.analysis import Options
     from pipeline.datasets.forecast import Forecast
     from pipeline.estimation import Recording
-    from pipeline.job import Options
     from pipeline.plan.plan import Plan
     from pipeline.plan.plan_files import Needed
     from pipeline.results import RunDiagnosis
@@ -99,11 +99,11 @@ def plan(  # noqa: D417 - the runs document themselves
     names = list(runs or [])
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
-    from pipeline.job.analyze import write_drive  # noqa: PLC0415 - heavy
-    from pipeline.job.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
     from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
     from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
+    from pipeline.plan.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
     from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
 
     seconds = parse_time(time)
     protocols = () if compare is None else parse_protocols(compare)
@@ -152,7 +152,7 @@ def plan(  # noqa: D417 - the runs document themselves
 
 def _show_in_report(results: Path, manifests: Sequence[Manifest], made: Plan) -> list[str]:
     """Store the plan with its run, if it is for one stored run, and name the report that shows it."""
-    from pipeline.job.analyze import leave_plan  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import leave_plan  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if len(manifests) != 1:
@@ -208,7 +208,7 @@ def _gather(
 ) -> _Gathered:
     """Runs of one vehicle, each once, after those that are known already."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.job.next_drive import read_command  # noqa: PLC0415 - heavy
+    from pipeline.plan.next_drive import read_command  # noqa: PLC0415 - heavy
 
     recordings = [] if known is None else [*known.recordings]
     manifests = [] if known is None else [*known.manifests]

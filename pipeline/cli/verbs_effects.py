@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     All,
     Choices,
@@ -32,7 +33,6 @@ from pipeline.cli.conventions import (
 )
 from pipeline.core import INPUTS, SlipError
 from pipeline.core.untrusted import resolve_inside
-from pipeline.job import Options
 
 if TYPE_CHECKING:
     from pipeline.estimation import Diagnosis, Recording

@@ -32,10 +32,10 @@ from pipeline.cli.model_runs import open_model
 from pipeline.core import SlipError, format_interval, suffix_unit
 
 if TYPE_CHECKING:
+    from pipeline.analysis import Options
+    from pipeline.datasets.check import Check
+    from pipeline.datasets.check_sides import Baseline
     from pipeline.datasets.trend import Trend
-    from pipeline.job import Options
-    from pipeline.job.check import Check
-    from pipeline.job.check_sides import Baseline
     from pipeline.models.model_file import ModelFile
     from pipeline.models.parameter import Parameter as ModelParameter
     from pipeline.sources.one_vehicle import Owner
@@ -76,15 +76,10 @@ def check(  # noqa: D417 - the arguments document themselves
     """
     _require_target(to, file, json=json)
     _require_runs(after)
-    from pipeline.job.check import (  # noqa: PLC0415 - heavy
-        check_as_json,
-        check_runs,
-        keep_baseline,
-        read_limits,
-    )
-    from pipeline.job.check_text import list_lines  # noqa: PLC0415 - heavy
+    from pipeline.datasets.check import check_as_json, check_runs, keep_baseline, read_limits  # noqa: PLC0415 - heavy
     from pipeline.models import write_text  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.words.check import list_lines  # noqa: PLC0415 - heavy
     from pipeline.words.diagnosis import format_lines  # noqa: PLC0415 - heavy
 
     bounds = None if limits is None else read_limits(limits)
@@ -156,7 +151,7 @@ def _require_runs(after: str) -> None:
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
     """Open a name as a model file or a baseline; None for a log, a folder or a run."""
-    from pipeline.job.check_sides import read_baseline  # noqa: PLC0415 - heavy
+    from pipeline.datasets.check_sides import read_baseline  # noqa: PLC0415 - heavy
 
     path = Path(name)
     if path.suffix == ".toml":
@@ -181,7 +176,7 @@ def _open_runs(
 
 
 def _render(checked: Check, to: Literal["markdown", "junit"]) -> str:
-    from pipeline.job.check_text import format_junit, format_markdown  # noqa: PLC0415 - heavy
+    from pipeline.words.check import format_junit, format_markdown  # noqa: PLC0415 - heavy
 
     return {"markdown": format_markdown, "junit": format_junit}[to](checked)
 
@@ -221,7 +216,8 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.prediction import fit_results, summarize_fleet, write_fleet  # noqa: PLC0415 - heavy
+    from pipeline.datasets.prediction import fit_results, summarize_fleet  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     store = Store(results)
@@ -240,7 +236,7 @@ def show(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.prediction import read_fleet  # noqa: PLC0415 - heavy
+    from pipeline.datasets.prediction import read_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     content = read_fleet(Store(results))
@@ -312,9 +308,9 @@ def predict(
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
-    from pipeline.job import prediction as predictions  # noqa: PLC0415 - heavy
-    from pipeline.job.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.datasets import prediction as predictions  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415
+    from pipeline.plan.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(results)
@@ -401,12 +397,8 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.over_runs import (  # noqa: PLC0415 - heavy
-        check_limits,
-        follow_trend,
-        summarize_trend,
-        write_trend,
-    )
+    from pipeline.datasets.over_runs import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
+    from pipeline.report.trend_page import write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     if not math.isfinite(threshold):

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Literal, cast
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
+from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
     LOSSY,
@@ -37,10 +38,9 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import trust_named
 from pipeline.core import FigureFormat, SlipError, format_duration, format_share, naming_os_errors
-from pipeline.job import Options
 
 if TYPE_CHECKING:
-    from pipeline.job.analyze import Outcome
+    from pipeline.analysis.analyze import Outcome
     from pipeline.live.watch import Watch
     from pipeline.recording import Recording
     from pipeline.recording.inspection import Inspection, TopicHealth
@@ -125,7 +125,7 @@ def _analyze_all(
     """Analyze the logs in turn, appending to outcomes and errors; an error affects only one log."""
     if options.report:
         _warm_report()
-    from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
+    from pipeline.analysis.analyze import analyze_log, update_datasets  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     for log in logs:
@@ -350,7 +350,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - heavy
+    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
     from pipeline.store.stored_runs import find_log  # noqa: PLC0415 - heavy
 
     options = replace(build_options(choices), force=force, through=name)

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, cast
 
 import msgspec
 
+from pipeline.analysis import Options
+from pipeline.analysis.work import as_recorded, identify
 from pipeline.core import SlipError, make_plain, shorten
 from pipeline.core.compute import return_freed_memory
 from pipeline.core.untrusted import read_object
 from pipeline.estimation.stored_diagnosis import add_model
-from pipeline.job import Options
-from pipeline.job.work import as_recorded, identify
 from pipeline.live import LiveError
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
 from pipeline.logs.index import GrowingLog, find_parts

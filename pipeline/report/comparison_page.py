@@ -3,12 +3,14 @@
 import itertools
 import json
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_duration
+from pipeline.core import INPUT_WORDS, FigureFormat, format_duration
 from pipeline.datasets import MEASURES, THIS_RUN
 from pipeline.datasets.answer_lines import Line, list_lines, list_pairs, title_line
+from pipeline.datasets.compare import list_shown_notes
 from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
 from pipeline.datasets.pairs import (
     ABOUT_BLOCKS,
@@ -22,6 +24,8 @@ from pipeline.datasets.pairs import (
     View,
     compare_orders,
     judge_pair,
+    write_csv,
+    write_latex,
 )
 from pipeline.datasets.rank_tests import kendall_tau, list_swaps
 from pipeline.report import (
@@ -36,9 +40,10 @@ from pipeline.report import (
     theme,
 )
 from pipeline.report.figures import Drawing
-from pipeline.report.page import render_figures
+from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
+from pipeline.store import Store
 
 _ROW_HEIGHT = 34
 _GUTTER = 210
@@ -478,3 +483,37 @@ def list_contradictions(shown: pl.DataFrame) -> list[str]:
 
 def _rate(shown: pl.DataFrame) -> pl.DataFrame:
     return shown.drop_nulls("median_modulus").sort("median_modulus")
+
+
+def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `datasets.parquet`, `comparisons.parquet`, CSV and LaTeX tables and `comparison.html`.
+
+    Args:
+        store: the results.
+        answer: result of `compare_results`.
+        figures: also write the two figures to `figures/` in this format.
+
+    Returns:
+        The files by name.
+    """
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.comparison_page import list_pictures, render_comparison  # noqa: PLC0415 - heavy
+
+    store.write_results_table("datasets", answer.datasets)
+    comparisons = pl.concat([view.comparisons for view in answer.views])
+    store.write_results_table("comparisons", comparisons)
+    written: dict[str, Path] = {}
+    for name, frame, shown in (
+        ("datasets", answer.datasets, answer.datasets.filter(pl.col("input") == answer.input)),
+        ("comparisons", comparisons, answer.comparisons),
+    ):
+        written |= write_tables(store, name, frame, shown)
+    page = render_comparison(answer, list_shown_notes(answer))
+    written["comparison.html"] = write_page(store, "comparison.html", page)
+    return written | add_figures(store, lambda: list_pictures(answer), figures)
+
+
+def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFrame) -> dict[str, Path]:
+    """Write a table as CSV and the rows for a paper as LaTeX; return the files by name."""
+    texts = {f"{name}.csv": write_csv(frame), f"{name}.tex": write_latex(name, shown)}
+    return {file: store.write_results_text(file, text) for file, text in texts.items()}

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Mapping
+from pathlib import Path
 
+import msgspec
 import numpy as np
 import polars as pl
 
+from pipeline.core.untrusted import PathError, read_bounded, read_bounded_text, resolve_inside
 from pipeline.plan.plan import SAFETY, Plan
-from pipeline.report import Picture, list_ways, render_template, theme
+from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
@@ -20,6 +24,10 @@ from pipeline.report.theme import (
     share_rows,
     stack,
 )
+from pipeline.store import Manifest, Store
+from pipeline.store.files import make_folder, replace_file
+from pipeline.store.names import encode_run
+from pipeline.store.stored_runs import REPORT
 
 # Subsampling of poses, and the largest number of predicted paths.
 _EVERY = 4
@@ -164,3 +172,100 @@ def _draw_commands(plan: Plan) -> Picture:
     words = f"Speed and {turn.partition(' [')[0]} of the commands over {plan.commands.duration_s:.0f} s."
     drawing = Drawing(stack(*panels), {"plan_commands": rows}, words=words)
     return Picture("commands", "Commands", drawing)
+
+
+PREVIEW = "plan.json"
+
+
+def locate_plan(results: Path, run: str, name: str) -> Path:
+    """Path of a file of a run's plan; it need not exist.
+
+    Raises:
+        PathError: a link leads out of the results.
+    """
+    return resolve_inside(results, f"{PLANS}/{encode_run(run)}/{name}")
+
+
+class _Preview(msgspec.Struct):
+    """Summary of a plan for a report: key of the results it was made for, and fields of `preview_plan`."""
+
+    key: str
+    drives: bool
+    area: str
+    duration_s: float
+    promises: list[str]
+
+
+def read_preview(results: Path, run: str, key: str) -> dict[str, object]:
+    """Summary of a run's plan, with the ``address`` of its page relative to the report.
+
+    Empty if there is no plan for these results, or if it is unreadable: the file is untrusted.
+
+    Args:
+        results: the results folder.
+        run: name of the run.
+        key: key of its generation.
+    """
+    try:
+        preview = msgspec.json.decode(read_bounded(locate_plan(results, run, PREVIEW)), type=_Preview)
+    except (OSError, PathError, msgspec.MsgspecError, RecursionError, UnicodeDecodeError):
+        return {}
+    address = lead_up(run, f"{PLANS}/{encode_run(run).as_posix()}/plan.html")
+    return {**msgspec.structs.asdict(preview), "address": address} if preview.key == key else {}
+
+
+def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
+    """Write a plan's files and its page, if it has any manoeuvre.
+
+    Args:
+        plan: the plan.
+        folder: folder for its files.
+        results: results folder; the page links to its catalogue.
+
+    Raises:
+        PlanError: as `write_plan`.
+    """
+    from pipeline.plan.plan_files import write_plan  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import render_plan  # noqa: PLC0415 - heavy
+
+    return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
+
+
+def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
+    """Store a plan with the run it was made for, and show it in the run's report.
+
+    Args:
+        store: the results.
+        manifest: manifest of the run.
+        plan: the plan.
+
+    Returns:
+        Path of the report; None if the run is not of these results, or has no report.
+
+    Raises:
+        SlipError: the results cannot be written.
+    """
+    from pipeline.plan.plan_files import FILES  # noqa: PLC0415 - heavy
+    from pipeline.report.drive_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
+
+    run, results = manifest.run, store.root
+    known = store.manifest(run)
+    if known is None or known.key != manifest.key:
+        return None
+    preview = locate_plan(results, run, PREVIEW)
+    make_folder(preview.parent)
+    written = {path.name for path in write_drive(plan, preview.parent, results)}
+    for name in FILES:
+        if name not in written:
+            # Files of an earlier plan are obsolete.
+            (preview.parent / name).unlink(missing_ok=True)
+    content = {"key": manifest.key, **preview_plan(plan)}
+    replace_file(preview, json.dumps(content, allow_nan=False).encode())
+    with store.open_generation(run, manifest.key) as generation:
+        current = generation.previous
+        if current is None or current.key != manifest.key or REPORT not in current.files:
+            return None
+        page = read_bounded_text(current.path(REPORT))
+        generation.reuse_all(REPORT)
+        generation.write_text(REPORT, show_planned(page, read_preview(results, run, manifest.key)))
+        return generation.commit(current.details).path(REPORT)

@@ -15,8 +15,7 @@ from pipeline.logs.writer import Given, LogWriter
 from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
 from pipeline.report.scene import CAP_QUANTILE, INPUTS
-from pipeline.run import TABLE_COLUMNS as COLUMNS
-from pipeline.run import MotionError, MotionRun, make_motion_run
+from pipeline.run import TABLE_COLUMNS, MotionError, MotionRun, make_motion_run
 from pipeline.store import Manifest
 from pipeline.store.names import name_damage
 
@@ -240,11 +239,13 @@ class ModelFeed:
         # Results of an earlier version lack newer columns.
         self._feeds: dict[str, Sequence[Feed]] = {
             name: [source.feed(name, "t", [column for column in columns if column in source.columns(name)])]
-            for name, columns in COLUMNS.items()
+            for name, columns in TABLE_COLUMNS.items()
             if name in tables and "t" in columns and name != "slip"
         }
         if "slip" in tables:
-            self._feeds["slip"] = [source.feed("slip", "t", COLUMNS["slip"], name) for name in source.inputs]
+            self._feeds["slip"] = [
+                source.feed("slip", "t", TABLE_COLUMNS["slip"], name) for name in source.inputs
+            ]
         self._duration_s = max(
             (_find_end(source, name) for name in ("poses", "commands", "wheels")), default=0.0
         )

@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
+import json
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import cast
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_share, suffix_unit
+from pipeline.core import INPUT_WORDS, FigureFormat, format_share, suffix_unit
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.datasets.causes import Budget, Causes, Difference
+from pipeline.datasets.compare import name_causes
+from pipeline.datasets.forecast import FleetModel
+from pipeline.datasets.over_runs import format_difference, tabulate_budgets, tabulate_differences
+from pipeline.datasets.prediction import FLEET, fit_results, summarize_fleet, tabulate_fleet
 from pipeline.datasets.terrain import SHARE_DIGITS, PassEffect, TerrainMap
+from pipeline.datasets.terrain_map import GEOJSON, PAGE, list_features
 from pipeline.models.catalogue import name_parameter
 from pipeline.report import (
     MISSING,
@@ -26,8 +35,9 @@ from pipeline.report import (
     set_squares,
     theme,
 )
+from pipeline.report.comparison_page import write_tables
 from pipeline.report.figures import Drawing
-from pipeline.report.page import render_figures
+from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import CAP_QUANTILE, format_ends
 from pipeline.report.theme import (
     Chart,
@@ -37,6 +47,8 @@ from pipeline.report.theme import (
     layer,
     make_axis,
 )
+from pipeline.store import Store
+from pipeline.store.stored_runs import NoRunsError
 
 _LEVELS = (
     Column("parameter"), Column("level"), Column("value", number=True), Column("95 %", number=True),
@@ -487,3 +499,67 @@ def _format_cause_ends(
     if not (math.isfinite(low) and math.isfinite(high)):
         return MISSING
     return f"{format_end(low)} to {format_end(high)}"
+
+
+def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = None) -> dict[str, Path]:
+    """Write `causes` and `cause_differences` as CSV and LaTeX, and `causes.html`; the files by name.
+
+    Args:
+        store: the results.
+        causes: result of `find_causes`.
+        figures: also write the figure to `figures/` in this format.
+    """
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import draw_causes, render_causes  # noqa: PLC0415 - heavy
+
+    written: dict[str, Path] = {}
+    for name, frame in (
+        ("causes", tabulate_budgets(causes)),
+        ("cause_differences", tabulate_differences(causes)),
+    ):
+        written |= write_tables(store, name, frame, frame)
+    names = name_causes(causes.names)
+    sentences = [
+        format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
+    ]
+    page = render_causes(replace(causes, names=names), sentences)
+    written["causes.html"] = write_page(store, "causes.html", page)
+    return written | add_figures(store, lambda: [draw_causes(causes.budgets, names)], figures)
+
+
+def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
+    """Write `fleet.json`, the table `fleet` and the page; return the path of the first."""
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import render_fleet  # noqa: PLC0415 - heavy
+
+    store.write_results_table("fleet", tabulate_fleet(model, keys))
+    content = {**summarize_fleet(model), "keys": list(keys)}
+    write_page(store, "fleet.html", render_fleet(content))
+    return store.write_results_text(FLEET, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def update_fleet(store: Store) -> None:
+    """Refit an existing fleet model; do nothing if there is none.
+
+    The model stays unchanged if no run has estimates.
+    """
+    if (store.root / FLEET).is_file():
+        with contextlib.suppress(NoRunsError):
+            write_fleet(store, *fit_results(store))
+
+
+def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
+    """Write `cells.parquet`, `terrain.html` and, if georeferenced, `terrain.geojson`; the files by name."""
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.fleet_pages import render_terrain  # noqa: PLC0415 - heavy
+
+    keys = " ".join(drawn.keys)
+    names = drawn.cell_table.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
+    store.write_results_table("cells", names.drop("i", "j"))
+    written = {"cells.parquet": store.root / "cells.parquet"}
+    features = list_features(drawn)
+    if features:
+        text = json.dumps({"type": "FeatureCollection", "features": features}, allow_nan=False) + "\n"
+        written[GEOJSON] = store.write_results_text(GEOJSON, text)
+    written[PAGE] = write_page(store, PAGE, render_terrain(drawn))
+    return written

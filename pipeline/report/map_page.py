@@ -5,17 +5,19 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS
+from pipeline.core import INPUT_WORDS, FigureFormat
 from pipeline.datasets import Measure
 from pipeline.datasets.deployments import ZONES, DeploymentMap
 from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
 from pipeline.report.figures import Drawing
-from pipeline.report.page import render_figures
+from pipeline.report.page import add_figures, render_figures
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
+from pipeline.store import Store
 
 _LETTER, _LINE = 6.7, 13.0
 _MARK = 9.0
@@ -441,3 +443,13 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> Tab
 #
 # Deployments of the literature by kind of model, bounds as arrows, uncertain rows hollow; own datasets
 # coloured by their slip.
+
+
+def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
+    """Write `map.html`, and the figure if a format is given; return the path of the page."""
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.map_page import picture_map, render_map  # noqa: PLC0415 - heavy
+
+    path = write_page(store, "map.html", render_map(drawn))
+    add_figures(store, lambda: [picture_map(drawn)], figures)
+    return path

@@ -12,7 +12,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from pipeline.core import INPUT_WORDS, format_recorded, naming_os_errors
+from pipeline.core import INPUT_WORDS, FigureFormat, format_recorded, naming_os_errors
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in
 from pipeline.report import (
     MISSING,
@@ -41,6 +41,7 @@ from pipeline.report.sections_why import (
 )
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
 from pipeline.results.reading import has_no_pose, read_findings
+from pipeline.store import Store
 from pipeline.words.errors import describe_regions, describe_structure, format_step, name_span
 
 _MOST_REGIONS = 2
@@ -501,3 +502,12 @@ def _number_ids(svg: str, prefix: str) -> str:
     """Renumber the ids of an SVG from zero; the engine's counter continues from one figure to the next."""
     order = {name: f"{prefix}-{i}" for i, name in enumerate(dict.fromkeys(_ID.findall(svg)))}
     return _ID.sub(lambda match: order[match.group()], svg)
+
+
+def add_figures(
+    store: Store, draw: Callable[[], Iterable[Picture]], figures: FigureFormat | None
+) -> dict[str, Path]:
+    """Write figures to `figures/` if a format is given; return the files by name."""
+    if figures is None:
+        return {}
+    return {path.name: path for path in write_pictures(draw(), store.root / "figures", figures)}

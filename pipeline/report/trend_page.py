@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
+import json
+import math
 from collections.abc import Sequence, Sized
+from pathlib import Path
 
 import numpy as np
 import polars as pl
 
 from pipeline.core.arrays import Floats
-from pipeline.datasets import WHISKER_REACH
+from pipeline.core.untrusted import read_bounded
+from pipeline.datasets import WHISKER_REACH, ComparisonError
+from pipeline.datasets.over_runs import TREND, follow_trend, summarize_trend
 from pipeline.datasets.trend import (
     ParameterTrend,
     Series,
@@ -25,6 +31,8 @@ from pipeline.report import Picture, begin_large, bracket_unit, set_squares, the
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, encode_column, layer
+from pipeline.store import Store
+from pipeline.store.stored_runs import NoRunsError
 
 _FEWEST_POINTS = 3
 _LIMITS = ("limit_low", "limit_high")
@@ -222,3 +230,35 @@ def _tabulate_levels(series: Series) -> pl.DataFrame:
             ],
         }
     )
+
+
+def write_trend(store: Store, trend: Trend) -> Path:
+    """Write `trend.html` and `trend.json`; return the path of the page."""
+    content = {**summarize_trend(trend), "asked": trend.asked}
+    store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
+    from pipeline.report import write_page  # noqa: PLC0415 - heavy
+    from pipeline.report.trend_page import render_trend  # noqa: PLC0415 - heavy
+
+    return write_page(store, "trend.html", render_trend(trend))
+
+
+def update_trend(store: Store) -> None:
+    """Update an existing trend with the options it was made with; do nothing if there is none.
+
+    The trend stays unchanged if no run has a date, or if its stored options cannot be read.
+    """
+    path = store.root / TREND
+    if not path.is_file():
+        return
+    try:
+        asked = json.loads(read_bounded(path))["asked"]
+        limits = {str(name): float(value) for name, value in asked["limits"].items()}
+        by = [str(name) for name in asked["by"]]
+        threshold = float(asked["threshold"])
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        return
+    if not all(math.isfinite(value) for value in (threshold, *limits.values())):
+        return
+    # No run with a date, or no such column to group by.
+    with contextlib.suppress(NoRunsError, ComparisonError):
+        write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))

@@ -202,3 +202,7 @@ def format_rises(below: object, errors: object, forgiven: float = NOTHING) -> st
         by = f" by {format_share(new / old - 1.0)}" if old else ""
         phrases.append(f"{ERRORS_OVER_2S[key][0]} error{'' if phrases else ' rises'}{by}")
     return ", ".join(phrases)
+
+
+CAUSE_NAMES = {"localization_noise": "localization noise"}
+"""Causes of an error budget in words, where these differ from the id."""

@@ -190,3 +190,6 @@ def locate_beside(results: Path, folder: str, run: str, suffix: str) -> Path:
     """
     encoded = encode_run(run)
     return resolve_inside(results, f"{WORKBENCH}/{folder}/{encoded.with_name(f'{encoded.name}{suffix}')}")
+
+
+REPORT = "report.html"

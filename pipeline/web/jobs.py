@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 
+from pipeline.analysis import STAGE_WORDS, STAGES, Options
 from pipeline.batch.batch_work import Entry, Report, Settings, Task
 from pipeline.batch.executors import LocalExecutor
 from pipeline.core import SlipError
-from pipeline.job import STAGE_WORDS, STAGES, Options
 from pipeline.store import LogSighting, Manifest, Store, see_log
 from pipeline.store.stored_runs import name_run
 from pipeline.web import Limits, ServerFolders, WorkbenchError
@@ -151,7 +151,7 @@ def _note(task: Task, stage: str) -> None:
 
 
 def _analyze(task: Task, entry: Entry) -> Entry:
-    from pipeline.job.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
+    from pipeline.analysis.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
 
     outcome = analyze_log(task.path, task.options, partial(_note, task))
     update_datasets(Store(task.options.out))

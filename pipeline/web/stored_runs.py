@@ -21,7 +21,7 @@ from pipeline.estimation.stored_diagnosis import (
     keep_diagnosis,
     read_recording,
 )
-from pipeline.job.analyze import PREVIEW, leave_plan, locate_plan, read_preview
+from pipeline.report.drive_pages import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import find_refusal, read_findings
 from pipeline.store import Manifest, Store
@@ -134,8 +134,8 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     Raises:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
-    from pipeline.job.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
     from pipeline.plan import parse_area, parse_time  # noqa: PLC0415
+    from pipeline.plan.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
 
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))

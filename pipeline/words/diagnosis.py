@@ -34,6 +34,7 @@ from pipeline.results import (
 from pipeline.results.reading import (
     ABOVE_FLOOR,
     BREVITY,
+    CAUSE_NAMES,
     CHANCE,
     CHANGE,
     DETECTED_SHARE,
@@ -47,7 +48,6 @@ from pipeline.results.reading import (
 )
 from pipeline.run.windows import HORIZON_S
 from pipeline.words.effects import (
-    CAUSE_NAMES,
     describe_cause,
     describe_motion,
     describe_separation,

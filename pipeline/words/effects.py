@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""
-CAUSE_NAMES = {"localization_noise": "localization noise"}
-"""Causes of an error budget in words, where these differ from the id."""
 _TIGHT = 10.0
 """Expected range between runs over the interval in this run above which a row says so: a limit that clips the
 samples of one run is known to a fraction of a percent there, and not in the next run."""

@@ -66,7 +66,7 @@ def assert_whole(out: Path, undisturbed: Mapping[str, bytes], fault: Fault) -> N
 @pytest.mark.parametrize("rounds", [FEW_ROUNDS, pytest.param(MANY_ROUNDS, marks=pytest.mark.long)])
 def test_memory_and_disk_fail(field: Path, tmp_path: Path, rounds: int) -> None:
     server = multiprocessing.get_context("forkserver")
-    server.set_forkserver_preload(["test_batch_faults", "pipeline.job.analyze", "pipeline.report.page"])
+    server.set_forkserver_preload(["test_batch_faults", "pipeline.analysis.analyze", "pipeline.report.page"])
     out = tmp_path / "out"
     batch(field, tmp_path / "undisturbed")
     undisturbed = read_tables(tmp_path / "undisturbed")

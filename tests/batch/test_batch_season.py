@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 from batch_tools import Watch, ask, batch, counts, read_tables
 
+from pipeline.analysis.analyze import analyze_log, update_datasets
+from pipeline.analysis.work import VERSIONS
 from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.season import run_batch
-from pipeline.job import keys
-from pipeline.job.analyze import analyze_log, update_datasets
 from pipeline.store import Store
 
 if TYPE_CHECKING:
@@ -106,7 +106,7 @@ def test_a_new_version_of_a_stage_is_noticed(
 ) -> None:
     hasher = batch_plan.BasisHasher(ask(season, tmp_path).options)
     before = hasher.hash_basis(season / "a.mcap")
-    monkeypatch.setattr(batch_plan, "VERSIONS", dict(keys.VERSIONS) | {"slip": 99})
+    monkeypatch.setattr(batch_plan, "VERSIONS", dict(VERSIONS) | {"slip": 99})
     batch_plan._fingerprint_program.cache_clear()
     try:
         after = batch_plan.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")

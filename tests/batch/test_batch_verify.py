@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 
 from batch_tools import batch, counts, read_tables
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.batch.batch_check import verify_results
 from pipeline.cli import main
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.store import LOG_NOTES, Store
 
 if TYPE_CHECKING:

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from verbs import ask_verb, print_verb, run_verb
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.cli import main
 from pipeline.estimation import Diagnosis, diagnose_runs
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.store import Store
 from pipeline.store.checksums import decode_checked, encode_checked
 

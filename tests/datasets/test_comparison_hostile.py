@@ -10,9 +10,12 @@ from pathlib import Path
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.job.compare import Question, compare_results, write_answer
-from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
+from pipeline.datasets.compare import Question, compare_results
+from pipeline.datasets.over_runs import draw_up_map, follow_trend
 from pipeline.report import render_catalogue
+from pipeline.report.comparison_page import write_answer
+from pipeline.report.map_page import write_map
+from pipeline.report.trend_page import write_trend
 from pipeline.store import Store
 
 DAY_NS = 86_400_000_000_000

@@ -10,10 +10,10 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.datasets.compare import Question, compare_results
 from pipeline.datasets.exchange import Limits, follow_published
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
 
 RATE = 20.0

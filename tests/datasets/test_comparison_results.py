@@ -9,9 +9,10 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
+from pipeline.datasets.compare import Question, compare_results
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pairs import Answer, Group, Samples, compare_groups, compare_orders
-from pipeline.job.compare import Question, compare_results, write_answer
+from pipeline.report.comparison_page import write_answer
 from pipeline.store import Store
 
 TERRAINS = {"asphalt": 0.5, "gravel": 1.0, "ice": 2.0}

@@ -10,12 +10,12 @@ import polars as pl
 import pytest
 from comparison_store import Run, make_budget, write_run
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.answer_lines import list_lines, list_pairs
+from pipeline.datasets.compare import Question, compare_results
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
 from pipeline.datasets.pooled_tests import compare_means
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
-from pipeline.job.compare import Question, compare_results
 from pipeline.store import Store
 
 if TYPE_CHECKING:

@@ -12,9 +12,9 @@ import pytest
 from test_fleet_levels import ALIKE, draw
 from verbs import run_verb
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.forecast import fit_fleet, forecast_vehicle
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, ModelFile, find_effect, read_model, write_model
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Scenario, simulate_run, write_log
 

@@ -13,9 +13,9 @@ from plan_game import record
 
 from pipeline.cli import main
 from pipeline.estimation import load_recording
-from pipeline.job.next_drive import UNDECIDED, ask, expect
 from pipeline.models import find_effect
 from pipeline.plan import choose_limits
+from pipeline.plan.next_drive import UNDECIDED, ask, expect
 from pipeline.plan.rehearsal import learn
 from pipeline.simulate import Program, make_scenario
 from pipeline.sources import Vehicle, find_preset, list_configuration_files

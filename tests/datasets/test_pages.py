@@ -7,10 +7,12 @@ from typing import TYPE_CHECKING
 
 from comparison_store import Run, write_run
 
+from pipeline.analysis.analyze import update_datasets
 from pipeline.batch.batch_work import Entry, Ledger
-from pipeline.job.analyze import update_datasets
-from pipeline.job.over_runs import draw_up_map, follow_trend, write_map, write_trend
+from pipeline.datasets.over_runs import draw_up_map, follow_trend
 from pipeline.report import lead_to
+from pipeline.report.map_page import write_map
+from pipeline.report.trend_page import write_trend
 from pipeline.store import Store, see_log
 
 if TYPE_CHECKING:

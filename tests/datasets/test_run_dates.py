@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.job.compared_runs import find_material
+from pipeline.datasets.compared_runs import find_material
 from pipeline.report import format_date, render_catalogue
 from pipeline.store import Partition, Store
 from pipeline.store.names import date_runs, read_day

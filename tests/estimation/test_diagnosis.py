@@ -11,6 +11,8 @@ import polars as pl
 import pytest
 from msgspec.structs import astuple
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import NORMAL_95
 from pipeline.estimation import (
     Diagnosis,
@@ -26,8 +28,6 @@ from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.state import Free
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import find_effect, read_model, write_model
 from pipeline.models.effects.side_gain import SideGain
 from pipeline.models.formula import FormulaEffect

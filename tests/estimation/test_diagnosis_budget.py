@@ -8,13 +8,13 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core.compute import usual_budget
 from pipeline.estimation import diagnose_runs, parse_budget
 from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.words.diagnosis import describe
 from pipeline.words.verdict import format_verdict
 

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
 from pipeline.estimation.folds import measure_errors
 from pipeline.estimation.plausibility import find_implausible
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, Timing, find_effect
 from pipeline.results import RunDiagnosis
 from pipeline.results.reading import read_model

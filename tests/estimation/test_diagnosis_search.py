@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, fit_model, load_recording
 from pipeline.estimation.context import prepare
 from pipeline.estimation.decision import Search
 from pipeline.estimation.fit import fit_part
 from pipeline.estimation.parts import BodyPart
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect
 from pipeline.simulate import (
     VEHICLES,

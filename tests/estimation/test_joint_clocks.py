@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Diagnosis, Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import read_model, write_model
 from pipeline.results import Value
 from pipeline.simulate import (

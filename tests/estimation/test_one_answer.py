@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
 from pipeline.estimation.estimates import parameters_as_json
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_model, ladder_as_json
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import read_model, write_model
 from pipeline.report.motion_view import view_diagnosis
 from pipeline.report.page import render_report

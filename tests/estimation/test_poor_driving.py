@@ -7,9 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Recording, diagnose_runs
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.results import RunDiagnosis
 from pipeline.simulate import (
     VEHICLES,

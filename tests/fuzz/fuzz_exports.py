@@ -33,10 +33,10 @@ from fuzzing import keep_failure, run_script  # noqa: E402
 from mcap.reader import make_reader  # noqa: E402
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402
 
+from pipeline.analysis import Options  # noqa: E402
+from pipeline.analysis.analyze import analyze_log  # noqa: E402
 from pipeline.core import SlipError  # noqa: E402
 from pipeline.export import export_model, list_targets, read_current  # noqa: E402
-from pipeline.job import Options  # noqa: E402
-from pipeline.job.analyze import analyze_log  # noqa: E402
 from pipeline.models import Model, format_model, format_value, list_effects  # noqa: E402
 from pipeline.models.model_file import ModelFile, parse_model  # noqa: E402
 from pipeline.report.export_source import ExportSource  # noqa: E402

@@ -39,9 +39,9 @@ from live_servers import (  # noqa: E402 - as above
 )
 from mcap_ros2.decoder import DecoderFactory  # noqa: E402 - as above
 
+from pipeline.analysis import Options  # noqa: E402 - as above
+from pipeline.analysis.analyze import analyze_log  # noqa: E402 - as above
 from pipeline.core import SlipError  # noqa: E402 - as above
-from pipeline.job import Options  # noqa: E402 - as above
-from pipeline.job.analyze import analyze_log  # noqa: E402 - as above
 from pipeline.live import receiver as live_receiver  # noqa: E402 - as above
 from pipeline.live.receiver import LiveReceiver  # noqa: E402 - as above
 from pipeline.live.watch import Watch  # noqa: E402 - as above

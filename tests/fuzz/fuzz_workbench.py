@@ -30,8 +30,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "fixtures"))
 
 from workbench_server import LIMITS, RUN, TOKEN, Workbench
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
 
 SLOWEST_S = 30.0

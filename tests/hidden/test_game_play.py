@@ -38,11 +38,11 @@ from game.tables import (
 )
 from game.true_model import Checked, Held
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core.rigid import rotate
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.simulate import EffectSpec, State, list_effects, simulate_run
 
 

@@ -10,11 +10,11 @@ import pytest
 from game.draw import draw_riddle, write_riddle
 from game.true_model import build_true
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, fit_model, hold_out, load_recording
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect
 from pipeline.simulate import simulate_case
 

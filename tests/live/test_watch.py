@@ -18,8 +18,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from verbs import run_verb
 
+from pipeline.analysis import Options
 from pipeline.cli.screen import format_watch
-from pipeline.job import Options
 from pipeline.live.running_log import RUNNING_T, list_passing, list_stated, summarize_knowledge
 from pipeline.live.watch import HEAVY_SHARE, LIGHT_SHARE, NOTES, Watch, choose_recording
 from pipeline.logs import LogError, open_log, read_topics

@@ -11,11 +11,11 @@ import polars as pl
 import pytest
 from motion_runs import as_run, extract, make_scenario, pass_stages, tables_of, vehicle_of
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core.arrays import Floats
 from pipeline.core.rigid import find_runs
 from pipeline.estimation import Input, Problem, estimate_intervals, fit_model
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, find_effect
 from pipeline.run import load_run
 from pipeline.simulate import (

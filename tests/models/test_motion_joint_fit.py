@@ -10,8 +10,8 @@ from motion_runs import simulate, vehicle_of
 
 from pipeline.estimation import Input, Problem
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
-from pipeline.job.next_drive import read_values
 from pipeline.models import find_effect
+from pipeline.plan.next_drive import read_values
 from pipeline.simulate import VEHICLES, Program
 
 WARTHOG = vehicle_of("warthog")

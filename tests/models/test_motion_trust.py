@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.models import read_model, write_model
 from pipeline.models.catalogue import distrust, list_trusted, trust
 from pipeline.models.model_file import list_code, parse_model

@@ -12,7 +12,7 @@ import pytest
 from front import Answer, ask, find_roles, judge
 from rewritten_logs import Change, Log, list_changes, read, write
 
-from pipeline.job import Options
+from pipeline.analysis import Options
 from pipeline.recording.log_setup import set_up_log
 from pipeline.simulate import simulate_case
 

@@ -10,9 +10,9 @@ import pytest
 from barriers import find_barriers
 from chrome import LAPTOP, PHONE
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.cli import main
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.report import CATALOGUE, read_own, render_catalogue, theme, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store

@@ -18,9 +18,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core import python_command
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.logs.writer import LogWriter
 from pipeline.models import Model, find_effect
 from pipeline.report import viewer_files as derived_module

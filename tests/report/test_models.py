@@ -47,8 +47,8 @@ def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from pipeline.job import Options  # noqa: PLC0415
-    from pipeline.job.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
+    from pipeline.analysis import Options  # noqa: PLC0415
+    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
 
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)

@@ -18,9 +18,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from stage_logs import FIELD, TakeThrough, keep_good_rows, record
 
+from pipeline.analysis.work import as_recorded
 from pipeline.datasets.confidence import integrated_time
 from pipeline.estimation import Recording, diagnose_runs
-from pipeline.job.work import as_recorded
 from pipeline.run import Alignment, read_drive
 from pipeline.simulate import Clock
 from pipeline.stages.align import align_tables

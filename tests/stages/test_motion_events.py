@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.export import export_model
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.models import Model, ModelFile
 from pipeline.run.signals import Limits, trace_traction
 from pipeline.simulate import (

@@ -9,8 +9,8 @@ import polars as pl
 import pytest
 from fomo_session import RADIUS_M, write_session
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.logs.writer import LogWriter
 from pipeline.report.figures.slip_figures import draw_power
 from pipeline.report.scene import RunReport, Scene

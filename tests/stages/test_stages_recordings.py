@@ -8,8 +8,8 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.store import Store
 
 LOGS = Path(__file__).parents[2] / ".." / "shared" / "logs"

@@ -11,7 +11,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from stage_logs import EXACT, FIELD, PLAIN, TakeThrough, rms
 
-from pipeline.job.work import as_recorded
+from pipeline.analysis.work import as_recorded
 from pipeline.run import Alignment
 from pipeline.simulate import Clock, Encoders, Imu, Program, Recording, Scenario
 from pipeline.stages.align import align_tables

@@ -11,9 +11,9 @@ import numpy as np
 import polars as pl
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.core.untrusted import number_in
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.simulate import (
     LAYOUTS,
     VEHICLES,

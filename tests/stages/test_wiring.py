@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.recording import FAULTS
 from pipeline.simulate import Imu, make_scenario, simulate_run, write_log
 

@@ -10,8 +10,8 @@ import pytest
 from stored import make_once
 from workbench_server import TRACK, Workbench
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:

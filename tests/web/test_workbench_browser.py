@@ -12,8 +12,8 @@ import pytest
 from chrome import LAPTOP, PHONE
 from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_for_trouble
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.logs.writer import LogWriter
 from pipeline.report import theme
 from pipeline.simulate import simulate_case

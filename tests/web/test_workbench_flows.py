@@ -11,8 +11,9 @@ from barriers import find_barriers
 from chrome import LAPTOP, PHONE
 from workbench_server import ERROR, RUN, SHOWN, Workbench
 
-from pipeline.job.analyze import update_datasets
-from pipeline.job.over_runs import draw_up_map, write_map
+from pipeline.analysis.analyze import update_datasets
+from pipeline.datasets.over_runs import draw_up_map
+from pipeline.report.map_page import write_map
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

@@ -10,9 +10,9 @@ import pytest
 from verbs import run_verb
 from workbench_server import RUN, TRACK
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation.additions import explain_refusal
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import read_model
 from pipeline.simulate import simulate_case

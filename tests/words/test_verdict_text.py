@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 from drawn_diagnoses import FLOOR, check_form, check_verdict, draw_diagnosis
 
-from pipeline.job import Options
-from pipeline.job.analyze import analyze_log
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main

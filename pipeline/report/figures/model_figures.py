@@ -23,8 +23,7 @@ from pipeline.report.scene import (
 )
 from pipeline.report.theme import Channel, Chart, encode_column, find_range, layer, make_axis, stack
 from pipeline.results import Errors, Growth, SlipBudget, Step
-from pipeline.results.reading import INTERVAL_SHARE, format_rises
-from pipeline.words.effects import CAUSE_NAMES
+from pipeline.results.reading import CAUSE_NAMES, INTERVAL_SHARE, format_rises
 from pipeline.words.errors import describe_need
 
 _QUANTITIES = {

@@ -1,0 +1,647 @@
+"""Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
+
+import contextlib
+import itertools
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import polars as pl
+
+from pipeline.core import FEWEST_OF_SPREAD, read_version
+from pipeline.core.arrays import Ints
+from pipeline.datasets import (
+    OVER_RUNS,
+    THIS_RUN,
+    add_measures,
+    find_unrelated,
+    gather_runs,
+    measure_difficulty,
+    pool_runs,
+    spread_windows,
+)
+from pipeline.datasets.answer_lines import list_lines
+from pipeline.datasets.causes import find_carriers
+from pipeline.datasets.compared_runs import (
+    ComparedRuns,
+    can_read,
+    choose_runs,
+    find_material,
+    keep_runs,
+    read_digest,
+)
+from pipeline.datasets.confidence import Interval
+from pipeline.datasets.equal_driving import Overlap, find_overlap, level_runs, measure_bins
+from pipeline.datasets.exchange import check_features, follow_published, read_limits
+from pipeline.datasets.pairs import (
+    ABOUT_UNIT,
+    AS_DRIVEN,
+    AS_PUBLISHED,
+    BLOCKS,
+    EQUAL_DRIVING,
+    Answer,
+    Group,
+    Pair,
+    Samples,
+    View,
+    bound_run,
+    compare_groups,
+    compare_orders,
+    tabulate_pairs,
+)
+from pipeline.datasets.pooled_tests import bound_levels
+from pipeline.datasets.prediction import fit_results
+from pipeline.datasets.rank_tests import connect_groups
+from pipeline.models.catalogue import list_effects, name_effect
+from pipeline.results.reading import CAUSE_NAMES
+from pipeline.stages.inputs import WINDOW_S
+from pipeline.store import Store
+from pipeline.store.stored_runs import ANALYZE_FIRST, NoRunsError, lack_runs
+from schemas import Features
+
+_FEWEST = 2
+
+Bounds = dict[tuple[str, str], Interval]
+"""Intervals by run and input."""
+Overlaps = Mapping[frozenset[str], Overlap]
+"""Driving in common by the datasets of a pair."""
+
+
+def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
+    """Slip moduli of every run on one input, without suspect samples.
+
+    Args:
+        compared: the runs.
+        input_name: `command` or `measured`.
+    """
+    parts = _split_by_run(compared, "slip", input_name, time="t", value="modulus")
+    return {run: _take_samples(part) for run, part in parts.items()}
+
+
+def read_norms(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
+    """2 s window norms of every run on one input, without suspect windows.
+
+    Args:
+        compared: the runs.
+        input_name: `command` or `measured`.
+    """
+    parts = _split_by_run(compared, "windows", input_name, time="t_start", value="window_norm")
+    return {run: _take_windows(part) for run, part in parts.items()}
+
+
+def _split_by_run(
+    compared: ComparedRuns, table: str, input_name: str, *, time: str, value: str
+) -> dict[str, pl.DataFrame]:
+    """Rows of a table on one input by run, without suspect, null and non-finite values."""
+    frame = (
+        compared.scan(table)
+        .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
+        .select("run", time, "segment", "step", value)
+        .collect()
+    )
+    parts = frame.partition_by("run", as_dict=True, maintain_order=True)
+    return {str(run): part for (run,), part in parts.items() if part.height >= _FEWEST}
+
+
+def follow_published_runs(
+    compared: ComparedRuns, runs: pl.DataFrame
+) -> tuple[dict[str, Samples], pl.DataFrame, list[str]]:
+    """Window norms of the published processing chain for every run that it applies to.
+
+    Returns:
+        Samples by run; the runs with ``published_norm`` in their rows of the command; notes on the fits.
+    """
+    samples: dict[str, Samples] = {}
+    notes: list[str] = []
+    for run, manifest in compared.manifests.items():
+        findings = set(manifest.read("findings")["id"]) if "findings" in manifest.tables else set()
+        followed = follow_published(
+            manifest.read("slip"),
+            manifest.read("poses"),
+            limits=read_limits(manifest.part("vehicle")),
+            command_is_scaled="command_scale" in findings,
+        )
+        if followed is None:
+            continue
+        samples[run] = _take_windows(followed.norms)
+        scaled = f", command scaled by {followed.scale[0]:.2f} forward and {followed.scale[1]:.2f} in yaw" * (
+            followed.scale != (1.0, 1.0)
+        )
+        notes.append(f"published chain, {run}: wheels lag with tau = {followed.tau_s:.2f} s{scaled}")
+    medians = pl.DataFrame(
+        {"run": list(samples), "published_norm": [own.median for own in samples.values()]},
+        schema={"run": pl.String, "published_norm": pl.Float64},
+    ).with_columns(pl.lit("command").cast(runs.schema["input"]).alias("input"))
+    return samples, runs.update(medians, on=["run", "input"]), notes
+
+
+def _take_samples(part: pl.DataFrame) -> Samples:
+    times = part["t"].to_numpy()
+    period = float(np.median(np.diff(times)))
+    ticks = np.round((times - times[0]) / max(period, 1e-6)).astype(np.int64)
+    return _as_samples(part, "modulus", ticks)
+
+
+def _take_windows(norms: pl.DataFrame) -> Samples:
+    """Windows as samples; windows that start within the same 2 s grid step get consecutive ticks."""
+    order = norms.sort("t_start")
+    times = order["t_start"].to_numpy()
+    ticks = np.maximum.accumulate(np.round((times - times[0]) / WINDOW_S).astype(np.int64))
+    # Windows start at steps, so two may round to the same tick: increment the later one.
+    ticks = np.maximum.accumulate(ticks - np.arange(ticks.size)) + np.arange(ticks.size)
+    return _as_samples(order, "window_norm", ticks)
+
+
+def _as_samples(rows: pl.DataFrame, value: str, ticks: Ints) -> Samples:
+    sizes = np.unique(rows["step"].to_numpy(), return_counts=True)[1]
+    return Samples(
+        values=rows[value].to_numpy(),
+        ticks=ticks,
+        pieces=rows["segment"].to_numpy().astype(np.int64),
+        step=float(np.median(sizes)),
+    )
+
+
+def list_shown_notes(answer: Answer) -> list[str]:
+    """The notes of an answer, less that on the plain test, which only the files have."""
+    return [note for note in answer.notes if note != NOT_VALID]
+
+
+def summarize_answer(answer: Answer) -> dict[str, object]:
+    """The JSON object of `slip compare`."""
+    return {
+        "input": answer.input,
+        "quantity": answer.quantity,
+        "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
+        "pairs": _list_pairs(answer.comparisons),
+        "answer": [vars(line) for line in list_lines(answer)],
+        "views": [
+            {
+                "input": view.input,
+                "quantity": view.quantity,
+                "levels": _list_rows(view.levels),
+                "pairs": _list_pairs(view.comparisons),
+            }
+            for view in answer.views
+        ],
+        "carried_by": [
+            {"input": name, "pair": sorted(pair), "by": by} for (name, pair), by in answer.carriers.items()
+        ],
+        "orders": [
+            vars(one) for one in compare_orders(answer.datasets.filter(pl.col("input") == answer.input))
+        ],
+        "notes": list(answer.notes),
+    }
+
+
+def _list_pairs(comparisons: pl.DataFrame) -> list[dict[str, object]]:
+    return _list_rows(comparisons.drop("run", "dataset", "vehicle", "terrain"))
+
+
+def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
+    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).to_dicts()
+
+
+_WINDOW_COLUMNS = {
+    "run": pl.String,
+    "input": pl.String,
+    "suspect": pl.Boolean,
+    "window_norm": pl.Float64,
+}
+NOT_VALID = (
+    "plain p (p_uncorrected) is the Mann-Whitney test of published work over all samples; it is not valid "
+    "here, because samples of one run are correlated"
+)
+
+
+@dataclass(frozen=True)
+class Question:
+    """Options of a comparison.
+
+    Attributes:
+        by: columns that define a dataset.
+        input: input u; None: both, the command first if every run has one.
+        as_published: compare the window norms of the published chain instead of the median slip modulus.
+        datasets: compare only these, each with every other; if empty all, and those of one vehicle with each
+            other.
+        vehicle: compare only runs of this vehicle; of any if empty.
+    """
+
+    by: tuple[str, ...] = ("dataset",)
+    input: str | None = None
+    as_published: bool = False
+    datasets: tuple[str, ...] = ()
+    vehicle: str = ""
+
+
+def compare_results(store: Store, question: Question) -> Answer:
+    """Compare the datasets of the results; nothing is written.
+
+    Raises:
+        ComparisonError: ``nothing_to_compare``.
+        ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
+    """
+    compared = find_material(store, question.by, trusted_only=True)
+    compared = choose_runs(compared, question.vehicle, question.datasets)
+    compared, runs, notes = measure_runs(compared)
+    if runs.is_empty():
+        what = "there is no run whose numbers can be compared"
+        raise lack_runs("nothing_to_compare", what, store.root, ANALYZE_FIRST, compared.notes)
+    untested = find_untested(compared, question)
+    material = _Material(compared, question, untested, _find_families(compared, untested), runs, notes)
+    return material.compare_published() if question.as_published else material.compare_driving()
+
+
+@dataclass
+class _Material:
+    """What a comparison is made of.
+
+    Attributes:
+        compared: the runs.
+        question: what is asked.
+        untested: pairs of datasets without a test.
+        families: datasets that are compared with each other, by their vehicles.
+        runs: one row per run and input with all its measures.
+        notes: grows with what is found.
+    """
+
+    compared: ComparedRuns
+    question: Question
+    untested: frozenset[frozenset[str]]
+    families: dict[str, tuple[str, ...]]
+    runs: pl.DataFrame
+    notes: list[str]
+
+    def compare_driving(self) -> Answer:
+        """Compare slip moduli on the inputs, each as driven and at equal driving."""
+        main = self.question.input or choose_input(self.runs)
+        others = {"command", "measured"} & set(self.runs["input"].cast(pl.String)) - {main}
+        inputs = [main, *(sorted(others) if self.question.input is None else ())]
+        self.notes += _doubt_commands(self.compared) if "command" in inputs else []
+        tables: dict[tuple[str, str], pl.DataFrame] = {}
+        within: Bounds = {}
+        norms_within: Bounds = {}
+        for name in inputs:
+            moduli = read_moduli(self.compared, name)
+            tables[name, AS_DRIVEN] = self._compare(self._group(moduli, name, AS_DRIVEN), name, AS_DRIVEN)
+            within |= self._bound_single(moduli, name)
+            norms_within |= self._bound_single(read_norms(self.compared, name), name)
+        labels = self.compared.labels.select("run", "group")
+        bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
+        driven = self._level_driving(bins, inputs)
+        for name in inputs:
+            levels = self.runs.filter(pl.col("input") == name, pl.col(EQUAL_DRIVING).is_not_null())
+            groups = _group_levels(levels)
+            overlaps = _find_overlaps(groups, levels, driven[name])
+            tables[name, EQUAL_DRIVING] = self._compare(groups, name, EQUAL_DRIVING, overlaps)
+        datasets = pool_runs(self.runs, self.question.by, within=within, norms_within=norms_within)
+        views = [View(*key, _list_levels(datasets, *key), table) for key, table in tables.items()]
+        return self._answer(datasets, views, self.compared.scan("windows"), bins)
+
+    def compare_published(self) -> Answer:
+        """Compare the window norms of the published chain."""
+        name = "command"
+        samples, self.runs, comments = follow_published_runs(self.compared, self.runs)
+        self.notes += [ABOUT_UNIT, *comments]
+        groups = self._group(samples, name, AS_PUBLISHED)
+        table = self._compare(groups, name, AS_PUBLISHED)
+        datasets = pool_runs(
+            self.runs,
+            self.question.by,
+            within=self._bound_single(read_moduli(self.compared, name), name),
+            norms_within=self._bound_single(read_norms(self.compared, name), name),
+        )
+        view = View(name, AS_PUBLISHED, _bound_published(groups, self.families), table)
+        return self._answer(datasets, [view], _tabulate_windows(samples, name), pl.DataFrame())
+
+    def _group(self, samples: Mapping[str, Samples], name: str, quantity: str) -> list[Group]:
+        if missing := sorted(set(self.compared.manifests) - set(samples)):
+            what = f"no {quantity.replace('_', ' ')} on {name}"
+            self.notes.append(f"{', '.join(missing)} not compared: {what}")
+        return _group(self.compared, samples)
+
+    def _compare(
+        self, groups: Sequence[Group], name: str, quantity: str, overlaps: Overlaps | None = None
+    ) -> pl.DataFrame:
+        """Table `comparisons` of the groups by a quantity on an input."""
+        pairs = compare_groups(groups, untested=self.untested, overlaps=overlaps)
+        self.notes += _sum_up(pairs, groups, _WORDS[quantity])
+        keys = _keys(self.compared)
+        return tabulate_pairs(pairs, by=self.question.by, input_name=name, quantity=quantity, keys=keys)
+
+    def _bound_single(self, samples: Mapping[str, Samples], name: str) -> Bounds:
+        """Intervals of runs that are alone in their dataset."""
+        alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
+        return {(run, name): bound_run(samples[run]) for run in alone if run in samples}
+
+    def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
+        """Give runs their levels at equal driving; the bins that count, by input."""
+        driven: dict[str, pl.DataFrame] = {}
+        for name in inputs:
+            counted = []
+            for datasets in self.families.values():
+                own = bins.filter(pl.col("input") == name, pl.col("group").is_in(list(datasets)))
+                levelled = level_runs(own)
+                counted.append(levelled.bins)
+                if levelled.apart:
+                    runs = ", ".join(levelled.apart)
+                    why = f"a cell of driving counts from {FEWEST_OF_SPREAD} runs on"
+                    self.notes.append(f"no level at equal driving, too little in common ({why}): {runs}")
+                levels = levelled.runs.select(
+                    "run",
+                    pl.lit(name).cast(self.runs.schema["input"]).alias("input"),
+                    pl.col("level").alias(EQUAL_DRIVING),
+                )
+                self.runs = self.runs.update(levels, on=["run", "input"])
+            driven[name] = pl.concat(counted)
+        if short := sorted(set(self.compared.manifests) - set(bins["run"])):
+            runs = ", ".join(short)
+            self.notes.append(f"no level at equal driving, too little driving on commands: {runs}")
+        return driven
+
+    def _answer(
+        self, datasets: pl.DataFrame, views: Sequence[View], windows: pl.LazyFrame, bins: pl.DataFrame
+    ) -> Answer:
+        labels = self.compared.labels.select("run", "group")
+        return Answer(
+            datasets=datasets,
+            views=tuple(views),
+            families=self.families,
+            runs=self.runs,
+            bins=bins,
+            carriers=_find_carriers(self.compared, [view.input for view in views]),
+            windows=spread_windows(windows, labels),
+            notes=(*self.compared.notes, *dict.fromkeys(self.notes), *note_untested(self.untested)),
+        )
+
+
+_WORDS = {
+    AS_DRIVEN: "as driven",
+    EQUAL_DRIVING: "at equal driving",
+    AS_PUBLISHED: "as published",
+}
+
+
+def _find_families(
+    compared: ComparedRuns, untested: Collection[frozenset[str]]
+) -> dict[str, tuple[str, ...]]:
+    """Datasets that are compared with each other, by their vehicles."""
+    names = sorted(set(compared.labels["group"]))
+    pairs = [
+        (i, j)
+        for i, j in itertools.combinations(range(len(names)), 2)
+        if frozenset((names[i], names[j])) not in untested
+    ]
+    sets = connect_groups(pairs)
+    alone = set(range(len(names))) - {i for one in sets for i in one}
+    families: dict[str, tuple[str, ...]] = {}
+    for members in sorted([*sets, *((i,) for i in alone)]):
+        datasets = tuple(names[i] for i in members)
+        own = compared.labels.filter(pl.col("group").is_in(list(datasets)))
+        vehicle = ", ".join(sorted(set(own["vehicle"])))
+        # Datasets of a vehicle that have nothing to be compared with would share its name.
+        families[vehicle if vehicle not in families else f"{vehicle}: {datasets[0]}"] = datasets
+    return families
+
+
+def _group_levels(levels: pl.DataFrame) -> list[Group]:
+    parts = levels.sort("group", "run").partition_by("group", as_dict=True, maintain_order=True)
+    return [Group(str(name), rows[EQUAL_DRIVING].to_numpy()) for (name,), rows in parts.items()]
+
+
+def _find_overlaps(
+    groups: Sequence[Group], levels: pl.DataFrame, bins: pl.DataFrame
+) -> dict[frozenset[str], Overlap]:
+    runs = {group.name: levels.filter(pl.col("group") == group.name)["run"].to_list() for group in groups}
+    return {
+        frozenset((a, b)): find_overlap(bins, runs[a], runs[b]) for a, b in itertools.combinations(runs, 2)
+    }
+
+
+def read_budgets(compared: ComparedRuns) -> pl.DataFrame:
+    """Rows of the slip's budget of every run, with ``group``; no columns without runs."""
+    if not compared.manifests:
+        return pl.DataFrame()
+    return (
+        compared.scan("budget")
+        .filter(pl.col("quantity").cast(pl.String) == "slip")
+        .with_columns(pl.col("input", "kind").cast(pl.String))
+        .collect()
+        .join(compared.labels.select("run", "group"), on="run")
+    )
+
+
+def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:
+    """The effect that carries the difference of two datasets as driven, in words; of diagnosed runs."""
+    diagnosed = {run: one for run, one in compared.manifests.items() if can_read(one, "budget")}
+    rows = read_budgets(replace(compared, manifests=diagnosed))
+    if rows.is_empty():
+        return {}
+    names = name_causes(find_level_names(compared.store))
+    carriers = {}
+    for name in inputs:
+        for pair, one in find_carriers(rows.filter(pl.col("input") == name)).items():
+            cause = names.get(one.name, one.name.replace("_", " "))
+            carriers[name, pair] = f"{cause} {one.difference:+.2g} m/s"
+    return carriers
+
+
+def find_level_names(store: Store) -> dict[str, str]:
+    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
+    names_by_effect: dict[str, set[str]] = {}
+    # Without estimates effects have no levels.
+    with contextlib.suppress(NoRunsError):
+        for number in fit_results(store)[0].numbers:
+            names_by_effect.setdefault(number.effect, set()).add(number.name)
+    called = {
+        effect: name
+        for effect, names in names_by_effect.items()
+        for name in names
+        if names == {name} != {effect}
+    }
+    return called | CAUSE_NAMES
+
+
+def name_causes(level_names: Mapping[str, str]) -> dict[str, str]:
+    """What effects and the other causes of slip are called within a sentence, by their levels where known."""
+    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
+    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
+    return names | {effect: name.replace("_", " ") for effect, name in level_names.items()}
+
+
+def find_untested(compared: ComparedRuns, question: Question) -> frozenset[frozenset[str]]:
+    """Pairs of datasets without a test; none where datasets are named."""
+    return frozenset() if question.datasets else find_unrelated(compared.labels)
+
+
+def note_untested(untested: Collection[frozenset[str]]) -> list[str]:
+    """The note on pairs of datasets without a test."""
+    if not untested:
+        return []
+    first, second = sorted(min(untested, key=sorted))
+    pairs = f"{len(untested)} pairs" if len(untested) > 1 else "1 pair"
+    why = "of different vehicles"
+    return [f"{pairs} of datasets {why}: no test, unless named, as in: slip compare {first} {second}"]
+
+
+def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
+    """Comparable runs, all measures with one row per run and input, and notes."""
+    compared, runs, notes = _agree_on_scale(compared, _gather(compared))
+    if runs.is_empty():
+        return compared, runs, notes
+    scales = runs.unique("run").select("run", "length_scale")
+    vehicles = compared.labels.select("run", "mass", "squared_gyration").join(scales, on="run")
+    return compared, add_measures(runs, measure_difficulty(compared.scan("slip"), vehicles)), notes
+
+
+def _gather(compared: ComparedRuns) -> pl.DataFrame:
+    if not compared.manifests:
+        return pl.DataFrame()
+    return gather_runs(compared.scan("aggregates").collect(), compared.labels).filter(
+        pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
+    )
+
+
+def _agree_on_scale(
+    compared: ComparedRuns, runs: pl.DataFrame
+) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
+    """Exclude runs whose length scale differs from that of most runs: their moduli are not comparable."""
+    if runs.is_empty():
+        return compared, runs, []
+    scales = runs.unique("run")["length_scale"]
+    usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
+    valid = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
+    compared = keep_runs(
+        compared, valid, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
+    )
+    return compared, runs.filter(pl.col("run").is_in(valid)), [NOT_VALID]
+
+
+def choose_input(runs: pl.DataFrame) -> str:
+    """Default input u: the command if every run has one, else the measured wheels."""
+    on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
+    return "command" if on_command == runs["run"].n_unique() else "measured"
+
+
+def _doubt_commands(compared: ComparedRuns) -> list[str]:
+    """Warn of runs whose recorded command was rescaled: their slip from commands rests on an estimate."""
+    doubtful = compared.scan("findings").filter(pl.col("id") == "command_scale")
+    runs = doubtful.select("run").unique().sort("run").collect()["run"].to_list()
+    if not runs:
+        return []
+    text = "read with care, the recorded command had another scale, which was estimated and corrected"
+    return [f"{text} (--input measured does without): {', '.join(runs)}"]
+
+
+def _group(compared: ComparedRuns, samples: Mapping[str, Samples]) -> list[Group]:
+    known = compared.labels.filter(pl.col("run").is_in(list(samples))).sort("group", "run")
+    return [
+        Group.of_runs(str(name), [samples[run] for run in rows["run"]])
+        for (name,), rows in known.partition_by("group", as_dict=True, maintain_order=True).items()
+    ]
+
+
+def _list_levels(datasets: pl.DataFrame, input_name: str, quantity: str) -> pl.DataFrame:
+    """Value and interval of a quantity, one row per dataset that has it."""
+    low, high, about = ("low", "high", pl.col("interval"))
+    if quantity == EQUAL_DRIVING:
+        low, high, about = ("equal_low", "equal_high", pl.lit(OVER_RUNS))
+    return datasets.filter(pl.col("input") == input_name, pl.col(quantity).is_not_null()).select(
+        "dataset",
+        pl.col(quantity).alias("value"),
+        pl.col(low).alias("low"),
+        pl.col(high).alias("high"),
+        pl.when(pl.col(low).is_null()).then(pl.lit("")).otherwise(about).alias("interval"),
+    )
+
+
+def _bound_published(groups: Sequence[Group], families: Mapping[str, Sequence[str]]) -> pl.DataFrame:
+    """Value and interval of the published norm, one row per dataset."""
+    rows: list[tuple[str, float, float | None, float | None, str]] = []
+    for datasets in families.values():
+        own = [group for group in groups if group.name in datasets]
+        for group, over_runs in zip(own, bound_levels([group.values for group in own]), strict=True):
+            interval, about = over_runs, OVER_RUNS
+            if interval is None and len(group.runs) == 1:
+                interval, about = bound_run(group.runs[0]), THIS_RUN
+            ends = (None, None) if interval is None else (interval.low, interval.high)
+            value = float(np.median(group.values))
+            rows.append((group.name, value, *ends, about if interval else ""))
+    kinds = {
+        "dataset": pl.String,
+        **dict.fromkeys(("value", "low", "high"), pl.Float64),
+        "interval": pl.String,
+    }
+    return pl.DataFrame(rows, schema=kinds, orient="row").sort("dataset")
+
+
+def _keys(compared: ComparedRuns) -> dict[str, str]:
+    """Run/generation of every run of a group, separated by spaces."""
+    named = compared.labels.with_columns(pl.concat_str("run", "key", separator="/").alias("place"))
+    joined = named.group_by("group").agg(pl.col("place").sort().str.join(" "))
+    return dict(zip(joined["group"].to_list(), joined["place"].to_list(), strict=True))
+
+
+def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str]:
+    """Notes on pairs without an answer, once for those alike, and on what intervals of single runs say."""
+    if len(groups) < 2:  # noqa: PLR2004 - a pair
+        return ["there is one dataset only: nothing to compare it with"] if groups else []
+    silent: dict[str, list[str]] = {}
+    for pair in pairs:
+        if pair.p is None or "cannot be significant" in pair.note:
+            silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
+    sentences = []
+    for note, (first, *others) in sorted(silent.items()):
+        count_text = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
+        sentences.append(f"{first}{count_text}, {of}: {note}")
+    single = sorted({group.name for pair in pairs if pair.unit == BLOCKS for group in (pair.a, pair.b)})
+    if single:
+        sentences.append(
+            f"one run only: {', '.join(single)}; their intervals describe the run, not the terrain"
+        )
+    return sentences
+
+
+def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.LazyFrame:
+    """Window norms of the published chain in the columns of the table `windows`."""
+    frames = [
+        pl.DataFrame({"window_norm": own.values}).select(
+            pl.lit(run).alias("run"),
+            pl.lit(input_name).alias("input"),
+            pl.lit(value=False).alias("suspect"),
+            "window_norm",
+        )
+        for run, own in samples.items()
+    ]
+    return pl.concat(frames).lazy() if frames else pl.LazyFrame(schema=_WINDOW_COLUMNS)
+
+
+_HASH = 64
+
+
+def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
+    """The table `features` of the results, and notes on excluded runs.
+
+    Raises:
+        ComparisonError: ``nothing_to_share``.
+        ComparisonError: ``bad_features``: a value is out of range.
+    """
+    compared, runs, comments = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
+    nameless = sorted(run for run, digest in digests.items() if len(digest) != _HASH)
+    notes = [*compared.notes, *comments[1:]]
+    if nameless:
+        notes.append(f"left out, the hash of the log is not known: {', '.join(nameless)}")
+    known = runs.filter(~pl.col("run").is_in(nameless)) if not runs.is_empty() else runs
+    if known.is_empty():
+        raise lack_runs("nothing_to_share", "there is no run to share", store.root, ANALYZE_FIRST, notes)
+    schema = Features.create_empty().schema
+    shared = known.with_columns(
+        pl.col("run").replace_strict(digests, return_dtype=pl.String).alias("sha256"),
+        pl.col("input").cast(pl.String),
+        pl.lit(read_version()).alias("made_by"),
+        pl.col("key").alias("from_results"),
+        (pl.col("mass") * pl.col("squared_gyration")).alias("inertia"),
+    ).with_columns(pl.col("sha256").str.slice(0, 16).alias("run"))
+    typed = shared.select(pl.col(name).cast(kind) for name, kind in schema.items())
+    return check_features(typed.sort("sha256", "input"), str(store.root)), tuple(notes)

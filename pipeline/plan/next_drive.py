@@ -1,0 +1,436 @@
+"""Plan of the next drive after stored runs, and the forecast from the evidence of each run.
+
+The plan answers open questions of their diagnosis; the forecast is of one model fitted jointly to all runs of
+a vehicle.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from pipeline.core import SlipError
+from pipeline.datasets.forecast import Forecast, forecast_vehicle, join_evidence, list_held
+from pipeline.datasets.joint_levels import RunEvidence
+from pipeline.datasets.prediction import find_estimates
+from pipeline.estimation import Recording
+from pipeline.estimation.across_runs import fit_part_jointly, split_normals
+from pipeline.estimation.comparison import Comparison, Input
+from pipeline.estimation.decision import find_cost
+from pipeline.estimation.parts import Part
+from pipeline.estimation.problem import Problem
+from pipeline.models.effect import Effect, Late
+from pipeline.models.model import Model
+from pipeline.plan import Area, Limits, is_steered
+from pipeline.plan.plan import Plan
+from pipeline.plan.plan_files import WHEELS, list_types
+from pipeline.plan.questions import Question
+from pipeline.plan.rehearsal import Knowledge
+from pipeline.results import RunDiagnosis
+from pipeline.run import load_motion_run
+from pipeline.sources import Vehicle
+from pipeline.sources.one_vehicle import load_vehicle
+from pipeline.store import Manifest
+
+if TYPE_CHECKING:
+    from pipeline.core.arrays import Floats
+    from pipeline.estimation.fit import PartFit
+    from pipeline.run import MotionRun
+    from pipeline.store import Store
+
+MOST_JOINED = 24
+"""Largest number of jointly fitted runs, those on the terrain first: more take longer for the same result."""
+OTHER_GROUND = 0.1
+"""Weight of a run on another terrain, so that runs on the requested terrain dominate and the others determine
+the remaining parameters. The median heading error of seven runs, divided by that of their own models, is 1.29
+with 0.3, 1.22 with 0.1 and 1.21 with 0.03; with 0.03 the largest error grows."""
+
+
+def forecast_deployment(
+    store: Store,
+    vehicle: str,
+    terrain: str,
+    source: Literal["command", "measured"] = "command",
+    *,
+    without: Sequence[str] = (),
+    notify: Callable[[str], object] = str,
+) -> Forecast:
+    """Forecast the parameters of a vehicle on a terrain from the runs of the results.
+
+    The stored models define the effects and the start values of the fit (`forecast_vehicle`). This model is
+    fitted to all runs of the vehicle jointly, each weighted by its own misfit, with less weight for other
+    terrains. An effect that fewer models have is added if it lowers the misfit over all runs. The normal
+    equations of the single runs determine the variation of the parameters between terrains and runs
+    (`join_evidence`): a parameter that a run does not determine has no weight.
+
+    Args:
+        store: the results.
+        vehicle: id of the vehicle.
+        terrain: name of the terrain; it need not have runs.
+        source: input of the model.
+        without: SHA-256 of recordings to exclude, such as those to be predicted.
+        notify: called with a line of progress.
+
+    Raises:
+        SlipError: there is no fleet, or no run of the vehicle.
+    """
+    estimates = find_estimates(store, without=without)
+    start = forecast_vehicle(estimates, vehicle, terrain, source)
+    runs = list(_load_runs(store, start))
+    if not start.numbers or not runs:
+        return start
+    notify(f"fitting {len(runs)} run{'s' * (len(runs) > 1)} jointly")
+    geometry, held = runs[0][1], list_held(estimates, vehicle, source)
+    problem = Problem([run for run, _ in runs], geometry, Input(source))
+    clocks = [effect for effect in held if effect.late is Late.POSES]
+    shares = np.array([1.0 if run.terrain == terrain else OTHER_GROUND for run in problem.runs])
+    fits: list[tuple[Part, PartFit]] = []
+    also: list[str] = []
+    timing = problem.start_state().timing
+    for part in problem.parts:
+        mine = [effect for effect in (*start.effects, *clocks) if part.owns(effect)]
+        active = problem.active_effects(Model(geometry, tuple(mine)))
+        # The delays of the encoders follow from the body: the drivetrain moves wheels before they report it.
+        state = replace(problem.start_state(active), timing=timing)
+        fit = _add_held(part, fit_part_jointly(part, state, shares), held, shares)
+        also += [effect.id for effect in fit.state.effects if effect.id not in state.ids]
+        timing = fit.state.timing
+        fits.append((part, fit))
+    if also:
+        start = forecast_vehicle(estimates, vehicle, terrain, source, also=also)
+    return join_evidence(start, _gather(problem, fits, start), read_values(problem, fits, terrain))
+
+
+def _load_runs(store: Store, start: Forecast) -> Iterator[tuple[MotionRun, Vehicle]]:
+    """Runs of the forecast that have its input, those on its terrain first."""
+    for name in start.runs[:MOST_JOINED]:
+        manifest = store.manifest(name)
+        with contextlib.suppress(SlipError):
+            if manifest is not None:
+                vehicle = load_vehicle(manifest)
+                run = load_motion_run(manifest, vehicle)
+                Comparison(run, vehicle, Input(start.input))
+                yield run, vehicle
+
+
+def _add_held(part: Part, fit: PartFit, held: Sequence[Effect], shares: Floats) -> PartFit:
+    """Extend the fit with effects of some stored models if they lower the misfit over all runs."""
+    for effect in held:
+        taken = any(
+            effect.id == one.id or effect.id in one.contains or one.id in effect.contains
+            for one in fit.state.effects
+        )
+        if taken or not part.owns(effect):
+            continue
+        extended = fit_part_jointly(part, fit.state.add(effect), shares)
+        if find_cost(extended) < find_cost(fit):
+            fit = extended
+    return fit
+
+
+def _gather(problem: Problem, fits: Sequence[tuple[Part, PartFit]], start: Forecast) -> list[RunEvidence]:
+    """Normal equations of every run for all parameters of a forecast, in its order."""
+    labels = [number.label for number in start.numbers]
+    size = len(labels)
+    normals, pulls = np.zeros((len(problem.runs), size, size)), np.zeros((len(problem.runs), size))
+    for part, fit in fits:
+        for run, summed in enumerate(split_normals(part, fit)):
+            rows = [index for index, label in enumerate(summed.labels) if label in labels]
+            places = [labels.index(summed.labels[row]) for row in rows]
+            normals[run][np.ix_(places, places)] += summed.normal[np.ix_(rows, rows)]
+            pulls[run][places] += summed.pull[rows]
+    return [
+        RunEvidence(run.name, run.terrain, normal, pull)
+        for run, normal, pull in zip(problem.runs, normals, pulls, strict=True)
+    ]
+
+
+def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain: str) -> Mapping[str, float]:
+    """Values of the joint fits by label; a terrain parameter has its value on this terrain.
+
+    For a terrain without runs it is the median over the other terrains, which is robust against an unusual
+    one such as ice.
+    """
+    first = {run.terrain: number for number, run in reversed([*enumerate(problem.runs)])}
+    runs = [first[terrain]] if terrain in first else [*first.values()]
+    values: dict[str, float] = {}
+    for _, fit in fits:
+        for number in fit.free:
+            if number.effect:
+                acting = (replace(number, run=run) for run in runs)
+                values[number.label] = float(np.median([fit.state.get(one) for one in acting]))
+    return values
+
+
+UNDECIDED = "undecided"
+ALL = "all"
+
+
+@dataclass(frozen=True)
+class Studied:
+    """Knowledge of one vehicle from its runs.
+
+    Attributes:
+        diagnosis: joint diagnosis of the runs; None without runs.
+        knowledge: model and the uncertainty of its parameters.
+        forecast: the fleet's forecast, which the knowledge includes; None if it was not used.
+    """
+
+    diagnosis: RunDiagnosis | None
+    knowledge: Knowledge
+    forecast: Forecast | None = None
+
+
+@dataclass(frozen=True)
+class Wish:
+    """Request of a user for a plan.
+
+    Attributes:
+        area: free area.
+        time_s: longest duration [s].
+        wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for undecided effects first and, in the remaining
+            time, all open questions.
+        speed_mps, yaw_rate_radps, acceleration_mps2, lateral_mps2: limits; None for what the runs reached, or
+            without runs for those of the vehicle.
+        topic, type_name: topic and type of the played commands; None for those of the recorded command.
+        seed: seed of the random draws.
+    """
+
+    area: Area
+    time_s: float
+    wanted: tuple[str, ...] = ()
+    speed_mps: float | None = None
+    yaw_rate_radps: float | None = None
+    acceleration_mps2: float | None = None
+    topic: str | None = None
+    type_name: str | None = None
+    seed: int = 0
+    lateral_mps2: float | None = None
+
+
+@dataclass(frozen=True)
+class Planned:
+    """A plan with its questions and limits."""
+
+    plan: Plan
+    questions: tuple[Question, ...]
+    limits: Limits
+
+
+def plan_drive(
+    vehicle: Vehicle,
+    studied: Studied,
+    wish: Wish,
+    recordings: Sequence[Recording] = (),
+    command: Mapping[str, object] | None = None,
+    notify: Callable[[str], object] = str,
+) -> Planned:
+    """Plan the drive that best answers the open questions.
+
+    Args:
+        vehicle: vehicle to drive.
+        studied: knowledge of the vehicle.
+        wish: request of the user.
+        recordings: the runs that the knowledge comes from.
+        command: choice of the first run's command, from `read_command`.
+        notify: called with what is being done.
+
+    Raises:
+        SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
+    """
+    from pipeline.plan import Reached, choose_limits  # noqa: PLC0415 - heavy
+    from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan.rehearsal import measure_reached  # noqa: PLC0415 - heavy
+
+    knowledge, diagnosis = studied.knowledge, studied.diagnosis
+    reached = Reached() if knowledge.problem is None else measure_reached(knowledge.problem)
+    limits = choose_limits(
+        vehicle,
+        reached,
+        speed_mps=wish.speed_mps,
+        yaw_rate_radps=wish.yaw_rate_radps,
+        acceleration_mps2=wish.acceleration_mps2,
+        lateral_mps2=wish.lateral_mps2,
+    )
+    is_ambiguous = diagnosis is not None and bool(diagnosis.undecided)
+    wanted = wish.wanted or (UNDECIDED if is_ambiguous else ALL,)
+    notify("fitting the alternatives of open questions")
+    questions = tuple(ask(knowledge, wanted, limits, wish.time_s, diagnosis))
+    later: list[Question] = []
+    if is_ambiguous and not wish.wanted:
+        texts = {question.text for question in questions}
+        everything = ask(knowledge, [ALL], limits, wish.time_s, diagnosis)
+        later = [question for question in everything if question.text not in texts]
+    topic, type_name = choose_topic(vehicle, command or {}, recordings[0].path if recordings else "")
+    request = Request(
+        limits,
+        wish.area,
+        wish.time_s,
+        tuple(recording.name for recording in recordings),
+        wish.topic or topic,
+        wish.type_name or type_name,
+        wish.seed,
+        tuple(reached.list_used(limits)),
+    )
+    return Planned(make_plan(knowledge, questions, request, later, notify), questions, limits)
+
+
+def study(
+    recordings: Sequence[Recording],
+    vehicle: Vehicle,
+    terrain: str | None = None,
+    known: Path | None = None,
+    notify: Callable[[str], None] | None = None,
+) -> Studied:
+    """Diagnose runs jointly, and fit the identified and the undecided effects.
+
+    Args:
+        recordings: runs of one vehicle.
+        vehicle: the vehicle.
+        terrain: terrain to drive on; the fleet's prior for it is combined with runs on this terrain, and
+            replaces the estimates of runs on other terrains.
+        known: results folder of the fleet; needed with a terrain.
+        notify: called with what is being done.
+
+    Raises:
+        SlipError: nothing can be estimated, or a run has no commands.
+    """
+    from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
+    from pipeline.models import list_effects  # noqa: PLC0415 - heavy
+    from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
+    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
+
+    joint = diagnose_runs(recordings, vehicle, notify=notify)
+    diagnosis = joint.runs[0]
+    if joint.proposal is None:
+        why = find_refusal(diagnosis.findings) or "the log cannot be judged"
+        what = f"{why}, so that nothing can be planned from it"
+        hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
+        raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
+    # Terms outside the catalogue are specific to this run's terrain.
+    catalogue = {effect.id for effect in list_effects()}
+    named = [effect for effect in joint.proposal.model.effects if effect.id in catalogue]
+    runs = [load_recording(recording, vehicle) for recording in recordings]
+    if terrain is None or known is None:
+        return Studied(diagnosis, learn(runs, vehicle, named))
+    here = [run for run in runs if run.terrain == terrain]
+    # The prior excludes runs that are fitted themselves, and includes those on other terrains.
+    forecast = _forecast(known, vehicle, terrain, without=[run.sha256 for run in here])
+    if len(here) < len(runs):
+        expected = assume(vehicle, forecast.effects, forecast.prior).base
+        return Studied(diagnosis, replace(learn(runs, vehicle, named), base=expected, fitted=None), forecast)
+    rest = [effect for effect in forecast.effects if effect.id not in {one.id for one in named}]
+    return Studied(diagnosis, learn(runs, vehicle, [*named, *rest], forecast.prior), forecast)
+
+
+def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
+    """Knowledge of a vehicle without a log: the fleet's forecast on a terrain, or the ideal model.
+
+    Raises:
+        SlipError: the results contain nothing about the vehicle.
+    """
+    from pipeline.plan.rehearsal import assume  # noqa: PLC0415 - heavy
+
+    if terrain is None:
+        return Studied(None, assume(vehicle))
+    forecast = _forecast(known, vehicle, terrain)
+    return Studied(None, assume(vehicle, forecast.effects, forecast.prior), forecast)
+
+
+def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+
+    return forecast_deployment(Store(known), vehicle.id, terrain, without=without)
+
+
+def ask(
+    knowledge: Knowledge, wanted: Sequence[str], limits: Limits, time_s: float, diagnosis: RunDiagnosis | None
+) -> list[Question]:
+    """List the questions of a plan.
+
+    Args:
+        knowledge: knowledge before the drive.
+        wanted: ``undecided``, ``all``, or ids of effects.
+        limits: limits of the commands, to which the usual sizes of effects are relative.
+        time_s: length of the plan [s].
+        diagnosis: diagnosis of the existing logs; None without logs.
+
+    Raises:
+        SlipError: an effect is unknown or does not exist on the vehicle.
+    """
+    from pipeline.plan.plan import find_largest  # noqa: PLC0415
+    from pipeline.plan.questions import ask_apart, ask_numbers, ask_presence, ask_undecided, list_names  # noqa: PLC0415
+
+    questions: list[Question] = []
+    names = [name for name in wanted if name not in {UNDECIDED, ALL}]
+    numbers = knowledge.base.names & set(names)
+    if len(names) < len(wanted):
+        groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
+        questions += ask_undecided(knowledge, groups)
+        questions += ask_apart(knowledge, {name for group in groups for name in group})
+        numbers |= knowledge.base.names.difference(*groups)
+    questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
+    if ALL in wanted:
+        names += [*diagnosis.unobservable_why] if diagnosis is not None else list_names(knowledge)
+    elif diagnosis is None and not names:
+        names = list(list_names(knowledge))
+    if names:
+        questions += ask_presence(knowledge, dict.fromkeys(names), find_largest(knowledge, limits, time_s))
+    return questions
+
+
+def read_command(manifest: Manifest) -> dict[str, object]:
+    """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
+    from pipeline.store.stored_runs import read_choices  # noqa: PLC0415 - heavy
+
+    configuration = manifest.details.get("configuration")
+    source = configuration.get("command") if isinstance(configuration, dict) else None
+    return {**read_choices(manifest), "command_source": source}
+
+
+def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> tuple[str, str]:
+    """Topics and type of the command in a log; the vehicle's usual one if the log has none.
+
+    A body command has priority over a pair of wheel speeds [rad/s].
+    """
+    types = list_types(steered=is_steered(vehicle))
+    chosen = choices.get("choices")
+    command = chosen.get("command") if isinstance(chosen, dict) else None
+    asked: list[str] = []
+    if isinstance(command, dict):
+        asked = [str(command.get("topic")), *(str(other["topic"]) for other in command.get("others", []))]
+    message_types = _read_types(log) if asked else {}
+    for topic in asked:
+        if message_types.get(topic) in types:
+            return topic, message_types[topic]
+    if isinstance(command, dict) and command.get("type") == WHEELS and _is_plain(choices, vehicle):
+        sides = [str(one).removesuffix(".data") for one in str(command["topic"]).split(", ")]
+        if len(sides) == 2:  # noqa: PLR2004 - left and right
+            return ", ".join(sides), WHEELS
+    # The topic of a single motor does not accept body commands.
+    usual = [topic for topic in vehicle.topics.command if "cmd" in topic and "motor" not in topic]
+    return (usual or ["/cmd_vel"])[0], types[-1] if is_steered(vehicle) else types[0]
+
+
+def _read_types(log: str) -> Mapping[str, str]:
+    """Message types by topic of a stored run's log; empty if the log is missing or not accessible."""
+    from pipeline.logs import LogError, locate_recorded, open_log  # noqa: PLC0415 - heavy
+
+    try:
+        location = locate_recorded(log)
+    except LogError:
+        return {}
+    return open_log(location).types if location.exists() else {}
+
+
+def _is_plain(choices: Mapping[str, object], vehicle: Vehicle) -> bool:
+    """Whether recorded wheel commands are in rad/s, positive forward."""
+    asked = choices.get("command_source")
+    source = asked if isinstance(asked, dict) else {}
+    unit, sign = source.get("unit"), source.get("sign")
+    return not vehicle.units and unit in {None, "rad/s"} and sign in {None, 1} and not source.get("per_turn")

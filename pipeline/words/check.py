@@ -1,0 +1,384 @@
+"""Text formats of a check: verdict, lines for a screen, Markdown, and JUnit for a build server."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Sequence
+from xml.etree import ElementTree as ET
+
+from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
+from pipeline.datasets.changes import Change
+from pipeline.datasets.check import Check, find_pace
+from pipeline.datasets.stored_fits import (
+    ERRORS,
+    HEADING_ERROR,
+    LOGARITHMS,
+    MULTIPLIER,
+    POSITION_ERROR,
+    Label,
+)
+from pipeline.models.catalogue import name_term
+from pipeline.models.effect import Place
+from pipeline.models.parameter import Level
+
+Line = tuple[str, str]
+_MOST_NAMED = 3
+"""Largest number of quantities in a sentence; the lines list all."""
+STATUSES = ("changed", "differs", "unchanged", "unknown")
+_INDENT = "    "
+_NONE = 0.1
+"""Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
+LIKELY = 0.2
+"""Largest p at which a change is called likely: at most one check in five of an unchanged robot says so."""
+_LEAST_SHARE = 0.01
+"""Smallest share of cases that is printed as a number."""
+_LEAST_P = 1e-4
+"""Smallest p value that is printed."""
+_NAMES = {
+    POSITION_ERROR: "position error over 2 s",
+    HEADING_ERROR: "heading error over 2 s",
+    MULTIPLIER: "the controller's multiplier",
+}
+
+
+def format_verdict(check: Check) -> str:
+    """State the changes, and whether they exceed the spread between runs, in one to four sentences."""
+    changed, differs = check.list_status("changed"), check.list_status("differs")
+    named = [name for name in changed if name not in LOGARITHMS]
+    sentences = _format_commanded(check)
+    if named and check.simulated:
+        sentences.append(f"{_format_simulated(check, named)}{_format_moves(check)}")
+    elif named:
+        listed = enumerate_texts([_format_change(check, name) for name in named[:_MOST_NAMED]])
+        others = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
+        sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
+    rest = "and no effect of the model explains it: run slip diagnose on AFTER"
+    sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
+    if not changed and differs:
+        sentences.append(_format_doubts(check, differs[:_MOST_NAMED]))
+    elif not changed:
+        known = len(check.changes) - len(check.list_status("unknown"))
+        nothing = "No conclusion: no quantity is known on both sides"
+        few = "" if check.is_compared else "; most parameters of the model cannot be compared"
+        noun = "quantity" if known == 1 else "quantities"
+        sentences.append(f"No change shown in {known} {noun}{few}" if known else nothing)
+    sentences += [*_format_limits(check), *_format_power(check)]
+    return " ".join(f"{text[:1].upper()}{text[1:]}." for text in sentences)
+
+
+def _format_commanded(check: Check) -> list[str]:
+    """What the robot does of the commanded yaw rate, and the controller's multiplier, where that changed."""
+    changed = check.list_status("changed")
+    if MULTIPLIER not in changed and (check.commanded is None or not {*changed} - {*ERRORS}):
+        return []
+    clauses = _list_commanded(check)
+    if MULTIPLIER in changed:
+        p = _format_p(check.changes[MULTIPLIER].p, 1)
+        clauses.append(f"the controller's multiplier {_format_pair(check, MULTIPLIER)} ({p})")
+    return ["; ".join(clauses)] if clauses else []
+
+
+def _list_commanded(check: Check) -> list[str]:
+    """What the robot does of the commanded yaw rate, where it differs by more than the recordings' errors."""
+    change = check.commanded
+    if change is None or change.status not in {"changed", "differs"}:
+        return []
+    nearer = "better" if abs(change.after) < abs(change.before) else "worse"
+    return [f"the robot turns at {_format_shares(change)} of the commanded rate: {nearer}"]
+
+
+def _format_shares(change: Change) -> str:
+    before, after = (format_share(math.exp(one)) for one in (change.before, change.after))
+    return f"{before.removesuffix(' %')} -> {after}"
+
+
+def _format_doubts(check: Check, differs: Sequence[str]) -> str:
+    """What differs between the recordings, and how often runs without a change differ by as much."""
+    changes = [check.changes[name] for name in differs]
+    listed = enumerate_texts(
+        [
+            f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(change.p_within, 1)})"
+            for name, change in zip(differs, changes, strict=True)
+        ]
+    )
+    least = min(change.p_alone for change in changes)
+    often = format_share(max(least, _LEAST_SHARE), 1)
+    rate = f"{'less than ' if least < _LEAST_SHARE else ''}{often}"
+    opening = "Likely changed" if min(change.p for change in changes) <= LIKELY else "No conclusion"
+    chance = f"runs without a change differ by as much in {rate} of cases"
+    return f"{opening}: the recordings differ in {listed}; {chance}"
+
+
+def _format_simulated(check: Check, named: Sequence[str]) -> str:
+    """List the effects that a simulation lacks, and those that differ in size."""
+    lacks, other = [], []
+    for name in named:
+        label, change = _find(check, name), check.changes[name]
+        neutral = label.parameter.neutral
+        is_lacking = abs(change.before - neutral) <= _NONE * abs(change.after - neutral)
+        if is_lacking and label.parameter.unit != "1":
+            lacks.append(f"{_name(check, name)} of {change.after:.3g} {label.parameter.unit}")
+        else:
+            unit = suffix_unit(label.parameter.unit)
+            other.append(
+                f"{_name(check, name)} is {change.before:.3g}{unit}, the robot's {change.after:.3g}{unit}"
+            )
+    clauses = [f"The simulation lacks {enumerate_texts(lacks)}"] if lacks else []
+    if other:
+        clauses.append(f"{'its' if lacks else 'the simulation: its'} {'; its '.join(other)}")
+    return "; ".join(clauses)
+
+
+def _format_change(check: Check, name: str) -> str:
+    return f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(check.changes[name].p, 1)})"
+
+
+def _format_pair(check: Check, name: str) -> str:
+    change = check.changes[name]
+    if name in ERRORS:
+        pace = find_pace(check.sides)
+        show = format_length if name == POSITION_ERROR else format_angle
+        before, after = (show(pace * math.exp(one)) for one in (change.before, change.after))
+        return f"{before} -> {after}"
+    if name == MULTIPLIER:
+        return f"{math.exp(change.before):.3g} -> {math.exp(change.after):.3g}"
+    label = _find(check, name)
+    unit = suffix_unit(label.parameter.unit)
+    return f"{change.before:.3g} -> {change.after:.3g}{unit}"
+
+
+def _find(check: Check, name: str) -> Label:
+    return next(label for label in check.sides.labels if label.name == name)
+
+
+def _name(check: Check, name: str) -> str:
+    if name in LOGARITHMS:
+        return _NAMES[name]
+    label = _find(check, name)
+    alone = len(label.effect.parameters) == 1
+    return name_term(label.effect.id) if alone else f"{name_term(label.effect.id)} ({label.parameter.name})"
+
+
+def _format_unchanged(check: Check, changed: Sequence[str]) -> str:
+    """`, ground unchanged` if none of its parameters changed and at least one is known."""
+    is_ground = {label.name: label.effect.place > Place.DRIVE for label in check.sides.labels}
+    known = {name for name in check.list_status("unchanged") if not check.is_unseen(name)} & set(is_ground)
+    for ground, word in ((True, "ground"), (False, "drivetrain")):
+        mine = {name for name, which in is_ground.items() if which is ground}
+        if mine & known and not mine & {*changed, *check.list_status("differs")}:
+            return f", {word} unchanged"
+    return ""
+
+
+def _format_moves(check: Check) -> str:
+    if check.moves is None:
+        return ""
+    return (
+        f"; predictions over 2 s change by {format_length(check.moves[0])} and {format_angle(check.moves[1])}"
+    )
+
+
+def _format_limits(check: Check) -> list[str]:
+    if not check.limits:
+        return []
+    broken = [one for one in check.limits if one.outcome == "broken"]
+    open_ones = [one for one in check.limits if one.outcome == "undetermined"]
+    if broken:
+        text = enumerate_texts(
+            [f"{one.name} {one.measured}, limit {one.limit}" for one in broken[:_MOST_NAMED]]
+        )
+        return [f"{len(broken)} of {len(check.limits)} limits broken: {text}"]
+    if open_ones:
+        return [f"{len(open_ones)} of {len(check.limits)} limits cannot be judged from these runs"]
+    return [f"All {len(check.limits)} limits kept"]
+
+
+def _format_power(check: Check) -> list[str]:
+    """Smallest detectable changes of the best known parameters, and the number of additional runs needed."""
+    asked = [
+        name
+        for name, change in check.changes.items()
+        if change.status in {"unchanged", "differs"} and name not in LOGARITHMS
+    ]
+    if not asked or check.list_status("changed"):
+        return []
+    asked.sort(key=lambda name: _share(check, name))
+    text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
+    count = len(check.sides.after) + (len(check.sides.before) if check.sides.kind != "model" else 0)
+    default = any(check.changes[name].is_default for name in asked)
+    others = f" and {check.count_others()} others of the vehicle" if check.count_others() else ""
+    spread = " at the default spread between runs" if default and not check.simulated else ""
+    runs = "this run" if count == 1 else f"these {count} runs"
+    first = f"A change of less than {text} is not detectable with {runs}{others}{spread}"
+    differs = check.list_status("differs")
+    missing = check.changes[(differs or asked)[0]].count_missing()
+    if missing is None:
+        return [first]
+    needed = "run per side is needed" if missing == 1 else "runs per side are needed"
+    return [first, f"{missing} more {needed} {'to decide' if differs else 'to detect half of that'}"]
+
+
+def _share(check: Check, name: str) -> float:
+    """Smallest detectable change, divided by the parameter's usual size."""
+    return check.changes[name].smallest / max(_find(check, name).parameter.usual_size, 1e-12)
+
+
+def _format_smallest(check: Check, name: str) -> str:
+    change, label = check.changes[name], _find(check, name)
+    size = abs(change.before)
+    if label.parameter.unit == "1" and size > 0.0:
+        return f"{format_share(change.smallest / size)} of {_name(check, name)}"
+    unit = suffix_unit(label.parameter.unit)
+    return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
+
+
+def list_lines(check: Check) -> list[Line]:
+    """The check as labels and texts: verdict, limits, quantities, compared runs."""
+    lines = [("verdict", format_verdict(check))]
+    lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
+    names = max(map(len, check.changes), default=0)
+    pairs = max((len(_format_pair(check, name)) for name in _list_known(check)), default=0)
+    for status in STATUSES:
+        for name in check.list_status(status):
+            lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
+            if status != "unknown":
+                lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
+    if check.commanded is not None:
+        share = f"the robot turns at {_format_shares(check.commanded)} of the commanded yaw rate"
+        lines.append(("commanded", share))
+    lines += [("may be", text) for text in _list_readings(check)]
+    lines += [(side, f"{len(runs)}: {', '.join(runs)}") for side, runs in _list_runs(check)]
+    others = [one.numbers.run for group in check.sides.others.values() for one in group]
+    if others:
+        lines.append(("others", f"{len(others)}: {', '.join(others)}"))
+    if all(check.sides.terrains) and check.sides.terrains[0] != check.sides.terrains[1]:
+        before, after = (" and ".join(one) for one in check.sides.terrains)
+        lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
+    return lines + [("note", note) for note in check.sides.notes]
+
+
+def _list_known(check: Check) -> list[str]:
+    return [name for name, change in check.changes.items() if change.status != "unknown"]
+
+
+def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
+    """One line for a quantity; columns of at least these widths."""
+    change = check.changes[name]
+    if change.status == "unknown":
+        sides = (("BEFORE", change.before), ("AFTER", change.after))
+        lacking = " and ".join(side for side, value in sides if math.isnan(value))
+        why = (
+            "not stated by the model"
+            if check.sides.kind == "model" and name in ERRORS
+            else "not determined in"
+        )
+        return f"{name:<{names}}  {why} {lacking}"
+    text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
+    within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
+    size = "a factor of two" if name in LOGARITHMS else "a change of its own size"
+    few = f"; too few runs to detect {size}" if check.is_unseen(name) else ""
+    return f"{text}  {_format_p(change.p)}{within}{few}"
+
+
+def _format_resolution(check: Check, name: str) -> str:
+    """Smallest detectable change of a quantity, and the spread between runs."""
+    change = check.changes[name]
+    show = _format_ratio if name in LOGARITHMS else _format_size
+    text = f"detectable change {show(change.smallest)}"
+    text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
+    if check.simulated:
+        return text
+    count = check.count_others()
+    known = f"with {count} others" if count else "these runs"
+    source = "(default)" if change.is_default else f"({known})"
+    return f"{text}; spread between runs {show(change.spread)} {source}"
+
+
+def _format_p(p: float, digits: int = 2) -> str:
+    """`p = 0.012`; below 0.0001 only that, as the tails of the test are not known better."""
+    return f"p = {p:.{digits}g}" if p >= _LEAST_P else f"p < {_LEAST_P:g}"
+
+
+def _format_ratio(logarithm: float) -> str:
+    return f"a factor of {math.exp(logarithm):.2g}"
+
+
+def _format_size(value: float) -> str:
+    return f"{value:.2g}"
+
+
+def _list_readings(check: Check) -> list[str]:
+    """Level of a changed effect: on one terrain that of the run, else that of the terrain."""
+    before, after = check.sides.terrains
+    level = Level.RUN if before == after else Level.TERRAIN
+    names = dict.fromkeys(
+        name.partition(".")[0] for name in check.list_status("changed") if name not in LOGARITHMS
+    )
+    effects = {label.effect.id: label.effect for label in check.sides.labels}
+    return [
+        f"{name_term(name)}: {reading.text}"
+        for name in names
+        for reading in effects[name].readings
+        if reading.level is level
+    ]
+
+
+def _list_runs(check: Check) -> Iterable[tuple[str, list[str]]]:
+    for side, readings in (("before", check.sides.before), ("after", check.sides.after)):
+        yield side, [one.numbers.run for one in readings]
+
+
+def format_markdown(check: Check) -> str:
+    """The check as Markdown: verdict, tables of limits and quantities."""
+    rows = [f"**{_escape(format_verdict(check))}**", ""]
+    if check.limits:
+        rows += ["| limit | measured | outcome |", "|---|---|---|"]
+        rows += [
+            f"| {_escape(one.name)}: {one.limit} | {one.measured} | {one.outcome} |" for one in check.limits
+        ]
+        rows.append("")
+    rows += ["| number | before -> after | p | outcome |", "|---|---|---|---|"]
+    for status in STATUSES:
+        for name in check.list_status(status):
+            change = check.changes[name]
+            known = status != "unknown"
+            pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
+            rows.append(f"| {_escape(name)} | {pair} | {p} | {check.name_outcome(name)} |")
+    rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
+    return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
+
+
+def _escape(text: str) -> str:
+    """Escape names of runs and terrains, which may contain Markdown or HTML markup."""
+    escaped = re.sub(r"([\\`*_\[\]|])", r"\\\1", make_plain(text))
+    return escaped.replace("<", "&lt;").replace(">", "&gt;")
+
+
+def format_junit(check: Check) -> str:
+    """The check as JUnit: one case per limit and quantity; changed or broken ones fail, open ones skip.
+
+    If limits are given, changed quantities do not fail: the limits decide, as for the exit code.
+    """
+    cases: list[tuple[str, str, str, str]] = []
+    for one in check.limits:
+        kind = {"broken": "failure", "undetermined": "skipped"}.get(one.outcome, "")
+        cases.append(("limit", f"{one.name}: {one.limit}", kind, f"{one.measured}, limit {one.limit}"))
+    gate = not check.limits
+    for name, change in check.changes.items():
+        kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
+        kind = "skipped" if check.is_unseen(name) else kind
+        text = _format_row(check, name)
+        text += "" if change.status == "unknown" else f"; {_format_resolution(check, name)}"
+        cases.append(("number", name, kind, text))
+    counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
+    suite = ET.Element(
+        "testsuite", name="slip check", tests=str(len(cases)), failures=str(counts[0]), skipped=str(counts[1])
+    )
+    for group, name, kind, text in cases:
+        case = ET.SubElement(suite, "testcase", classname=f"slip.check.{group}", name=make_plain(name))
+        if kind:
+            ET.SubElement(case, kind, message=make_plain(text))
+    ET.SubElement(suite, "system-out").text = make_plain(format_verdict(check))
+    ET.indent(suite)
+    return f'<?xml version="1.0" encoding="utf-8"?>\n{ET.tostring(suite, encoding="unicode")}\n'

@@ -1,0 +1,102 @@
+"""Public data sets, a few made-up rows of each in its own format: recognized, and analyzed."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from fomo_session import EFFECTIVE_TRACK, write_session
+from mcap.reader import make_reader
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from verbs import run_verb
+
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
+from pipeline.simulate import simulate_case
+
+
+def test_fomo_is_recognized_and_what_it_lacks_is_said(tmp_path: Path) -> None:
+    session = write_session(tmp_path / "red_2025-10-14-11-41", duration_s=20.0, imu=False)
+    said = json.loads(run_verb("inspect", session, "--json").stdout)
+    assert said["vehicle"] == "warthog"
+    assert said["problem"] is None
+    roles = {role: found["topic"] if found else None for role, found in said["roles"].items()}
+    assert roles["pose"] == "/ppk_gnss/pose"
+    assert "/warthog/platform/motor/left/cmd_velocity" in roles["command"]
+    assert "/warthog/platform/motor/left/status/velocity" in roles["wheels"]
+    notes = " ".join(said["notes"])
+    assert "a recording of FoMo" in notes
+    assert "without a heading" in notes
+    assert "not in the folder: vectornav.csv, xsens.csv, metadata/cmd_velocity.csv" in notes
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("imu", [True, False])
+def test_a_session_of_fomo_is_analyzed(tmp_path: Path, *, imu: bool) -> None:
+    session = write_session(tmp_path / "red_2025-10-14-11-41", imu=imu)
+    outcome = analyze_log(session, Options(out=tmp_path / "results", report=False, diagnosis=True))
+    findings = {finding["id"] for finding in outcome.manifest.read("findings").to_dicts()}
+    assert ("heading_from_imu" if imu else "heading_from_course") in findings
+    (effect,) = outcome.summary["diagnosis"]["effects"]
+    assert effect["id"] == "effective_track"
+    assert effect["parameters"]["k"]["value"] == pytest.approx(EFFECTIVE_TRACK, rel=0.02)
+
+
+def as_bag(log: Path) -> Path:
+    """A simulated log as a bag of ROS 1, as the data set publishes it."""
+    store, modern = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+    bag = log.with_suffix(".bag")
+    with log.open("rb") as stream, BagWriter(bag) as writer:
+        connections = {}
+        for schema, channel, message in make_reader(stream).iter_messages():
+            assert schema is not None
+            if channel.topic not in connections:
+                if schema.name not in store.types:
+                    found = get_types_from_msg(schema.data.decode(), schema.name)
+                    for known in (store, modern):
+                        known.register(
+                            {name: made for name, made in found.items() if name not in known.types}
+                        )
+                connections[channel.topic] = writer.add_connection(
+                    channel.topic, schema.name, typestore=store
+                )
+            data = modern.cdr_to_ros1(message.data, schema.name)
+            writer.write(connections[channel.topic], message.log_time, data)
+    return bag
+
+
+@pytest.mark.parametrize(
+    ("platform", "effects", "lacks"),
+    [
+        pytest.param(
+            "tartandrive",
+            {"wheel_radius": 0.93},
+            "throttle and steering as shares",
+            marks=pytest.mark.long,
+        ),
+        pytest.param("f1tenth_ros1", {"steering_offset": 0.05}, "", marks=pytest.mark.long),
+        ("jackal_ros1", {"effective_track": 1.5}, ""),
+    ],
+)
+def test_a_bag_of_ros_1_is_recognized_and_its_effect_is_named(
+    tmp_path: Path, platform: str, effects: dict[str, float], lacks: str
+) -> None:
+    log = simulate_case(None, effects, out=tmp_path / "run.mcap", seed=3, duration_s=90.0, platform=platform)
+    bag = as_bag(log)
+    log.unlink()
+    said = json.loads(run_verb("inspect", bag, "--json").stdout)
+    assert said["profile"] == "ros1"
+    assert said["problem"] is None
+    assert lacks in run_verb("inspect", bag).stdout
+    outcome = analyze_log(bag, Options(out=tmp_path / "results", report=False, diagnosis=True))
+    assert {effect["id"] for effect in outcome.summary["diagnosis"]["effects"]} >= effects.keys()
+
+
+def test_a_topic_that_is_not_what_its_type_says_serves_where_it_is_named(tmp_path: Path) -> None:
+    log = simulate_case(None, {}, out=tmp_path / "run.mcap", seed=3, duration_s=20.0, platform="tartandrive")
+    assert json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"] is None
+    (tmp_path / "run.toml").write_text('[command]\ntopic = "/cmd"\n', encoding="utf-8")
+    named = json.loads(run_verb("inspect", log, "--json").stdout)["roles"]["command"]
+    assert named["topic"] == "/cmd"
