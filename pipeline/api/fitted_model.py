@@ -19,6 +19,7 @@ from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over
+from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.export import export_model, read_current
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
@@ -28,6 +29,7 @@ from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import MotionError, MotionRun
+from pipeline.run.windows import HORIZON_S
 from pipeline.sources import Vehicle, resolve_vehicle
 from pipeline.sources.configuration import VehicleSection
 from pipeline.words.models import format_ladder, format_parameters
@@ -211,6 +213,33 @@ class Model:
                 errors = errors_as_json(held_out.pooled)
                 rows.append({"run": item.run, "model": words, **{key: errors[key] for key in _OVER_2S}})
         return pl.DataFrame(rows)
+
+    def limit_speed(
+        self,
+        runs: Run | Sequence[Run],
+        *,
+        within_m: float,
+        ahead_s: float = HORIZON_S,
+        input: Source | None = None,
+        vehicle_of: Owner | None = None,
+    ) -> pl.DataFrame:
+        """Highest speeds at which predictions stay within a tolerance, as `slip model speed` tells them.
+
+        Args:
+            runs: one, or several of one vehicle.
+            within_m: largest error of position [m].
+            ahead_s: time ahead [s], at most 2.
+            input: what it is fed with; None as at the last fit, else as the effects need it.
+            vehicle_of: whose geometry counts where a run is of another vehicle.
+
+        Returns:
+            A row for each terrain: ``answer`` is ``up_to``, ``every``, ``none`` or ``too_few``, ``speed_mps``
+            the highest speed with its interval, beside the range that was driven and the errors at its ends.
+        """
+        file, read = self._read(runs, vehicle_of)
+        source = choose_input(read, input, file.model, last=file.last_input).source
+        with threadpool_limits(1):
+            return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
 
     def export(self, to: str, *, current: str | Path | None = None) -> str:
         """Its values as parameters of what people run, as `slip model export` writes them.

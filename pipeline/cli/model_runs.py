@@ -239,8 +239,8 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
 _SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")
 
 
-def read_seconds(text: str) -> float:
-    """Seconds of `20s` or `20`.
+def read_seconds(text: str, where: str = "--first") -> float:
+    """Seconds of `20s` or `20`, an option's.
 
     Raises:
         MotionError: ``bad_duration``.
@@ -249,8 +249,27 @@ def read_seconds(text: str) -> float:
 
     match = _SECONDS.fullmatch(text.strip())
     if match is None or not float(match[1]) > 0.0:
-        raise MotionError("bad_duration", f"{text!r} is not a duration", where="--first", hint="Write 20s.")
+        raise MotionError("bad_duration", f"{text!r} is not a duration", where=where, hint="Write 20s.")
     return float(match[1])
+
+
+_METRES = re.compile(r"(\d+(?:\.\d+)?)\s*(mm|cm|m)")
+_PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
+
+
+def read_metres(text: str) -> float:
+    """Metres of `10cm`, `0.1m` or `100mm`: a length needs its unit.
+
+    Raises:
+        MotionError: ``bad_tolerance``.
+    """
+    from pipeline.run import MotionError  # noqa: PLC0415 - heavy
+
+    match = _METRES.fullmatch(text.strip())
+    if match is None or not float(match[1]) > 0.0:
+        what = f"{text!r} is not a length above zero"
+        raise MotionError("bad_tolerance", what, where="--within", hint="Write 10cm or 0.1m.")
+    return float(match[1]) / _PER_METRE[match[2]]
 
 
 def require_model(path: Path | None) -> Path:

@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 
-from pipeline.cli.conventions import CLEAN, Results, TrustCode, print_json, print_lines, print_note
+from pipeline.cli.conventions import (
+    CLEAN,
+    Results,
+    TrustCode,
+    print_json,
+    print_lines,
+    print_note,
+    print_result,
+)
 from pipeline.cli.model_runs import (
     Against,
     compare_rivals,
@@ -23,6 +31,7 @@ from pipeline.cli.model_runs import (
     open_model,
     open_to_change,
     prior_as_json,
+    read_metres,
     read_seconds,
     require_model,
     require_models,
@@ -67,7 +76,9 @@ Spoken = Annotated[On, Parameter(name="*")]
 def build_model() -> App:
     """The verb and its own verbs."""
     model = App(name="model", help="Make, show, change, fit, compare and export a motion model.")
-    for command in (new, new_effect, literature, show, add, fit, compare, export, trust, untrust, trusted):
+    for command in (
+        new, new_effect, literature, show, add, fit, compare, speed, export, trust, untrust, trusted,
+    ):  # fmt: skip
         model.command(command)
     model.command(drop, name=("drop", "remove"))
     return model
@@ -282,6 +293,45 @@ def compare(  # noqa: D417 - the shared options document themselves
         print_lines([text for one in held for text in describe_coverage(one)])
         _warn(warnings)
     return CLEAN
+
+
+def speed(  # noqa: D417 - the shared options document themselves
+    model: Path, /, *, spoken: Spoken, within: str, ahead: str = "2s"
+) -> int:
+    """Find the highest speed at which predictions stay within a tolerance.
+
+    One answer for each terrain of the runs: the highest speed with 95 % of the predicted positions within it,
+    no speed that was driven, or every one.
+
+    Args:
+        model: the model file.
+        within: largest error of the predicted position, for example 10cm.
+        ahead: how far ahead, up to 2s.
+    """
+    from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
+    from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
+    from pipeline.words.models import format_speed_limits  # noqa: PLC0415
+
+    tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
+    opened = open_model(model, trust_code=spoken.trust_code)
+    file, runs = _gather(spoken, opened, spoken.on)
+    chosen = choose_input(runs, spoken.input, file.model, last=file.last_input)
+    limits = limit_speeds(file, runs, chosen.source, tolerance_m, ahead_s)
+    warnings = [chosen.warning] if chosen.warning else []
+    content = {
+        "within_m": tolerance_m,
+        "ahead_s": ahead_s,
+        "input": chosen.source.value,
+        "terrains": limits_as_json(limits),
+        "warnings": [*file.warnings, *warnings],
+    }
+    if not spoken.json:
+        _warn(warnings)
+    lines = [
+        f"{INPUT_WORDS[chosen.source.value]} of {', '.join(run.name for run in runs)} ({chosen.reason})",
+        *format_speed_limits(limits, tolerance_m, ahead_s),
+    ]
+    return print_result(content, lambda: lines, json=spoken.json, quiet=spoken.quiet)
 
 
 def export(  # noqa: D417 - the options document themselves

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from pipeline.core import format_share
+from pipeline.core import format_digits, format_length, format_share, split_interval
+from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer
 from pipeline.models.parameter import AT_BOUND, UNDETERMINED
 from pipeline.results.reading import ERRORS_OVER_2S, format_rises
 
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.folds import Errors
     from pipeline.estimation.ladder import Ladder, LadderStep
     from pipeline.estimation.rivals import Contest, Rival
+    from pipeline.estimation.tolerance import SpeedLimit
     from pipeline.run import MotionRun
 
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
@@ -100,6 +102,42 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
                 text += f"  run {row['run']}"
             lines.append(text.rstrip())
     return lines
+
+
+def format_speed_limits(limits: Mapping[str, SpeedLimit], tolerance_m: float, ahead_s: float) -> list[str]:
+    """Highest speeds by terrain at which predictions stay within a tolerance, one line each.
+
+    Args:
+        limits: by terrain.
+        tolerance_m: largest error of position [m].
+        ahead_s: time ahead [s].
+    """
+    head = f"within {format_length(tolerance_m)} at {ahead_s:g} s ahead: "
+    return [
+        (head if number == 0 else " " * len(head)) + _describe_limit(limit, terrain)
+        for number, (terrain, limit) in enumerate(limits.items())
+    ]
+
+
+def _describe_limit(limit: SpeedLimit, terrain: str) -> str:
+    """One terrain's highest speed, or why there is none."""
+    where = "" if terrain == "unknown" else f" on {terrain}"
+    if limit.answer is Answer.TOO_FEW:
+        count = f"{limit.predictions} prediction{'s' * (limit.predictions != 1)} while driving"
+        return f"unknown{where}: {count}, and {FEWEST_PREDICTIONS} are needed; drive longer"
+    fastest, slowest = (f"{format_digits(one)} m/s" for one in (limit.fastest, limit.slowest))
+    if limit.answer is Answer.NONE:
+        best = format_length(limit.error_slowest)
+        return f"at no speed that was driven{where}: at the slowest, {slowest}, 95 % are within {best}"
+    if limit.answer is Answer.EVERY:
+        best = format_length(limit.error_fastest)
+        return (
+            f"at every speed that was driven{where}, up to {fastest}: 95 % are within {best} there; "
+            "faster driving is not judged"
+        )
+    reached = split_interval(limit.speed, limit.low, limit.high)
+    held = f"{format_share(limit.within)} of the predictions up to there are within it"
+    return f"up to {reached[0]} m/s{where} (95 %: {reached[1]} to {reached[2]}); {held}"
 
 
 def _show(value: object) -> str:

@@ -31,6 +31,7 @@ ASKED = {
     "diagnose": ("field/wide",),
     "inspect": ("field/wide.mcap",),
     "model fit": ("husky.toml", "--on", "field/wide"),
+    "model speed": ("husky.toml", "--on", "field/wide", "--within", "10cm"),
     "compare": (),
     "check": ("field/wide", "field/other"),
     "plan": ("field/wide", "--time", "60s"),
