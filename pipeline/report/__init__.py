@@ -53,8 +53,8 @@ writing_export = partial(
 
 MISSING = "\u2013"
 _SQUARE = re.compile(r"\b(m|rad|s)\^2")
-_OPTION = re.compile(r"((?<![\w-])--[a-z][a-z-]*)")
-"""Command line option in a text: browsers would break it after a hyphen."""
+_LITERAL = re.compile(r"(`[^`]+`|(?<![\w-])--[a-z][a-z-]*)")
+"""Command in backquotes, or option of one, in a text: browsers would break an option after a hyphen."""
 _KILOMETRE = 1000.0
 _MOST_PLACES = 3
 _EARLIEST_YEAR = 2000
@@ -206,7 +206,7 @@ def _environment() -> Environment:
         "bytes": format_bytes,
         "capital": begin_large,
         "squares": set_squares,
-        "split_options": _OPTION.split,
+        "split_literals": _LITERAL.split,
         "distance": format_distance,
         "number": format_number,
         "sha256": lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode(),

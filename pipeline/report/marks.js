@@ -120,38 +120,19 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
     setZoom([start, start + length]);
   };
 
-  const findPanel = (view) => {
-    const [left, top] = view.origin();
-    for (const mark of view.scenegraph().root.items[0].items)
-      if (mark.name === "concat_0_group") return { left: left + mark.items[0].x, top, prefix: "concat_0_" };
-    return { left, top, prefix: "" };
-  };
-
-  const locate = (place, view, event) => {
-    const svg = place.querySelector("svg");
-    const box = svg.getBoundingClientRect();
-    const ratio = box.width / svg.width.baseVal.value;
-    const panel = findPanel(view);
-    const at = (axis, pixel) => view.scale(panel.prefix + axis).invert(pixel);
-    return {
-      x: at("x", (event.clientX - box.left) / ratio - panel.left),
-      y: () => at("y", (event.clientY - box.top) / ratio - panel.top),
-    };
-  };
-
   const startDrag = (place, event) => {
     const drawn = plots?.views.get(place.dataset.figure);
     const brush = drawn?.meta.brush;
     if (!brush || event.button !== 0 || (brush === "plane" && event.pointerType === "touch")) return;
     const { view, meta } = drawn;
     const before = zoom;
-    const first = { px: event.clientX, py: event.clientY, ...locate(place, view, event) };
+    const first = { px: event.clientX, py: event.clientY, ...plots.invert(place, view, event) };
     const firstY = brush === "plane" ? first.y() : 0;
     let box = null;
     place.setPointerCapture(event.pointerId);
     const move = (now) => {
       if (Math.abs(now.clientX - first.px) < 4 && !box && brush !== "plane") return;
-      const here = locate(place, view, now);
+      const here = plots.invert(place, view, now);
       if (brush === "time") {
         box = true;
         markTime(first.x, here.x);

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING
 
@@ -52,8 +52,8 @@ class MotionView:
         horizon_errors: one row per prediction of 2 s: ``t piece ideal model`` [m], ``ideal_yaw model_yaw``
             [rad].
         arcs: consecutive predicted paths of two seconds: ``t piece x y`` in the map.
+        ideal_arcs: the same for the ideal model.
         signatures: signatures of the effects, predicted and measured in the run.
-        ideal_arcs: the same for the ideal model; empty if not needed.
     """
 
     input: str
@@ -64,8 +64,8 @@ class MotionView:
     velocity: pl.DataFrame
     horizon_errors: pl.DataFrame
     arcs: pl.DataFrame
+    ideal_arcs: pl.DataFrame
     signatures: Sequence[Signature] = ()
-    ideal_arcs: pl.DataFrame = field(default_factory=pl.DataFrame)
 
 
 class MotionStage:
@@ -209,10 +209,11 @@ def view_diagnosis(
         diagnosis: of the run.
 
     Returns:
-        Rows to draw; None without effects, or if the run has too little data for a model.
+        Rows to draw, of the ideal model where no effect was found; None without errors of a model, or if the
+        run has too little data for one.
     """
     file = read_model(diagnosis)
-    if file is None or not file.model.effects or "poses" not in tables:
+    if file is None or not diagnosis.ladder or "poses" not in tables:
         return None
     try:
         run = load_run(tables, vehicle, name=diagnosis.run)

@@ -22,7 +22,9 @@
   }
   // What the reader chose, or else the stretch that a figure shows first.
   const zoomOf = (meta) => marks.zoomOf() ?? meta.window ?? null;
-  const plots = slipPlots(page, { own: marks.own, zoomOf });
+  const bar = find("cursor");
+  const cursor = bar && slipCursor(bar);
+  const plots = slipPlots(page, { own: marks.own, zoomOf, drawn: () => cursor?.refresh() });
   const places = document.querySelectorAll(".plot[data-figure]");
 
   // What is folded away has no room to be drawn in.
@@ -33,9 +35,19 @@
   };
 
   let queue = drawAll();
+  cursor?.setSpan(Number(bar.dataset.from), Number(bar.dataset.to));
+  cursor?.join(plots, places);
   marks.join(page, plots, () => (queue = queue.then(() => drawAll(".plot.brush-time"))), places);
   document.addEventListener("toggle", ({ target }) => (queue = queue.then(() => drawAll(undefined, target))), true);
   document.addEventListener("keydown", (event) => event.key === "Escape" && marks.leave());
+
+  // A way into a folded chapter opens it.
+  const unfold = (id) => {
+    const fold = id && find(id)?.closest("details");
+    if (fold) fold.open = true;
+  };
+  document.addEventListener("click", ({ target }) => unfold(target.closest?.('a[href^="#"]')?.hash.slice(1)));
+  unfold(location.hash.slice(1));
 
   // Drawing again when room or colours change -----------------------------------------------------------------
 

@@ -10,8 +10,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-import numpy as np
-
 from pipeline.core import INPUT_WORDS, FigureFormat, format_recorded, naming_os_errors
 from pipeline.core.untrusted import mapping_in, number_in, numbers_in
 from pipeline.report import (
@@ -29,10 +27,10 @@ from pipeline.report import (
     render_template,
     theme,
 )
-from pipeline.report.figures import Section, list_figures
+from pipeline.report.figures import Section, draw_figure, list_figures
 from pipeline.report.scene import RunReport, Scene
 from pipeline.report.sections_why import (
-    format_row,
+    format_remaining,
     list_findings,
     summarise_health,
     view_health,
@@ -42,36 +40,22 @@ from pipeline.report.sections_why import (
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
 from pipeline.results.reading import has_no_pose, read_findings
 from pipeline.store import Store
-from pipeline.words.errors import describe_regions, describe_structure, format_step, name_span
+from pipeline.words.errors import describe_regions, format_step, name_span
 
-_MOST_REGIONS = 2
-_SPARK_BINS, _SPARK_HEIGHT = 150, 28
+_STEPS_SHOWN = 3
+"""Next steps that are shown; the others are folded."""
 
 
 def view_glance(page: Page) -> dict[str, object]:
-    """Four short answers, each linked to its section; above them findings that forbid conclusions."""
-    report, name = page.report, page.report.main_input
-    main, minor = report.effects
-    verdict = report.verdict
+    """The verdict, findings that forbid conclusions, and the half minute with the largest error."""
+    report, verdict = page.report, page.report.verdict
     doubts = (str(one.get("text", "")) for one in list_findings(report) if one.get("severity") == "error")
     return {
         "verdict": verdict,
         "doubts": [text for text in doubts if text.casefold() not in verdict.casefold()],
-        "input": INPUT_WORDS[name],
-        "median": number_in(mapping_in(report.part("by_input"), name) or report.summary, "median_modulus"),
-        "spark": _draw_spark(page),
-        "spark_box": f"0 0 {_SPARK_BINS} {_SPARK_HEIGHT}",
-        "standing": format_standing(report),
-        "regions": list_regions(report, _MOST_REGIONS),
-        "pictures": page.pictures[Section.GLANCE],
         "refusal": report.refusal,
-        "diagnosed": report.is_diagnosed,
-        "effects": [format_row(report, entry) for entry in main],
-        "more_effects": len(minor) + report.small_groups,
-        "unexplained": None if (rest := report.diagnosis.unexplained) is None else describe_structure(rest),
-        "split": _order_split(report),
-        "step": list_steps(report)[0] if report.text("run") else None,
-        "undecided": next(iter(report.undecided), None),
+        "stretch": page.scene.stretch,
+        "pictures": page.pictures[Section.GLANCE],
     }
 
 
@@ -86,39 +70,9 @@ def format_standing(report: RunReport) -> str:
     usual = f"{format_number(statistics.median(others))} m/s"
     if len(others) == 1:
         comparative = "more" if median > others[0] else "less"
-        return f"{comparative} than the one other run of {dataset}: {usual}"
+        return f"{comparative} slip than the one other run of {dataset}: {usual}"
     below = sum(other < median for other in others)
-    return f"vs {len(others)} runs of {dataset}: more slip than {below}; their median {usual}"
-
-
-def _order_split(report: RunReport) -> list[tuple[float, str]]:
-    """Shares of ground and drivetrain, the larger first; empty if unknown."""
-    drivetrain, ground, _ = report.split
-    if drivetrain is None or ground is None:
-        return []
-    return sorted(
-        [(ground, "in the ground (wheels to body)"), (drivetrain, "in the drivetrain (command to wheels)")],
-        reverse=True,
-    )
-
-
-def _draw_spark(page: Page) -> str:
-    """Sparkline of slip over time as an SVG path; the figure below shows details."""
-    frame = page.scene.slip.get(page.report.main_input)
-    if frame is None or frame.height < _SPARK_BINS:
-        return ""
-    times, modulus = frame["t"].to_numpy(), frame["modulus"].to_numpy()
-    edges = np.linspace(times[0], times[-1], _SPARK_BINS + 1)
-    which = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, _SPARK_BINS - 1)
-    count = np.bincount(which, minlength=_SPARK_BINS)
-    mean = np.bincount(which, np.minimum(modulus, page.scene.modulus_cap), minlength=_SPARK_BINS)
-    height = mean / np.maximum(count, 1) / max(page.scene.modulus_cap, 1e-9) * (_SPARK_HEIGHT - 2)
-    path, pen = [], "M"
-    for number, there in enumerate((count > 0).tolist()):
-        if there:
-            path.append(f"{pen}{number} {_SPARK_HEIGHT - 1 - height[number]:.1f}")
-        pen = "L" if there else "M"
-    return "".join(path)
+    return f"more slip than {below} of the {len(others)} other runs of {dataset}; their median is {usual}"
 
 
 def view_how_bad(page: Page) -> dict[str, object]:
@@ -127,6 +81,7 @@ def view_how_bad(page: Page) -> dict[str, object]:
     return {
         "refusal": report.refusal,
         "cards": [_view_card(name, _numbers_of(report, name)) for name in report.inputs],
+        "standing": format_standing(report),
         "ladder": [format_step(step) for step in report.diagnosis.ladder],
         "pictures": page.pictures[Section.HOW_BAD],
         "table": _tabulate(report),
@@ -207,11 +162,17 @@ def list_regions(report: RunReport, most: int = 3) -> list[tuple[str, str]]:
 def view_what_now(page: Page) -> dict[str, object]:
     """Commands for the next steps, and whether a drive could decide anything that is open."""
     if not page.report.text("run"):
-        return {"steps": [], "settled": False, "planned": {}}
+        return {"steps": [], "more": [], "settled": False, "planned": {}}
     diagnosis = page.report.diagnosis
     is_open = diagnosis.undecided or diagnosis.unobservable_why or diagnosis.unexplained
     settled = bool(diagnosis.effects) and not is_open
-    return {"steps": list_steps(page.report), "settled": settled, "planned": page.report.planned}
+    steps = list_steps(page.report)
+    return {
+        "steps": steps[:_STEPS_SHOWN],
+        "more": steps[_STEPS_SHOWN:],
+        "settled": settled,
+        "planned": page.report.planned,
+    }
 
 
 def list_steps(report: RunReport) -> list[tuple[str, str]]:
@@ -263,10 +224,15 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     return steps
 
 
-# Sections of the page in order: how bad, where, why, what now; first a summary, then with figures.
+def view_rest(page: Page) -> dict[str, object]:
+    """Figures of what the effects carry and of what they leave."""
+    return {"pictures": page.pictures[Section.REST]}
+
+
+# Sections of the page in order: the verdict with the first picture, the effects, what to do next; the rest is
+# folded behind a line that says what is there.
 #
-# Health of the log and provenance come last. A section is a function from the page to values, and a template
-# that shows them; empty sections are omitted.
+# A section is a function from the page to values, and a template that shows them; empty sections are omitted.
 
 
 @dataclass(frozen=True)
@@ -292,21 +258,53 @@ class PageSection:
         id: anchor, and the name of its template in `templates/sections`.
         title: heading.
         view: function that returns the values for the template; a section without values is omitted.
+        sum_up: function that returns the line beside the heading of a folded section; None for one that is
+            always open.
     """
 
     id: str
     title: str
     view: Callable[[Page], Mapping[str, object]]
+    sum_up: Callable[[Page], str] | None = None
+
+
+def sum_up_where(page: Page) -> str:
+    """The region that carries most of the ideal model's error."""
+    regions = list_regions(page.report, 1)
+    return "".join(f"{region}: {part}" for region, part in regions)
+
+
+def sum_up_slip(page: Page) -> str:
+    """The median slip from each input."""
+    report = page.report
+    if report.is_refused:
+        return ""
+    medians = {name: number_in(_numbers_of(report, name), "median_modulus") for name in report.inputs}
+    told = [
+        f"{format_number(one)} m/s {INPUT_WORDS[name]}" for name, one in medians.items() if one is not None
+    ]
+    return f"median slip modulus {', '.join(told)}" if told else ""
+
+
+def sum_up_health(page: Page) -> str:
+    """Losses, gaps and serious findings."""
+    return ", ".join(words for _, words in summarise_health(page.report))
 
 
 SECTIONS = (
     PageSection("glance", "At a glance", view_glance),
-    PageSection("how-bad", "How bad", view_how_bad),
-    PageSection("where", "Where", view_where),
-    PageSection("why", "Why", view_why),
-    PageSection("what-now", "What now", view_what_now),
-    PageSection("health", "Data health", view_health),
-    PageSection("provenance", "Provenance", view_provenance),
+    PageSection("why", "Effects", view_why),
+    PageSection("what-now", "What to do next", view_what_now),
+    PageSection("where", "Where", view_where, sum_up_where),
+    PageSection("how-bad", "How much slip", view_how_bad, sum_up_slip),
+    PageSection("rest", "What is left", view_rest, lambda page: format_remaining(page.report)),
+    PageSection("health", "Data health", view_health, sum_up_health),
+    PageSection(
+        "provenance",
+        "Provenance",
+        view_provenance,
+        lambda page: str(page.report.part("log").get("path") or ""),
+    ),
 )
 
 # Page of a run, and common parts of all pages with figures.
@@ -334,7 +332,11 @@ def render_report(report: RunReport) -> str:
         ways=list_ways(report.catalogue),
         facts=_list_facts(page),
         strip=summarise_health(report),
-        sections=[(section, section.view(page)) for section in SECTIONS],
+        sections=[
+            (section, section.view(page), section.sum_up and section.sum_up(page)) for section in SECTIONS
+        ],
+        # Without a model to look at, the map is what there is to see.
+        opened=() if drawn[Section.GLANCE] else ("where",),
     )
 
 
@@ -342,11 +344,7 @@ def draw_pictures(scene: Scene) -> dict[Section, list[Picture]]:
     """Figures with something to draw, by section of the page, in its order."""
     drawn: dict[Section, list[Picture]] = {section: [] for section in Section}
     for figure in list_figures():
-        for name, panel in figure.panels(scene).items() if figure.panels else ():
-            drawn[figure.section].append(Picture(f"{figure.id}-{name}", name, panel, figure.width))
-        drawing = None if figure.panels else figure.draw(scene)
-        if drawing is not None:
-            drawn[figure.section].append(Picture(figure.id, figure.title, drawing, figure.width))
+        drawn[figure.section] += draw_figure(figure, scene)
     return drawn
 
 
@@ -358,7 +356,7 @@ def render_figures(template: str, pictures: Sequence[Picture], **values: object)
         pictures: the figures of the page.
         values: other values: at least ``title`` and ``facts``.
     """
-    own = ("plots.js", "marks.js", "page.js")
+    own = ("plots.js", "marks.js", "cursor.js", "page.js")
     scripts = [load_bundle(), "".join(read_own(f"report/{name}") for name in own)] if pictures else []
     data = {
         "figures": {picture.id: build_spec(picture.drawing) for picture in pictures},

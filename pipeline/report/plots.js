@@ -1,7 +1,7 @@
 "use strict";
 // Draws figures out of specifications and shared rows, fitted to the room there is; the report and the workbench
 // use it. `page` holds figures, rows and dark twins of colours; `own(name)` gives rows that are not among them.
-const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false } = {}) => {
+const slipPlots = (page, { own = () => null, zoomOf = () => null, drawn = () => {}, strict = false } = {}) => {
   const dark = matchMedia("(prefers-color-scheme: dark)");
   const RIGHT = 16;
   const NARROW = 480;
@@ -127,6 +127,28 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
       await embed(place, width);
     }
     place.classList.add("drawn");
+    drawn();
+  };
+
+  // Where the panels of a figure lie within its picture, and how their scales are called.
+  const findPanels = (view) => {
+    const [left, top] = view.origin();
+    const groups = view.scenegraph().root.items[0].items.filter((mark) => /^concat_\d+_group$/.test(mark.name));
+    if (!groups.length) return { left, top, bottom: top + view.height(), prefix: "" };
+    const [first, last] = [groups[0].items[0], groups[groups.length - 1].items[0]];
+    return { left: left + first.x, top, bottom: top + last.y + last.height, prefix: "concat_0_" };
+  };
+
+  const invert = (place, view, event) => {
+    const svg = place.querySelector("svg");
+    const box = svg.getBoundingClientRect();
+    const ratio = box.width / svg.width.baseVal.value;
+    const panels = findPanels(view);
+    const at = (axis, pixel) => view.scale(panels.prefix + axis).invert(pixel);
+    return {
+      x: at("x", (event.clientX - box.left) / ratio - panels.left),
+      y: () => at("y", (event.clientY - box.top) / ratio - panels.top),
+    };
   };
 
   // Puts new rows into what is drawn, into what is in sight first; axes whose ends are fixed stay where they are.
@@ -150,5 +172,7 @@ const slipPlots = (page, { own = () => null, zoomOf = () => null, strict = false
     }
   };
 
-  return { dark, draw, feed, forget, rowsOf, unpack, views };
+  const metaOf = (id) => page.figures[id].usermeta ?? {};
+
+  return { dark, draw, feed, findPanels, forget, invert, metaOf, rowsOf, unpack, views };
 };

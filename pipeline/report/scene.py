@@ -15,6 +15,7 @@ from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import format_number
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import Named, RunDiagnosis
+from pipeline.run.windows import HORIZON_S
 
 if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
@@ -272,6 +273,9 @@ _FAR_M = 10_000.0
 CAP_QUANTILE = 0.98
 """Quantile at the upper end of colours: a few samples of a stuck vehicle would dominate the scale."""
 _WORST_S = 20.0
+STRETCH_S = 30.0
+_FEWEST = 5
+"""Smallest number of predictions of a ranked stretch."""
 
 
 @dataclass(frozen=True)
@@ -293,9 +297,17 @@ class Thinned:
 
 @dataclass(frozen=True)
 class Scene:
-    """Tables of a run in the form that figures need; every part is computed once, on first use."""
+    """Tables of a run in the form that figures need; every part is computed once, on first use.
+
+    Attributes:
+        report: the run.
+        stretch_number: index of the half minute that is drawn large, 0 for that with the largest error.
+        ideal_cap: end of the colour scale of slip [m/s] where it is to be the same for every model.
+    """
 
     report: RunReport
+    stretch_number: int = 0
+    ideal_cap: float | None = None
 
     @cached_property
     def period(self) -> float:
@@ -358,6 +370,8 @@ class Scene:
     @cached_property
     def modulus_cap(self) -> float:
         """Upper end of the slip colour ramp [m/s]: the 98th percentile, rounded up to two digits."""
+        if self.ideal_cap is not None:
+            return self.ideal_cap
         sound = self.sound_slip.get(self.report.main_input)
         if sound is None:
             return 1.0
@@ -379,6 +393,50 @@ class Scene:
         total = summed[ends] - summed[np.searchsorted(seconds, starts)]
         start = min(domain[0] + float(starts[int(np.argmax(total))]), domain[1] - _WORST_S)
         return start, start + _WORST_S
+
+    @cached_property
+    def stretches(self) -> list[tuple[float, float]]:
+        """Stretches of half a minute [s], in order of decreasing error of the ideal model."""
+        errors = None if self.report.motion is None else self.report.motion.horizon_errors
+        if errors is None or errors.is_empty():
+            return []
+        first = float(errors["t"].min() or 0.0)  # type: ignore[arg-type]
+        number = ((pl.col("t") - first) / STRETCH_S).floor().cast(pl.Int64)
+        ranked = (
+            errors.group_by(number=number)
+            .agg(error=(pl.col("ideal") ** 2).mean(), count=pl.len())
+            .with_columns(few=pl.col("count") < _FEWEST)
+            .sort("few", pl.col("error") * -1.0, "number")
+        )
+        starts = [first + STRETCH_S * number for number in ranked["number"].to_list()]
+        end = float(errors["t"].max() or 0.0) + HORIZON_S  # type: ignore[arg-type]
+        # The last stretch starts earlier to have the full length.
+        begins = [max(min(start, end - STRETCH_S), first) for start in starts]
+        return [(start, min(start + STRETCH_S, end)) for start in begins]
+
+    @cached_property
+    def stretch(self) -> tuple[float, float] | None:
+        """The half minute that is drawn large [s]; None without predictions of a model."""
+        return self.stretches[self.stretch_number % len(self.stretches)] if self.stretches else None
+
+    @cached_property
+    def driven(self) -> pl.DataFrame:
+        """Positions of the vehicle in the stretch: ``t x y piece``."""
+        if self.velocities is None or self.stretch is None:
+            return pl.DataFrame(schema={"t": pl.Float64, "x": pl.Float64, "y": pl.Float64, "piece": pl.Int32})
+        east, north = self.origin
+        inside = self.velocities.filter(pl.col("t").is_between(*self.stretch))
+        return inside.select("t", pl.col("x") - east, pl.col("y") - north, "piece").drop_nulls()
+
+    def cut_arcs(self, arcs: pl.DataFrame) -> pl.DataFrame:
+        """The predicted paths that start in the stretch."""
+        if self.stretch is None or arcs.is_empty():
+            return arcs
+        east, north = self.origin
+        low, high = self.stretch
+        begins = pl.col("t").first().over("piece")
+        inside = arcs.filter((begins >= low) & (begins < high))
+        return inside.with_columns(pl.col("x") - east, pl.col("y") - north)
 
     @cached_property
     def origin(self) -> tuple[float, float]:

@@ -27,7 +27,13 @@ from pipeline.report import (
 from pipeline.report.figures import Section
 from pipeline.report.scene import RunReport
 from pipeline.results import Named
-from pipeline.words.diagnosis import format_learned_share, format_suggestion
+from pipeline.words.diagnosis import (
+    format_learned_share,
+    format_short,
+    format_suggestion,
+    list_largest_falls,
+    list_terms,
+)
 from pipeline.words.effects import describe_cause, describe_motion
 from pipeline.words.errors import describe_rest, describe_unexplained, format_remaining_error
 
@@ -197,12 +203,12 @@ def view_why(page: Page) -> dict[str, object]:
     main, minor = report.effects
     rows = [row for entry in (*main, *minor) for row in _list_parameters(entry)]
     drivetrain, ground, cross = report.split
-    signatures = {picture.title: picture for picture in page.pictures[Section.EFFECT]}
+    signatures = {picture.id: picture for picture in page.pictures[Section.EFFECT]}
     return {
         "refusal": report.refusal,
         "diagnosed": report.is_diagnosed,
-        "named": [_view_effect(report, entry, signatures.get(entry.id)) for entry in main],
-        "smaller": [_view_effect(report, entry, signatures.get(entry.id)) for entry in minor],
+        "named": [_view_effect(report, entry, signatures.get(f"signature-{entry.id}")) for entry in main],
+        "smaller": [_view_effect(report, entry, signatures.get(f"signature-{entry.id}")) for entry in minor],
         "groups": report.small_groups,
         "undecided": bool(report.undecided),
         "remaining": format_remaining(report),
@@ -217,19 +223,15 @@ def view_why(page: Page) -> dict[str, object]:
 
 def _view_effect(report: RunReport, effect: Named, signature: object) -> dict[str, object]:
     """One effect: description, possible causes, and its measured signature."""
-    does, may_be = format_row(report, effect)
     return {
         "id": effect.id,
-        "does": begin_large(does),
-        "may_be": may_be,
+        "does": begin_large(set_squares(describe_motion(effect, report.diagnosis))),
+        "value": set_squares(format_short(effect)),
+        "fall": list_largest_falls(report.diagnosis).get(effect.id, "").replace("->", "\u2192"),
+        "may_be": set_squares(describe_cause(effect)),
         "alike": _list_alike(effect),
         "picture": signature,
     }
-
-
-def format_row(report: RunReport, effect: Named) -> tuple[str, str]:
-    """Description of an effect, and its possible causes."""
-    return set_squares(describe_motion(effect, report.diagnosis)), set_squares(describe_cause(effect))
 
 
 def _list_alike(effect: Named) -> tuple[str, str] | None:
@@ -285,10 +287,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     for names, advice in report.undecided:
         yield "undecided", f"{names}: {advice}", ""
     if diagnosis.unexplained is not None:
-        suggested = format_suggestion(diagnosis.unexplained)
-        example = f"; suggested term: {suggested}" if suggested else ""
-        formula = diagnosis.unexplained.formula or ""
-        yield "unexplained", f"{describe_unexplained(diagnosis.unexplained)}{example}", formula
+        rest = diagnosis.unexplained
+        told = [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest)]
+        yield "unexplained", "; ".join(filter(None, told)), rest.formula or ""
     if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
         yield "beyond the effects", beyond, ""
     if diagnosis.unobservable_why:

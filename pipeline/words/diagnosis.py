@@ -152,18 +152,9 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     undecided = {item.in_model for item in felt}
     shown = [effect for effect in main if effect.id not in undecided]
     folded = len(shown[_EFFECTS_SHOWN:]) + len(minor) + len(small)
-    falls = {
-        name: _format_largest_fall(before, after)
-        for before, after in pairwise(run.ladder)
-        for name in list_added(before, after)
-    }
+    falls = list_largest_falls(run)
     rows = [
-        (
-            name_term(effect.id),
-            _format_short(effect),
-            "corrected before the fit" if effect.corrected else falls.get(effect.id, ""),
-            effect.id,
-        )
+        (name_term(effect.id), format_short(effect), falls.get(effect.id, ""), effect.id)
         for effect in shown[:_EFFECTS_SHOWN]
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -176,7 +167,17 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     return texts
 
 
-def _format_short(effect: Named) -> str:
+def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
+    """The error over 2 s that each effect lowers most, before and after it, by its id."""
+    falls = {
+        name: _format_largest_fall(before, after)
+        for before, after in pairwise(run.ladder)
+        for name in list_added(before, after)
+    }
+    return falls | {one.id: "corrected before the fit" for one in run.effects if one.corrected}
+
+
+def format_short(effect: Named) -> str:
     """The value of an effect, or how many it has."""
     if effect.by_run:
         return "one offset a run"
@@ -195,10 +196,11 @@ def _list_rest(run: RunDiagnosis) -> list[str]:
     rest = run.unexplained
     if rest is None:
         return []
-    return [describe_unexplained(rest), *_list_terms(rest), format_suggestion(rest)]
+    return [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest)]
 
 
-def _list_terms(rest: Unexplained) -> list[str]:
+def list_terms(rest: Unexplained) -> list[str]:
+    """The terms of a suggested formula, with its numbers and inputs in words."""
     terms = [line for line in _list_formula(rest.formula or "") if len(line) <= _LONGEST_TERM]
     return [f"suggested term: {line}" for line in terms]
 
@@ -320,7 +322,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
     if rest is None:
         return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
     rows.append(describe_unexplained(rest))
-    rows += _list_terms(rest)
+    rows += list_terms(rest)
     return [*rows, format_suggestion(rest), *_suggest_next_steps(run)]
 
 

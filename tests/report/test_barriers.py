@@ -80,6 +80,9 @@ def test_no_page_has_a_serious_barrier(
         chrome.size(width, 900, dark=dark)
         chrome.open(pages[name].as_uri())
         chrome.wait(DRAWN)
+        # What is folded is part of the page.
+        chrome.run("document.querySelectorAll('.chapter').forEach((chapter) => (chapter.open = true))")
+        chrome.wait("!document.querySelector('.chapter[open] > .figures > figure > .plot:not(.drawn)')")
         chrome.picture(pictures / f"barriers_{name}_{width}.png", whole=True)
         assert find_barriers(chrome) == [], json.dumps([name, width])
         assert chrome.errors == []

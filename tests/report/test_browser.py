@@ -52,6 +52,9 @@ PROBE = """
   });
   addEventListener("load", async () => {
     await wait(() => document.documentElement.dataset.drawn === "yes");
+    seen.first = [...document.querySelectorAll(".plot.drawn")].map((place) => place.dataset.figure);
+    for (const chapter of document.querySelectorAll("details")) chapter.open = true;
+    await wait(() => !document.querySelector(".plot:not(.drawn)"));
     seen.drawn = Object.fromEntries([...document.querySelectorAll("[data-figure]")].map(
       (place) => [place.dataset.figure, place.querySelectorAll("svg path").length]));
     seen.wide = document.documentElement.scrollWidth - document.documentElement.clientWidth;
@@ -160,6 +163,11 @@ def test_every_figure_is_drawn(seen: dict[str, object]) -> None:
     assert min(drawn.values()) > 3
 
 
+def test_only_the_answer_is_open_at_first(seen: dict[str, object]) -> None:
+    drawn = ["paths", "stretch", "ladder", "signature-effective_track", "signature-drive_lag"]
+    assert seen["first"] == drawn
+
+
 def test_nothing_is_cut_or_wider_than_the_screen(seen: dict[str, object]) -> None:
     assert isinstance(seen["wide"], int)
     assert seen["wide"] <= 0
@@ -185,6 +193,8 @@ def test_the_strip_of_the_whole_run_chooses_what_is_drawn_large(
     chrome.size(LAPTOP, 900)
     chrome.open((tmp_path / "page.html").as_uri())
     chrome.wait("document.documentElement?.dataset.drawn === 'yes'")
+    chrome.click("#where > summary")
+    chrome.wait("!document.querySelector('#where .plot:not(.drawn)')")
     words = "[...document.querySelectorAll('[data-figure={}] .role-axis-label text')].map((t) => t.{})"
     large, whole = (words.format(name, "textContent") for name in ("velocities", "navigator"))
     first = chrome.run(large)
@@ -230,3 +240,35 @@ def test_names_of_options_do_not_break_at_their_hyphens(tmp_path: Path, chrome: 
         options += cast("list[tuple[str, int]]", chrome.run(BROKEN))
     assert {"--apply", "--to", "--on"} & {option for option, _ in options}
     assert [option for option, lines in options if lines > 1] == []
+
+
+@pytest.mark.long
+def test_one_moment_shows_in_every_figure_and_can_be_played(
+    page: str, chrome: Chrome, tmp_path: Path
+) -> None:
+    (tmp_path / "page.html").write_text(page, encoding="utf-8")
+    chrome.size(LAPTOP, 900)
+    chrome.open(f"{(tmp_path / 'page.html').as_uri()}#where")
+    chrome.wait(
+        "document.querySelector('#where')?.open && !document.querySelector('#where .plot:not(.drawn)')"
+    )
+    marked = "[...document.querySelectorAll('.cursor-mark')].map((mark) => mark.parentElement.dataset.figure)"
+    assert chrome.run(marked) == []
+    # By keys, as by the pointer.
+    chrome.run("document.querySelector('.moment-slider').focus()")
+    for _ in range(80):
+        chrome.press("ArrowRight", 39)
+    chrome.wait("document.querySelector('.moment-said').textContent.startsWith('4.0 s')")
+    chrome.wait(f"new Set({marked}).size > 2")
+    assert {"paths", "stretch", "trajectory"} <= set(cast("list[str]", chrome.run(marked)))
+    told = str(chrome.run("document.querySelector('.moment-said').textContent"))
+    assert "forward [m/s] measured" in told
+    assert "cm off" in told
+    slider = "Number(document.querySelector('.moment-slider').value)"
+    chrome.click(".play")
+    chrome.wait(f"{slider} > 6")
+    chrome.click(".play")
+    stopped = chrome.run(slider)
+    assert chrome.run("document.querySelector('.play').textContent") == "Play"
+    assert chrome.run(slider) == stopped
+    assert chrome.errors == []

@@ -17,7 +17,8 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, suffix_unit
-from pipeline.report import format_number, theme
+from pipeline.models.catalogue import name_effect
+from pipeline.report import Picture, format_number, theme
 from pipeline.report.scene import Scene, Thinned
 from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis
 
@@ -26,10 +27,11 @@ class Section(Enum):
     """Question of the page that a figure answers."""
 
     GLANCE = "glance"
-    HOW_BAD = "how-bad"
-    WHERE = "where"
-    EFFECT = "effect"
     WHY = "why"
+    EFFECT = "effect"
+    WHERE = "where"
+    HOW_BAD = "how-bad"
+    REST = "rest"
 
 
 @dataclass(frozen=True)
@@ -56,17 +58,18 @@ class Figure:
     Attributes:
         title: what it shows, in a few words.
         section: the question it answers.
-        draw: the function from tables to a drawing; returns None if there is nothing to draw.
+        draw: the function from tables to a drawing, which returns None if there is nothing to draw; None for
+            a figure of panels.
         order: position within the section, in ascending order; figures of half the width may come first.
         id: stable name.
         width: share of a wide page's width.
-        panels: parts by title, for a figure that a page shows part by part; may be empty.
+        panels: drawings by the id of an effect, for a figure that has one for each.
         live: names of its rows that change with the model of the run.
     """
 
     title: str
     section: Section
-    draw: Callable[[Scene], Drawing | None]
+    draw: Callable[[Scene], Drawing | None] | None
     order: int
     id: str
     width: Literal["half", "full"] = "half"
@@ -86,6 +89,17 @@ def list_figures() -> tuple[Figure, ...]:
     return tuple(
         sorted(figures, key=lambda figure: (sections.index(figure.section), figure.order, figure.id))
     )
+
+
+def draw_figure(figure: Figure, scene: Scene) -> list[Picture]:
+    """The pictures of a figure, one for each of its parts; empty if there is nothing to draw."""
+    if figure.panels is not None:
+        return [
+            Picture(f"{figure.id}-{name}", name_effect(name), panel, figure.width)
+            for name, panel in figure.panels(scene).items()
+        ]
+    drawing = None if figure.draw is None else figure.draw(scene)
+    return [] if drawing is None else [Picture(figure.id, figure.title, drawing, figure.width)]
 
 
 WIDTH = 720

@@ -318,7 +318,7 @@ def _list_points(seconds: Sequence[float], values: Sequence[float]) -> list[tupl
     return [point for point in zip(seconds, values, strict=False) if math.isfinite(point[1])]
 
 
-ENOUGH = Figure("Is the log long enough", Section.WHY, draw_enough, order=6, width="full", id="enough")
+ENOUGH = Figure("Is the log long enough", Section.REST, draw_enough, order=6, width="full", id="enough")
 
 _NUMBERS = dict.fromkeys(("from", "to", "low", "high"), pl.Float64)
 _SCHEMA_BUDGET = {"cause": pl.String, **_NUMBERS, "kind": pl.String, "told": pl.String}
@@ -397,7 +397,7 @@ def _format_split(scene: Scene, rows: pl.DataFrame) -> str:
     )
 
 
-BUDGET = Figure("Error budget by cause", Section.WHY, draw_budget, order=1, id="budget")
+BUDGET = Figure("Error budget by cause", Section.REST, draw_budget, order=1, id="budget")
 
 _PARTS = {
     "drivetrain": "drivetrain (command to wheels)",
@@ -477,4 +477,4 @@ def _list_parts(scene: Scene) -> pl.DataFrame | None:
     )
 
 
-SPLIT = Figure("Drivetrain and ground", Section.WHY, draw_split, order=10, width="full", id="split")
+SPLIT = Figure("Drivetrain and ground", Section.REST, draw_split, order=10, width="full", id="split")

@@ -62,7 +62,7 @@ def list_horizon_errors(scene: Scene) -> dict[str, pl.DataFrame]:
 
 REACH = Figure(
     "Predictions over two seconds",
-    Section.WHY,
+    Section.REST,
     draw_horizon_errors,
     order=6,
     width="full",
@@ -196,7 +196,7 @@ def _format_residuals(motion: MotionView) -> str:
 
 RESIDUALS = Figure(
     "Residual against the signal that explains most of it",
-    Section.WHY,
+    Section.REST,
     draw_residuals,
     order=2,
     live=list_residuals,
@@ -307,7 +307,7 @@ def _format_autocorrelation(rows: dict[str, pl.DataFrame]) -> str:
 
 AUTOCORRELATION = Figure(
     "Autocorrelation of the residual",
-    Section.WHY,
+    Section.REST,
     draw_autocorrelation,
     order=4,
     live=list_autocorrelations,
@@ -366,27 +366,13 @@ def _format_crosscorrelation(rows: dict[str, pl.DataFrame]) -> str:
 
 CROSSCORRELATION = Figure(
     "Cross-correlation of the residual with the input",
-    Section.WHY,
+    Section.REST,
     draw_crosscorrelation,
     order=5,
     id="crosscorrelation",
 )
 
 _SERIES = {"before": "error without it", "after": "with it", "curve": "its effect"}
-
-
-def draw_signature(scene: Scene) -> Drawing | None:
-    """Draw all effects below each other; None without a model or effects."""
-    panels = list_panels(scene)
-    if not panels:
-        return None
-    chart = stack(*(panel.chart for panel in panels.values())).resolve_scale(x="independent")
-    note, words = (
-        "Error bars: 95 % between blocks of ten seconds.",
-        [panel.words for panel in panels.values()],
-    )
-    chart = chart.properties(usermeta={"gutter": figures.GUTTER})
-    return Drawing(chart, list_signatures(scene), note, " ".join(words))
 
 
 def list_panels(scene: Scene) -> dict[str, Drawing]:
@@ -482,5 +468,5 @@ def _format_signature(signature: Signature) -> str:
 
 _TITLE = "Each effect: model and measurement"
 SIGNATURE = Figure(
-    _TITLE, Section.EFFECT, draw_signature, order=0, panels=list_panels, live=list_signatures, id="signature"
+    _TITLE, Section.EFFECT, None, order=0, panels=list_panels, live=list_signatures, id="signature"
 )

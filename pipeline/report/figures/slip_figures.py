@@ -82,7 +82,8 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
         for end, dy in (("start", -9), ("end", 12))
     ]
     meta = figures.brush_over_plane("x", "y") | {
-        "equal": {"x": extent[0], "y": extent[1], "lowest": MAP_LOWEST, "highest": MAP_HIGHEST}
+        "dots": {"track": "measured"},
+        "equal": {"x": extent[0], "y": extent[1], "lowest": MAP_LOWEST, "highest": MAP_HIGHEST},
     }
     predicted = [
         Chart.of_rows("arcs")
@@ -145,7 +146,7 @@ def format_map(scene: Scene) -> str:
     )
 
 
-TRAJECTORY = Figure("On the map", Section.GLANCE, draw_trajectory, order=10, live=list_arcs, id="trajectory")
+TRAJECTORY = Figure("On the map", Section.WHERE, draw_trajectory, order=10, live=list_arcs, id="trajectory")
 
 _CELLS = 20
 _FEWEST_SAMPLES = 3
@@ -488,7 +489,7 @@ def _format_step_response(responses: dict[str, pl.DataFrame]) -> str:
 
 STEP_RESPONSE = Figure(
     "After a step of the command",
-    Section.WHY,
+    Section.REST,
     draw_step_response,
     order=3,
     live=list_responses,
