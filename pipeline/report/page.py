@@ -270,8 +270,10 @@ class PageSection:
 
 def sum_up_where(page: Page) -> str:
     """The region that carries most of the ideal model's error."""
-    regions = list_regions(page.report, 1)
-    return "".join(f"{region}: {part}" for region, part in regions)
+    if not page.report.diagnosis.ladder:
+        return ""
+    regions = [f"{region}: {part}" for region, part in list_regions(page.report, 1)]
+    return regions[0] if regions else "the error is spread evenly over the run"
 
 
 def sum_up_slip(page: Page) -> str:
@@ -281,7 +283,9 @@ def sum_up_slip(page: Page) -> str:
         return ""
     medians = {name: number_in(_numbers_of(report, name), "median_modulus") for name in report.inputs}
     told = [
-        f"{format_number(one)} m/s {INPUT_WORDS[name]}" for name, one in medians.items() if one is not None
+        f"{format_number(one, digits=2)} m/s {INPUT_WORDS[name]}"
+        for name, one in medians.items()
+        if one is not None
     ]
     return f"median slip modulus {', '.join(told)}" if told else ""
 
