@@ -2,7 +2,7 @@
 
 A batch finds the logs, skips those that are done, processes the rest on this machine or a cluster, and
 reports the outcome of each log with its reason. The same command continues an interrupted batch. Here are the
-options of a batch, and systemd or cron units that run it every night.
+options of a batch.
 """
 
 from __future__ import annotations
@@ -10,12 +10,8 @@ from __future__ import annotations
 import math
 import os
 import re
-import unicodedata
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from importlib import resources
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 from pipeline.core import SlipError, shorten
 
@@ -135,124 +131,3 @@ def parse_shard(text: str) -> Shard:
             "bad_shard", f"{text!r} is not a shard", hint="Write i/n with i from 1 to n, for example 2/4"
         )
     return Shard(number=number, count=count)
-
-
-System = Literal["systemd", "cron"]
-
-_CLOCK = re.compile(r"([01]?\d|2[0-3]):([0-5]\d)")
-_STOP_S = 120
-
-
-@dataclass(frozen=True, kw_only=True)
-class Nightly:
-    """Program to run nightly.
-
-    Attributes:
-        program: the program and its first arguments, absolute.
-        arguments: arguments of ``slip batch``.
-        folder: working folder, to which relative paths in the arguments refer.
-        lock: lock file that prevents a second instance.
-        hour: hour of the day, local time.
-        minute: minute of the hour.
-    """
-
-    program: Sequence[str]
-    arguments: Sequence[str]
-    folder: Path
-    lock: Path
-    hour: int
-    minute: int
-
-
-def parse_clock(text: str) -> tuple[int, int]:
-    """Hour and minute of ``02:30``.
-
-    Raises:
-        BatchError: ``bad_time``.
-    """
-    match = _CLOCK.fullmatch(text)
-    if match is None:
-        raise BatchError("bad_time", f"{text!r} is not a time of day", hint="Write HH:MM, for example 02:30")
-    return int(match[1]), int(match[2])
-
-
-def print_units(nightly: Nightly, system: System) -> str:
-    """Return the units as text, with comments on where to install them.
-
-    Args:
-        nightly: program and time.
-        system: ``systemd`` for a service and its timer, ``cron`` for lines of a crontab.
-
-    Raises:
-        BatchError: ``bad_word``, a path or an argument that the format cannot represent.
-    """
-    for word in (*_command(nightly), str(nightly.folder), str(nightly.lock)):
-        _require_one_line(word)
-    return _print_systemd(nightly) if system == "systemd" else _print_cron(nightly)
-
-
-def _print_systemd(nightly: Nightly) -> str:
-    # A service is never started twice; the lock also excludes batches started by hand. The folder ends in a
-    # slash because a backslash or a space at the end of a line would be misread.
-    words = ["/usr/bin/flock", "--nonblock", "--conflict-exit-code", "0", str(nightly.lock)]
-    command = " ".join(_quote_systemd(word) for word in [*words, *_command(nightly)])
-    units = resources.files("pipeline.batch").joinpath("slip-batch.systemd").read_text("utf-8")
-    folder = _escape_systemd(str(nightly.folder))
-    return units.format(
-        folder=folder, command=command, hour=nightly.hour, minute=nightly.minute, stop_s=_STOP_S
-    )
-
-
-def _print_cron(nightly: Nightly) -> str:
-    inner = " ".join(_quote_cron(word) for word in _command(nightly))
-    flock = f"flock --nonblock --conflict-exit-code 0 {_quote_cron(str(nightly.lock))}"
-    line = f"cd {_quote_cron(str(nightly.folder))} && {flock} {inner} 2>&1 | logger --tag slip-batch"
-    return f"""\
-# crontab -e
-SHELL=/bin/sh
-PATH=/usr/local/bin:/usr/bin:/bin
-{nightly.minute} {nightly.hour} * * * {line}
-# A night that the machine slept through is caught up after it starts.
-@reboot sleep 300; {line}
-# journalctl --identifier slip-batch
-"""
-
-
-def _command(nightly: Nightly) -> list[str]:
-    return [*nightly.program, "batch", "run", *nightly.arguments]
-
-
-def _require_one_line(word: str) -> None:
-    """Reject control characters and names that are not UTF-8, which units and crontabs cannot represent."""
-    if any(unicodedata.category(character) in {"Cc", "Cs"} for character in word):
-        raise BatchError(
-            "bad_word",
-            f"{word!r} holds a line break or another character that cannot stand in a unit or a crontab",
-            hint="Rename the file or folder",
-        )
-
-
-def _quote_cron(word: str) -> str:
-    r"""Quote a word of a crontab command so that every cron and the shell behind it read it alike.
-
-    A bare percent sign ends the command. Some crons remove the backslash before it, some keep it: it is
-    placed outside of quotes, where the shell removes it. Some crons turn two backslashes into one, so two
-    never follow each other.
-    """
-    if re.fullmatch(r"[A-Za-z0-9_@+=:,./-]+", word):
-        return word
-    single = word.replace("'", "'\"'\"'").replace("\\", "\\''").replace("%", "'\\%'")
-    return f"'{single}'"
-
-
-def _escape_systemd(text: str) -> str:
-    return text.replace("%", "%%")
-
-
-def _quote_systemd(word: str) -> str:
-    """Quote a word of an ExecStart line if needed; its % and $ are literal."""
-    plain = _escape_systemd(word).replace("$", "$$")
-    if re.fullmatch(r"[A-Za-z0-9_@%+=:,./$-]+", plain):
-        return plain
-    escaped = plain.replace("\\", "\\\\").replace('"', '\\"')
-    return f'"{escaped}"'

@@ -52,7 +52,7 @@ _GROUPS = {
     "Change the model": {"model": "verb_model", "effects": "verbs_effects", "serve": "verbs_machine"},
     "Plan and simulate drives": {"plan": "verbs_drives", "simulate": "verbs_drives"},
     "Compare several runs": {"check": "verbs_fleet", "compare": "verbs_datasets", "fleet": "verbs_fleet"},
-    "Batches and results": {"batch": "verbs_machine", "results": "verbs_results"},
+    "Batches and results": {"batch": "verbs_batch", "results": "verbs_results"},
     "The installation": {"doctor": "verbs_machine"},
 }
 """Files of the commands, by task."""

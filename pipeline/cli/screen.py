@@ -57,7 +57,7 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        print_note(f"{todo} logs to work on ({size / 1e6:.1f} MB), {settled} already done")
+        print_note(f"{todo} log{'s' * (todo != 1)} to work on ({size / 1e6:.1f} MB), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""

@@ -13,6 +13,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import NonNegativeFloat
 
 from pipeline.cli.conventions import (
+    ALERT,
     CLEAN,
     FAILED,
     Choices,
@@ -29,7 +30,7 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import SlipError, format_interval, suffix_unit
+from pipeline.core import TREND_THRESHOLD, SlipError, format_interval, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -367,9 +368,6 @@ def _format_interval(number: Mapping[str, object], unit: str) -> str:
     return format_interval(value, low, high, unit)
 
 
-ALERT = 4
-
-
 def trend(  # noqa: D417 - arguments document themselves
     results: Results = Path("results"),
     *,
@@ -378,7 +376,7 @@ def trend(  # noqa: D417 - arguments document themselves
     ] = "dataset",
     threshold: Annotated[
         NonNegativeFloat, Parameter(help="relative change of slip that raises an alert")
-    ] = 0.1,
+    ] = TREND_THRESHOLD,
     limit: Annotated[
         tuple[str, ...], Parameter(help="QUANTITY=VALUE, an alert where the last run is above")
     ] = (),

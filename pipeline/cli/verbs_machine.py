@@ -1,4 +1,4 @@
-"""Commands that put this machine to work: batch, serve; and doctor, which says whether it can."""
+"""Commands about this machine: serve, and doctor, which says whether all that slip needs is there."""
 
 from __future__ import annotations
 
@@ -10,222 +10,24 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
-from cyclopts import App, Parameter
-from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
+from cyclopts import Parameter
+from cyclopts.types import PositiveFloat
 
-from pipeline.batch import (
-    Nightly,
-    Pruning,
-    Request,
-    System,
-    count_cores,
-    parse_clock,
-    parse_memory_limit,
-    parse_shard,
-    parse_size,
-    print_units,
-)
+from pipeline.batch import parse_memory_limit
 from pipeline.cli.conventions import (
     CLEAN,
     FAILED,
-    LOSSY,
-    Choices,
     Results,
-    build_options,
-    format_state,
-    open_results,
-    print_error,
     print_json,
-    print_lines,
     print_note,
     print_result,
-    summarize_error,
 )
-from pipeline.core import PACKAGE, SlipError, measure_memory, read_version, slip_command
-
-if TYPE_CHECKING:
-    from pipeline.batch.season import Line, Outcome
-
-_MEMORY_SHARE = 0.8
-_EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
-
-
-def build_batch() -> App:
-    """The command, which brings results up to date by itself, and its own commands."""
-    app = App(name="batch", help="Analyze the new and changed logs of a folder.")
-    app.default(run)
-    app.command(run)
-    app.command(schedule)
-    return app
-
-
-def run(  # noqa: D417 - the shared choices document themselves
-    logs: Annotated[
-        list[str] | None,
-        Parameter(help="logs, folders, 'globs' and @lists; after -- where a name begins with a dash"),
-    ] = None,
-    /,
-    *,
-    choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
-    jobs: PositiveInt | None = None,
-    executor: str = "local",
-    shard: str | None = None,
-    reports: bool = False,
-    diagnosis: bool = False,
-    force: bool = False,
-    retry_quarantined: bool = False,
-    timeout: PositiveFloat = 3600.0,
-    memory: str | None = None,
-    settle: NonNegativeFloat = 120.0,
-    prune: bool = False,
-    keep: NonNegativeInt = 1,
-    quota: str | None = None,
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Analyze the new and changed logs of a folder.
-
-    The same command again continues.
-
-    Args:
-        jobs: logs processed in parallel (default: the cores it may use).
-        executor: local; dask for a cluster on this machine; or a scheduler's address, tcp://host:8786.
-        shard: i/n, the i-th of n machines that share the logs.
-        reports: write report.html for every log.
-        diagnosis: identify the effects that the model lacks in every log, which takes longer.
-        force: compute again what is already there.
-        retry_quarantined: try logs again that killed their workers.
-        timeout: longest time for one log [s].
-        memory: memory limit for one log, for example 2GB (default: a fair share of the machine's).
-        settle: an unfinished log that changed within this time [s] counts as being written.
-        prune: remove old generations afterwards; without logs, only that.
-        keep: old generations to keep of each run.
-        quota: with --prune, size of the results above which the oldest go first, for example 200GB.
-        json: print one JSON object.
-        quiet: print nothing but errors.
-    """
-    from pipeline.cli.screen import open_watch  # noqa: PLC0415 - only for this verb
-
-    if not logs and not prune:
-        raise SlipError("no_logs", "no log is given", hint="Give logs: slip batch LOGS, a folder or a glob")
-    if quota is not None and not prune:
-        raise SlipError("quota_alone", "--quota does nothing by itself", hint="Add --prune, or leave it out")
-    pruning = Pruning(keep=keep, quota_bytes=None if quota is None else parse_size(quota))
-    options = replace(build_options(choices), report=reports, diagnosis=diagnosis, force=force)
-    opened = open_results(choices.results)
-    if not logs:
-        opened.open_store()
-    workers = jobs or count_cores()
-    request = Request(
-        targets=tuple(logs or ()),
-        options=replace(options, out=opened.root, config=None, fleet=options.config),
-        address=None if opened.mirror is None else opened.mirror.address,
-        executor=executor,
-        jobs=workers,
-        shard=None if shard is None else parse_shard(shard),
-        timeout_s=timeout,
-        memory_bytes=int(measure_memory() * _MEMORY_SHARE / workers)
-        if memory is None
-        else parse_memory_limit(memory),
-        settle_s=settle,
-        retries_quarantined=retry_quarantined,
-        pruning=pruning if prune else None,
-    )
-    from pipeline.batch.season import run_batch  # noqa: PLC0415 - heavy
-
-    with open_watch(quiet=quiet or json) as watch:
-        outcome = run_batch(request, watch)
-    for problem in outcome.problems:
-        print_error(problem)
-    if json:
-        print_json(_as_json(outcome))
-    elif not quiet:
-        print_lines(format_outcome(outcome, is_search=bool(logs)))
-    if outcome.has_failed:
-        return FAILED
-    return LOSSY if outcome.has_losses else CLEAN
-
-
-def _as_json(outcome: Outcome) -> dict[str, object]:
-    states = [line.state for line in outcome.lines]
-    return {
-        **outcome.counts,
-        **{name: states.count(name) for name in ("growing", "left", "skipped")},
-        "seconds": round(outcome.seconds, 3),
-        "removed_generations": outcome.removed,
-        "logs": [asdict(line) for line in outcome.lines],
-        "errors": [summarize_error("", problem) for problem in outcome.problems],
-    }
-
-
-def format_outcome(outcome: Outcome, *, is_search: bool = True) -> list[str]:
-    """The closing table: how many logs came out how, and of those that need a look, why."""
-    counts = {state: count for state, count in outcome.counts.items() if count or state != "refused"}
-    lines = [f"{format_state(state):<14}{count:>6}" for state, count in counts.items()]
-    for state in ("growing", "left", "skipped"):
-        count = sum(line.state == state for line in outcome.lines)
-        lines += [f"{format_state(state):<14}{count:>6}"] if count else []
-    fetched = sum(line.fetched_bytes for line in outcome.lines)
-    if fetched:
-        whole = sum(line.size_bytes for line in outcome.lines if line.fetched_bytes)
-        lines.append(f"fetched {fetched / 1e6:.1f} MB of {whole / 1e6:.1f} MB")
-    if outcome.removed or not is_search:
-        lines.append(f"{'pruned':<14}{outcome.removed:>6} old generation{'s' * (outcome.removed != 1)}")
-    for state in _EXPLAINED:
-        noted = [line for line in outcome.lines if state in _list_notes(line)]
-        if noted:
-            lines += ["", format_state(state), *(text for line in noted for text in _explain(line))]
-    copies = [line for line in outcome.lines if _list_notes(line) == ["unchanged"] and line.reason]
-    if copies:
-        lines += ["", "copies, counted once", *(text for line in copies for text in _explain(line))]
-    return lines
-
-
-def _list_notes(line: Line) -> list[str]:
-    """State of a log, and notes on results that did not change."""
-    notes = {"refused": line.refused, "lossy": line.lossy}
-    return [line.state, *(name for name, is_so in notes.items() if is_so and name != line.state)]
-
-
-def _explain(line: Line) -> list[str]:
-    hint = [f"      {line.hint}"] if line.hint else []
-    return [f"  {line.path}", f"      {line.reason}", *hint]
-
-
-def schedule(  # noqa: D417 - arguments document themselves
-    *arguments: Annotated[
-        str, Parameter(help="what follows `slip batch`: logs and options", allow_leading_hyphen=True)
-    ],
-    print: Annotated[System, Parameter(name="--print")] = "systemd",  # noqa: A002 - the promised name
-    at: Annotated[str, Parameter(name="--at")] = "02:00",
-    lock: Annotated[Path | None, Parameter(name="--lock")] = None,
-) -> int:
-    """Print units that run `slip batch` every night.
-
-    Runs never overlap, are made up after downtime, and log to the journal.
-
-    Args:
-        print: for systemd (a service and its timer) or cron.
-        at: time of day, local.
-        lock: lock file (default: .slip-batch.lock in this folder).
-    """
-    hour, minute = parse_clock(at)
-    folder = Path.cwd()
-    nightly = Nightly(
-        program=slip_command(),
-        arguments=arguments,
-        folder=folder,
-        lock=(folder / (lock or ".slip-batch.lock")),
-        hour=hour,
-        minute=minute,
-    )
-    sys.stdout.write(print_units(nightly, print))
-    return CLEAN
+from pipeline.core import PACKAGE, measure_memory, read_version
 
 
 def serve(  # noqa: D417 - the results folder documents itself

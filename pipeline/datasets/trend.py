@@ -314,11 +314,12 @@ class Series:
 
 @dataclass(frozen=True)
 class Alert:
-    """Change or value that needs attention."""
+    """Change, since a date, or a last value that needs attention."""
 
     group: str
     quantity: str
     text: str
+    since: str = ""
 
 
 def name_quantity(quantity: str) -> str:
@@ -359,6 +360,7 @@ class _Event:
     short: str
     earliest: int
     latest: int
+    since: str
 
 
 def raise_alerts(
@@ -387,13 +389,13 @@ def raise_alerts(
     moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.relevant]
     events = [
         _Event(one.vehicle, one.label, format_change(one, last), shorten_change(one, last), last.earliest,
-               last.latest)
+               last.latest, last.since)
         for one, last in sorted(moved, key=lambda pair: (pair[1].p, -pair[0].named))
     ]  # fmt: skip
     stepped = [(one, one.steps[-1]) for one in series if one.steps and one.steps[-1].size >= threshold]
     events += [
         _Event(vehicles.get(one.group, one.group), one.quantity, format_step(one, step),
-               shorten_step(one, step), step.earliest, step.latest)
+               shorten_step(one, step), step.earliest, step.latest, step.since)
         for one, step in sorted(stepped, key=lambda pair: pair[0].quantity not in _SLIP_FIRST)
     ]  # fmt: skip
     alerts = []
@@ -402,9 +404,8 @@ def raise_alerts(
         same = [one for one in events if one.group == head.group and _overlap(one, head)]
         events = [one for one in events if one not in same]
         others = "; ".join(one.short for one in same)
-        alerts.append(
-            Alert(head.group, head.quantity, head.text + (f"; with it: {others}" if others else ""))
-        )
+        text = head.text + (f"; with it: {others}" if others else "")
+        alerts.append(Alert(head.group, head.quantity, text, head.since))
     lasts = [
         (one.group, one.quantity, name_quantity(one.quantity), one.unit, one.latest, one.points["run"][-1])
         for one in series

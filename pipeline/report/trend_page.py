@@ -6,12 +6,13 @@ import contextlib
 import itertools
 import json
 import math
-from collections.abc import Sequence, Sized
+from collections.abc import Mapping, Sequence, Sized
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
+from pipeline.core import TREND_THRESHOLD
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import read_bounded
 from pipeline.datasets import WHISKER_REACH, ComparisonError
@@ -237,7 +238,6 @@ def write_trend(store: Store, trend: Trend) -> Path:
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.trend_page import render_trend  # noqa: PLC0415 - heavy
 
     return write_page(store, "trend.html", render_trend(trend))
 
@@ -247,18 +247,36 @@ def update_trend(store: Store) -> None:
 
     The trend stays unchanged if no run has a date, or if its stored options cannot be read.
     """
+    if _read_asked(store) is not None:
+        # No run with a date, or no such column to group by.
+        with contextlib.suppress(NoRunsError, ComparisonError):
+            renew_trend(store)
+
+
+def renew_trend(store: Store) -> Trend:
+    """Follow and write the trend with the options of the last time, or with those of `slip fleet trend`.
+
+    Raises:
+        NoRunsError, ComparisonError: as `follow_trend`.
+    """
+    by, threshold, limits = _read_asked(store) or (("dataset",), TREND_THRESHOLD, {})
+    trend = follow_trend(store, by, threshold=threshold, limits=limits)
+    write_trend(store, trend)
+    return trend
+
+
+def _read_asked(store: Store) -> tuple[Sequence[str], float, Mapping[str, float]] | None:
+    """Options of the trend that was made last; None where there is none, or it cannot be read."""
     path = store.root / TREND
     if not path.is_file():
-        return
+        return None
     try:
         asked = json.loads(read_bounded(path))["asked"]
         limits = {str(name): float(value) for name, value in asked["limits"].items()}
         by = [str(name) for name in asked["by"]]
         threshold = float(asked["threshold"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        return
+        return None
     if not all(math.isfinite(value) for value in (threshold, *limits.values())):
-        return
-    # No run with a date, or no such column to group by.
-    with contextlib.suppress(NoRunsError, ComparisonError):
-        write_trend(store, follow_trend(store, by, threshold=threshold, limits=limits))
+        return None
+    return by, threshold, limits

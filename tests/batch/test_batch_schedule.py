@@ -5,21 +5,26 @@ from __future__ import annotations
 import configparser
 import fcntl
 import os
+import re
 import shlex
 import shutil
 import subprocess
 import sys
+import types
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
+import yaml
 from batch_tools import HERE
 
-from pipeline.batch import BatchError, Nightly, parse_clock, print_units
+from pipeline.batch import BatchError
+from pipeline.batch.schedule import Nightly, parse_clock, print_units
 from pipeline.store import Store
 
 if TYPE_CHECKING:
-    from pipeline.batch import System
+    from pipeline.batch.schedule import System
 
 needs_flock = pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 
@@ -57,7 +62,7 @@ def cron_command(text: str) -> str:
     return command.replace("| logger --tag slip-batch", "")
 
 
-def run(command: list[str] | str, folder: Path | None) -> subprocess.CompletedProcess[str]:
+def run(command: list[str] | str, folder: Path | None, **variables: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(
         command,
         cwd=folder,
@@ -65,8 +70,41 @@ def run(command: list[str] | str, folder: Path | None) -> subprocess.CompletedPr
         capture_output=True,
         text=True,
         check=False,
-        env=os.environ | {"PYTHONPATH": str(HERE.parents[1])},
+        env=os.environ | {"PYTHONPATH": str(HERE.parents[1])} | variables,
     )
+
+
+def split_units(text: str) -> dict[str, str]:
+    """Each unit by the name of the file that it says to go to."""
+    _, *parts = re.split(r"^# ~/\.config/systemd/user/(\S+)$", text, flags=re.MULTILINE)
+    return dict(zip(parts[::2], parts[1::2], strict=True))
+
+
+def play_airflow(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Run a DAG: a stand-in for Airflow calls its tasks at once."""
+    asked: dict[str, object] = {}
+
+    def dag(**options: object) -> object:
+        asked.update(options)
+        return lambda body: body
+
+    airflow = types.ModuleType("airflow")
+    decorators = types.ModuleType("airflow.decorators")
+    decorators.dag = dag  # type: ignore[attr-defined]
+    decorators.task = lambda **_options: lambda body: body  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "airflow", airflow)
+    monkeypatch.setitem(sys.modules, "airflow.decorators", decorators)
+    exec(compile(text, "slip_batch.py", "exec"), {"__name__": "slip_batch"})  # noqa: S102 - what Airflow does
+    assert asked["schedule"] == "5 3 * * *"
+    assert asked["max_active_runs"] == 1
+
+
+def read_actions(text: str) -> str:
+    """The script that a runner of GitHub gives to the shell: expressions are put in their places before."""
+    job = yaml.safe_load(text)["jobs"]["batch"]
+    (step,) = job["steps"]
+    script: str = step["run"]
+    return re.sub(r"\$\{\{ '([^']*)' \}\}", lambda match: match[1], script)
 
 
 @needs_flock
@@ -108,13 +146,94 @@ def test_the_timer_catches_up_and_the_journal_hears(season: Path, tmp_path: Path
 @pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="there is no systemd here")
 def test_systemd_accepts_the_units(season: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    text = print_units(make_nightly(season, tmp_path), "systemd")
-    service, timer = text.split("# ~/.config/systemd/user/slip-batch.timer")
-    (tmp_path / "slip-batch.service").write_text(service)
-    (tmp_path / "slip-batch.timer").write_text(timer)
-    for name in ("slip-batch.service", "slip-batch.timer"):
+    nightly = replace(make_nightly(season, tmp_path), notify=NOTIFY)
+    units = split_units(print_units(nightly, "systemd"))
+    assert set(units) == {"slip-batch.service", "slip-batch.timer", "slip-batch-died.service"}
+    for name, text in units.items():
+        (tmp_path / name).write_text(text)
+    for name in units:
         checked = run(["systemd-analyze", "--user", "verify", str(tmp_path / name)], None)
         assert checked.returncode == 0, checked.stderr
+
+
+@needs_flock
+@pytest.mark.parametrize("system", ["airflow", "github"])
+def test_other_schedulers_run_the_same(
+    season: Path, tmp_path: Path, system: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nightly = make_nightly(season, tmp_path)
+    text = print_units(nightly, system)
+    if system == "airflow":
+        monkeypatch.setenv("PYTHONPATH", str(HERE.parents[1]))
+        play_airflow(text, monkeypatch)
+    else:
+        done = run(["sh", "-e", "-c", read_actions(text)], tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert Store(nightly.folder / "my results").runs() == ("season/a",)
+
+
+@needs_flock
+@pytest.mark.parametrize(("code", "fails"), [(0, False), (3, False), (1, True), (4, True)])
+def test_losses_do_not_fail_a_job_and_alerts_do(
+    code: int,
+    fails: bool,  # noqa: FBT001
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    nightly = end_with(code, tmp_path)
+    assert (
+        bool(run(["sh", "-e", "-c", read_actions(print_units(nightly, "github"))], None).returncode) is fails
+    )
+    if fails:
+        with pytest.raises(RuntimeError, match=f"exit code {code}"):
+            play_airflow(print_units(nightly, "airflow"), monkeypatch)
+    else:
+        play_airflow(print_units(nightly, "airflow"), monkeypatch)
+
+
+NOTIFY = 'cat >> "told of $SLIP_SUBJECT"'
+DIED = "told of slip batch was ended before it could say anything"
+
+
+def end_with(code: int | str, folder: Path) -> Nightly:
+    """A program that does nothing but end with this code, or be killed."""
+    return Nightly(
+        program=("/bin/sh", "-c", f"exit {code}" if isinstance(code, int) else f"kill -{code} $$"),
+        arguments=(),
+        folder=folder,
+        lock=folder / "lock",
+        hour=3,
+        minute=5,
+        notify=NOTIFY,
+    )
+
+
+@needs_flock
+@pytest.mark.parametrize("code", [0, 1, 3, 4, 2, "KILL"])
+def test_a_batch_that_could_say_nothing_is_told_all_the_same(code: int | str, tmp_path: Path) -> None:
+    nightly = end_with(code, tmp_path)
+    run(cron_command(print_units(nightly, "cron")), tmp_path)
+    is_dead = code in (2, "KILL")
+    assert (tmp_path / DIED).exists() is is_dead
+
+    units = split_units(print_units(nightly, "systemd"))
+    assert "OnFailure=slip-batch-died.service" in units["slip-batch.service"]
+    service = read_systemd(units["slip-batch-died.service"])["Service"]
+    # systemd starts it after every failure: not after 0 and 3.
+    condition = run(words_of(service["ExecCondition"]), tmp_path, MONITOR_EXIT_STATUS=str(code))
+    if code not in (0, 3):
+        assert (condition.returncode == 0) is is_dead
+    (tmp_path / DIED).unlink(missing_ok=True)
+    variables = re.findall(r"^Environment=(.*)$", units["slip-batch-died.service"], flags=re.MULTILINE)
+    set_to = dict(shlex.split(one)[0].split("=", 1) for one in variables)
+    assert run(words_of(service["ExecStart"]), tmp_path, **set_to).returncode == 0
+    assert (tmp_path / DIED).exists()
+
+
+def test_without_anybody_to_tell_there_is_no_unit_for_it(season: Path, tmp_path: Path) -> None:
+    text = print_units(make_nightly(season, tmp_path), "systemd")
+    assert set(split_units(text)) == {"slip-batch.service", "slip-batch.timer"}
+    assert "OnFailure" not in text
 
 
 def test_times_of_day_are_read() -> None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import ast
 import re
+import shlex
 import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.batch import BatchError, Nightly, print_units
+from pipeline.batch import BatchError
+from pipeline.batch.schedule import Nightly, print_units
 
 HOSTILE = (
     "a b",
@@ -122,7 +126,7 @@ def test_no_cron_ends_a_command_early_or_joins_backslashes(words: list[str], kee
     assert unescape_cron(line, keeps_backslash=keeps_backslash).endswith("| logger --tag slip-batch")
 
 
-@pytest.mark.parametrize("system", ["systemd", "cron"])
+@pytest.mark.parametrize("system", ["systemd", "cron", "airflow", "github"])
 @pytest.mark.parametrize(
     "bad", ["a\nExecStartPre=/bin/evil", "a\r* * * * * evil", "a\x85b", "a\x00b", "\udcff"]
 )
@@ -131,6 +135,23 @@ def test_what_cannot_stand_in_one_line_is_refused(system: str, bad: str) -> None
         with pytest.raises(BatchError, match="Rename") as caught:
             print_units(nightly, system)  # type: ignore[arg-type]
         assert "\n" not in str(caught.value)
+
+
+@settings(max_examples=200)
+@given(WORDS)
+def test_a_dag_and_a_workflow_hold_the_words_as_they_are(words: list[str]) -> None:
+    text = print_units(make_nightly([*words, "${{ secrets.X }}"]), "airflow")
+    (line,) = [line for line in text.split("\n") if line.startswith("COMMAND = ")]
+    found = ast.literal_eval(line.removeprefix("COMMAND = "))
+    assert found[found.index("batch") + 1 :] == ["run", *words, "${{ secrets.X }}"]
+
+    workflow = print_units(make_nightly([*words, "${{ secrets.X }}"]), "github")
+    script = yaml.safe_load(workflow)["jobs"]["batch"]["steps"][0]["run"]
+    expressions = re.findall(r"\$\{\{.*?\}\}", script)
+    assert set(expressions) <= {"${{ '${{' }}"}, "nothing of a name is an expression"
+    shell = re.sub(r"\$\{\{ '([^']*)' \}\}", lambda match: match[1], script)
+    found = shlex.split(shell.removesuffix(" || [ $? -eq 3 ]"))
+    assert found[found.index("batch") + 1 :] == ["run", *words, "${{ secrets.X }}"]
 
 
 def test_a_folder_that_ends_in_a_backslash_does_not_swallow_the_next_line() -> None:

@@ -52,6 +52,7 @@ def test_schedule_prints_units_of_this_folder(monkeypatch: pytest.MonkeyPatch, t
         "01:30",
     )
     assert code == 0
+    assert "--trend" not in run_slip("batch", "schedule", "logs", "--no-trend")[1]
     assert f"WorkingDirectory={tmp_path}" in out
-    assert f"{sys.executable} -P -m pipeline batch run logs --results results --jobs 4\n" in out
+    assert f"{sys.executable} -P -m pipeline batch run --trend logs --results results --jobs 4\n" in out
     assert "OnCalendar=*-*-* 01:30:00" in out

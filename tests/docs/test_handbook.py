@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"
 SYMPTOMS = sorted((ROOT / "docs" / "pages" / "symptoms").glob("[!i]*.md"))
-PROGRAMS = {"slip", "make", "python", "printf", "mkdir"}
+PROGRAMS = {"slip", "make", "python", "printf", "mkdir", "cat"}
 INLINE = re.compile(r"`(slip [a-z][^`]*)`")
 ROW = re.compile(r"^\| `([^|]*)` \|(.*)\|$", re.MULTILINE)
 
