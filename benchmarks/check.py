@@ -32,8 +32,8 @@ from motion_runs import as_run, make_scenario, tables_of, vehicle_of
 from pipeline.core import SlipError
 from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.datasets.check import Check, compare, find_usual_spread
+from pipeline.datasets.check_readings import ERRORS, RunReading
 from pipeline.datasets.check_sides import Sides, read_under, unite_effects
-from pipeline.datasets.stored_fits import ERRORS, RunReading
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.estimation.stored_diagnosis import find_diagnosis
 from pipeline.models.catalogue import find_effect

@@ -24,7 +24,7 @@ from measuring import read_rows
 from pipeline.core.arrays import Floats
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, Side, compare_sides
 from pipeline.datasets.check import find_usual_spread
-from pipeline.datasets.stored_fits import USUAL_LOGARITHMS
+from pipeline.datasets.check_readings import USUAL_LOGARITHMS
 from pipeline.models.catalogue import find_effect
 from pipeline.words.check import LIKELY
 

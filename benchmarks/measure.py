@@ -28,7 +28,8 @@ from rivals import describe_sections
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.compare import Question, compare_results
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
 from pipeline.store import Store
 
 CATEGORIES = (

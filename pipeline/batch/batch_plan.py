@@ -379,8 +379,8 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
     catalogue links them.
     """
-    from pipeline.datasets.over_runs import TREND  # noqa: PLC0415 - heavy
     from pipeline.datasets.prediction import FLEET  # noqa: PLC0415 - heavy
+    from pipeline.datasets.trend import TREND  # noqa: PLC0415 - heavy
     from pipeline.report import PAGES  # noqa: PLC0415 - heavy
 
     mirror.pull_index()

@@ -15,7 +15,7 @@ from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.datasets.compare import Question
+    from pipeline.datasets.compared_runs import Question
     from pipeline.datasets.pairs import Answer
     from pipeline.store import Store
 
@@ -62,9 +62,11 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.datasets.compare import Question, compare_results, summarize_answer  # noqa: PLC0415 - heavy
+    from pipeline.datasets.compare import compare_results  # noqa: PLC0415 - heavy
+    from pipeline.datasets.compared_runs import Question  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.words.comparison import summarize_answer  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
     is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
@@ -84,7 +86,7 @@ def compare(  # noqa: D417 - arguments document themselves
 def _compare_causes(
     store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
 ) -> int:
-    from pipeline.datasets.over_runs import find_causes, summarize_causes  # noqa: PLC0415 - heavy
+    from pipeline.datasets.causes import find_causes, summarize_causes  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
 
     causes = find_causes(store, question)
@@ -115,9 +117,12 @@ _MOST_PAIRS = 10
 
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     from pipeline.datasets import MEASURES  # noqa: PLC0415 - heavy
-    from pipeline.datasets.answer_lines import list_lines, title_line  # noqa: PLC0415 - heavy
-    from pipeline.datasets.compare import list_shown_notes  # noqa: PLC0415 - heavy
     from pipeline.datasets.pairs import compare_orders  # noqa: PLC0415 - heavy
+    from pipeline.words.comparison import (  # noqa: PLC0415 - heavy
+        list_lines,
+        list_shown_notes,
+        title_line,
+    )
 
     lines: list[str] = []
     title = ""
@@ -175,7 +180,7 @@ def _format_ends(row: Mapping[str, object]) -> str:
 
 def _format_pairs(answer: Answer, name: str) -> list[str]:
     """One line a pair, the surest first."""
-    from pipeline.datasets.answer_lines import list_pairs  # noqa: PLC0415 - heavy
+    from pipeline.words.comparison import list_pairs  # noqa: PLC0415 - heavy
 
     rows = [
         (
@@ -249,9 +254,8 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.deployments import ZONES  # noqa: PLC0415 - heavy
-    from pipeline.datasets.exchange import read_features  # noqa: PLC0415 - heavy
-    from pipeline.datasets.over_runs import draw_up_map  # noqa: PLC0415 - heavy
+    from pipeline.datasets.deployments import ZONES, draw_up_map  # noqa: PLC0415 - heavy
+    from pipeline.datasets.features import read_features  # noqa: PLC0415 - heavy
     from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -375,7 +379,7 @@ def _are_features(*paths: Path) -> bool:
 
 
 def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
-    from pipeline.datasets.exchange import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets.features import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
     write_features(merged, path)
@@ -406,8 +410,7 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.compare import gather_features  # noqa: PLC0415 - heavy
-    from pipeline.datasets.exchange import write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets.features import gather_features, write_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     features, notes = gather_features(Store(results))

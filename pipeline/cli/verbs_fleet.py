@@ -395,7 +395,7 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.over_runs import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
+    from pipeline.datasets.trend import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
     from pipeline.report.trend_page import write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 

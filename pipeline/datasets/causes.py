@@ -7,6 +7,7 @@ their squares over the sum of the roots, so the difference of RMS slip is additi
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
@@ -15,11 +16,25 @@ from itertools import combinations
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, format_share
+from pipeline.core import FEWEST_OF_SPREAD, finite_or_none, format_share, pick, pick_finite
 from pipeline.core.arrays import Floats
+from pipeline.datasets.compared_runs import (
+    ComparedRuns,
+    Question,
+    choose_runs,
+    find_material,
+    find_untested,
+    keep_runs,
+    note_untested,
+)
 from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
+from pipeline.datasets.prediction import fit_results
 from pipeline.datasets.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
 from pipeline.estimation.apportion import jackknife_ratio
+from pipeline.models.catalogue import list_effects, name_effect
+from pipeline.results.reading import CAUSE_NAMES
+from pipeline.store import Store
+from pipeline.store.stored_runs import NoRunsError, lack_runs
 
 _LEAST_SHOWN = 0.05
 """Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""
@@ -271,3 +286,150 @@ class Causes:
     names: Mapping[str, str]
     keys: tuple[str, ...]
     notes: tuple[str, ...]
+
+
+def read_budgets(compared: ComparedRuns) -> pl.DataFrame:
+    """Rows of the slip's budget of every run, with ``group``; no columns without runs."""
+    if not compared.manifests:
+        return pl.DataFrame()
+    return (
+        compared.scan("budget")
+        .filter(pl.col("quantity").cast(pl.String) == "slip")
+        .with_columns(pl.col("input", "kind").cast(pl.String))
+        .collect()
+        .join(compared.labels.select("run", "group"), on="run")
+    )
+
+
+def find_level_names(store: Store) -> dict[str, str]:
+    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
+    names_by_effect: dict[str, set[str]] = {}
+    # Without estimates effects have no levels.
+    with contextlib.suppress(NoRunsError):
+        for number in fit_results(store)[0].numbers:
+            names_by_effect.setdefault(number.effect, set()).add(number.name)
+    called = {
+        effect: name
+        for effect, names in names_by_effect.items()
+        for name in names
+        if names == {name} != {effect}
+    }
+    return called | CAUSE_NAMES
+
+
+def name_causes(level_names: Mapping[str, str]) -> dict[str, str]:
+    """What effects and the other causes of slip are called within a sentence, by their levels where known."""
+    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
+    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
+    return names | {effect: name.replace("_", " ") for effect, name in level_names.items()}
+
+
+_EFFECT = "effect"
+
+
+def find_causes(store: Store, question: Question) -> Causes:
+    """Compare the datasets of the results by cause; nothing is written.
+
+    Args:
+        store: the results.
+        question: what to compare; its input, if None, is the command if every run has a budget on it, else
+            the measured wheels.
+
+    Raises:
+        ComparisonError: ``nothing_to_compare``.
+        ComparisonError: ``no_such_column``, ``no_such_vehicle``, ``no_such_dataset``.
+    """
+    compared = find_material(store, question.by, trusted_only=True, tables=("budget", "estimates"))
+    compared = choose_runs(compared, question.vehicle, question.datasets)
+    rows = read_budgets(compared)
+    if rows.is_empty():
+        hint = "Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME."
+        what = "no run has a budget of its slip"
+        raise lack_runs("nothing_to_compare", what, store.root, hint, compared.notes)
+    on_command = rows.filter(pl.col("input") == "command")["run"].n_unique()
+    source = question.input or ("command" if on_command == rows["run"].n_unique() else "measured")
+    own = rows.filter(pl.col("input") == source)
+    compared = keep_runs(compared, own["run"].unique().to_list(), f"no budget of its slip on {source}")
+    if own.is_empty():
+        what = f"no run has a budget of its slip on {source}"
+        raise lack_runs("nothing_to_compare", what, store.root, "Choose the other input.")
+    untested = find_untested(compared, question)
+    budgets, differences = compare_causes(own, untested=untested)
+    keys = tuple(f"{run}/{manifest.key}" for run, manifest in sorted(compared.manifests.items()))
+    notes = (*compared.notes, *note_untested(untested))
+    return Causes(budgets, differences, source, find_level_names(store), keys, notes)
+
+
+def summarize_causes(causes: Causes) -> dict[str, object]:
+    """The JSON object of `slip compare --causes`."""
+    return {
+        "input": causes.input,
+        "budgets": [_summarize_budget(budget, causes.names) for budget in causes.budgets],
+        "differences": [
+            {
+                **pick(one, "a", "b", "total"),
+                "unit": "m/s",
+                "by_effect": [
+                    {
+                        _EFFECT: part.name,
+                        "name": causes.names.get(part.name, part.name),
+                        "difference": part.difference,
+                        **pick_finite(part, "low", "high", "p", "p_adjusted"),
+                    }
+                    for part in one.parts
+                ],
+                "unit_of_analysis": one.unit,
+                "note": one.note or None,
+                "sentence": format_difference(one, causes.names),
+            }
+            for one in causes.differences
+        ],
+        "notes": list(causes.notes),
+    }
+
+
+def _summarize_budget(budget: Budget, names: Mapping[str, str]) -> dict[str, object]:
+    numbers = {part.name: {"share": part.share, **pick_finite(part, "low", "high")} for part in budget.parts}
+    return {
+        **pick(budget, "dataset", "runs", "total"),
+        "unit": "m^2/s^2",
+        "rms": math.sqrt(budget.total),
+        "shares": [
+            {_EFFECT: part.name, "name": names.get(part.name, part.name), **numbers[part.name]}
+            for part in budget.parts
+            if part.kind == _EFFECT
+        ],
+        **{part.name: numbers[part.name] for part in budget.parts if part.kind != _EFFECT},
+        "unit_of_analysis": budget.unit,
+    }
+
+
+def format_difference(one: Difference, names: Mapping[str, str]) -> str:
+    """Text of a difference, with effects named by their levels."""
+    return one.describe({part.name: names.get(part.name, part.name) for part in one.parts})
+
+
+def tabulate_budgets(causes: Causes) -> pl.DataFrame:
+    """Shares of every cause in the slip of every dataset."""
+    rows = [
+        (one.dataset, one.runs, causes.names.get(part.name, part.name), part.share, finite_or_none(part.low),
+         finite_or_none(part.high), math.sqrt(one.total))
+        for one in causes.budgets
+        for part in one.parts
+    ]  # fmt: skip
+    numbers = dict.fromkeys(("share", "low", "high", "rms"), pl.Float64)
+    schema = {"dataset": pl.String, "runs": pl.Int64, "cause": pl.String, **numbers}
+    return pl.DataFrame(rows, schema=schema, orient="row")
+
+
+def tabulate_differences(causes: Causes) -> pl.DataFrame:
+    """Differences of every pair of datasets by cause."""
+    rows = [
+        (one.a, one.b, causes.names.get(part.name, part.name), part.difference, finite_or_none(part.low),
+         finite_or_none(part.high), finite_or_none(part.p), finite_or_none(part.p_adjusted), one.unit)
+        for one in causes.differences
+        for part in one.parts
+    ]  # fmt: skip
+    numbers = dict.fromkeys(("difference", "low", "high", "p", "p_adjusted"), pl.Float64)
+    texts = dict.fromkeys(("a", "b", "cause"), pl.String)
+    return pl.DataFrame(rows, schema={**texts, **numbers, "unit_of_analysis": pl.String}, orient="row")

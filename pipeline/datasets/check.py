@@ -16,8 +16,7 @@ from pipeline.core import NORMAL_95, finite_or_none, format_interval, format_sha
 from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
 from pipeline.datasets import ComparisonError
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
-from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
-from pipeline.datasets.stored_fits import (
+from pipeline.datasets.check_readings import (
     COMMANDED,
     COMMANDED_TURN,
     ERRORS,
@@ -29,6 +28,7 @@ from pipeline.datasets.stored_fits import (
     USUAL_LOGARITHMS,
     RunReading,
 )
+from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.models import write_text
 
 if TYPE_CHECKING:

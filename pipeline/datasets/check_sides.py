@@ -20,8 +20,7 @@ from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import read_bounded
 from pipeline.datasets import ComparisonError
 from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
-from pipeline.datasets.compared_runs import find_run_refusal
-from pipeline.datasets.stored_fits import (
+from pipeline.datasets.check_readings import (
     COMMANDED,
     LOGARITHMS,
     Label,
@@ -29,8 +28,9 @@ from pipeline.datasets.stored_fits import (
     list_labels,
     measure_slip,
     read_run,
-    read_runs,
 )
+from pipeline.datasets.compared_runs import find_run_refusal
+from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.models import format_model

@@ -1,6 +1,5 @@
-"""Comparison of deployments: tables, page, JSON of `slip compare`, and features to share."""
+"""Comparison of the datasets of the results: as driven, at equal driving, and as published."""
 
-import contextlib
 import itertools
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -8,31 +7,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, read_version
+from pipeline.core import FEWEST_OF_SPREAD
 from pipeline.core.arrays import Ints
 from pipeline.datasets import (
     OVER_RUNS,
     THIS_RUN,
-    add_measures,
-    find_unrelated,
-    gather_runs,
-    measure_difficulty,
     pool_runs,
     spread_windows,
 )
-from pipeline.datasets.answer_lines import list_lines
-from pipeline.datasets.causes import find_carriers
+from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
+    Question,
     can_read,
+    choose_input,
     choose_runs,
     find_material,
-    keep_runs,
-    read_digest,
+    find_untested,
+    measure_runs,
+    note_untested,
 )
 from pipeline.datasets.confidence import Interval
 from pipeline.datasets.equal_driving import Overlap, find_overlap, level_runs, measure_bins
-from pipeline.datasets.exchange import check_features, follow_published, read_limits
 from pipeline.datasets.pairs import (
     ABOUT_UNIT,
     AS_DRIVEN,
@@ -46,18 +42,14 @@ from pipeline.datasets.pairs import (
     View,
     bound_run,
     compare_groups,
-    compare_orders,
     tabulate_pairs,
 )
 from pipeline.datasets.pooled_tests import bound_levels
-from pipeline.datasets.prediction import fit_results
+from pipeline.datasets.published_chain import follow_published, read_limits
 from pipeline.datasets.rank_tests import connect_groups
-from pipeline.models.catalogue import list_effects, name_effect
-from pipeline.results.reading import CAUSE_NAMES
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.store import Store
-from pipeline.store.stored_runs import ANALYZE_FIRST, NoRunsError, lack_runs
-from schemas import Features
+from pipeline.store.stored_runs import ANALYZE_FIRST, lack_runs
 
 _FEWEST = 2
 
@@ -162,76 +154,12 @@ def _as_samples(rows: pl.DataFrame, value: str, ticks: Ints) -> Samples:
     )
 
 
-def list_shown_notes(answer: Answer) -> list[str]:
-    """The notes of an answer, less that on the plain test, which only the files have."""
-    return [note for note in answer.notes if note != NOT_VALID]
-
-
-def summarize_answer(answer: Answer) -> dict[str, object]:
-    """The JSON object of `slip compare`."""
-    return {
-        "input": answer.input,
-        "quantity": answer.quantity,
-        "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
-        "pairs": _list_pairs(answer.comparisons),
-        "answer": [vars(line) for line in list_lines(answer)],
-        "views": [
-            {
-                "input": view.input,
-                "quantity": view.quantity,
-                "levels": _list_rows(view.levels),
-                "pairs": _list_pairs(view.comparisons),
-            }
-            for view in answer.views
-        ],
-        "carried_by": [
-            {"input": name, "pair": sorted(pair), "by": by} for (name, pair), by in answer.carriers.items()
-        ],
-        "orders": [
-            vars(one) for one in compare_orders(answer.datasets.filter(pl.col("input") == answer.input))
-        ],
-        "notes": list(answer.notes),
-    }
-
-
-def _list_pairs(comparisons: pl.DataFrame) -> list[dict[str, object]]:
-    return _list_rows(comparisons.drop("run", "dataset", "vehicle", "terrain"))
-
-
-def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
-    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).to_dicts()
-
-
 _WINDOW_COLUMNS = {
     "run": pl.String,
     "input": pl.String,
     "suspect": pl.Boolean,
     "window_norm": pl.Float64,
 }
-NOT_VALID = (
-    "plain p (p_uncorrected) is the Mann-Whitney test of published work over all samples; it is not valid "
-    "here, because samples of one run are correlated"
-)
-
-
-@dataclass(frozen=True)
-class Question:
-    """Options of a comparison.
-
-    Attributes:
-        by: columns that define a dataset.
-        input: input u; None: both, the command first if every run has one.
-        as_published: compare the window norms of the published chain instead of the median slip modulus.
-        datasets: compare only these, each with every other; if empty all, and those of one vehicle with each
-            other.
-        vehicle: compare only runs of this vehicle; of any if empty.
-    """
-
-    by: tuple[str, ...] = ("dataset",)
-    input: str | None = None
-    as_published: bool = False
-    datasets: tuple[str, ...] = ()
-    vehicle: str = ""
 
 
 def compare_results(store: Store, question: Question) -> Answer:
@@ -418,19 +346,6 @@ def _find_overlaps(
     }
 
 
-def read_budgets(compared: ComparedRuns) -> pl.DataFrame:
-    """Rows of the slip's budget of every run, with ``group``; no columns without runs."""
-    if not compared.manifests:
-        return pl.DataFrame()
-    return (
-        compared.scan("budget")
-        .filter(pl.col("quantity").cast(pl.String) == "slip")
-        .with_columns(pl.col("input", "kind").cast(pl.String))
-        .collect()
-        .join(compared.labels.select("run", "group"), on="run")
-    )
-
-
 def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[str, frozenset[str]], str]:
     """The effect that carries the difference of two datasets as driven, in words; of diagnosed runs."""
     diagnosed = {run: one for run, one in compared.manifests.items() if can_read(one, "budget")}
@@ -444,83 +359,6 @@ def _find_carriers(compared: ComparedRuns, inputs: Sequence[str]) -> dict[tuple[
             cause = names.get(one.name, one.name.replace("_", " "))
             carriers[name, pair] = f"{cause} {one.difference:+.2g} m/s"
     return carriers
-
-
-def find_level_names(store: Store) -> dict[str, str]:
-    """Names of effects that the fleet model labels by their level, or by all candidate levels."""
-    names_by_effect: dict[str, set[str]] = {}
-    # Without estimates effects have no levels.
-    with contextlib.suppress(NoRunsError):
-        for number in fit_results(store)[0].numbers:
-            names_by_effect.setdefault(number.effect, set()).add(number.name)
-    called = {
-        effect: name
-        for effect, names in names_by_effect.items()
-        for name in names
-        if names == {name} != {effect}
-    }
-    return called | CAUSE_NAMES
-
-
-def name_causes(level_names: Mapping[str, str]) -> dict[str, str]:
-    """What effects and the other causes of slip are called within a sentence, by their levels where known."""
-    words = {effect.id: name_effect(effect.id) for effect in list_effects()}
-    names = {effect: name[:1].lower() + name[1:] for effect, name in words.items()}
-    return names | {effect: name.replace("_", " ") for effect, name in level_names.items()}
-
-
-def find_untested(compared: ComparedRuns, question: Question) -> frozenset[frozenset[str]]:
-    """Pairs of datasets without a test; none where datasets are named."""
-    return frozenset() if question.datasets else find_unrelated(compared.labels)
-
-
-def note_untested(untested: Collection[frozenset[str]]) -> list[str]:
-    """The note on pairs of datasets without a test."""
-    if not untested:
-        return []
-    first, second = sorted(min(untested, key=sorted))
-    pairs = f"{len(untested)} pairs" if len(untested) > 1 else "1 pair"
-    why = "of different vehicles"
-    return [f"{pairs} of datasets {why}: no test, unless named, as in: slip compare {first} {second}"]
-
-
-def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
-    """Comparable runs, all measures with one row per run and input, and notes."""
-    compared, runs, notes = _agree_on_scale(compared, _gather(compared))
-    if runs.is_empty():
-        return compared, runs, notes
-    scales = runs.unique("run").select("run", "length_scale")
-    vehicles = compared.labels.select("run", "mass", "squared_gyration").join(scales, on="run")
-    return compared, add_measures(runs, measure_difficulty(compared.scan("slip"), vehicles)), notes
-
-
-def _gather(compared: ComparedRuns) -> pl.DataFrame:
-    if not compared.manifests:
-        return pl.DataFrame()
-    return gather_runs(compared.scan("aggregates").collect(), compared.labels).filter(
-        pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
-    )
-
-
-def _agree_on_scale(
-    compared: ComparedRuns, runs: pl.DataFrame
-) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
-    """Exclude runs whose length scale differs from that of most runs: their moduli are not comparable."""
-    if runs.is_empty():
-        return compared, runs, []
-    scales = runs.unique("run")["length_scale"]
-    usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
-    valid = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
-    compared = keep_runs(
-        compared, valid, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
-    )
-    return compared, runs.filter(pl.col("run").is_in(valid)), [NOT_VALID]
-
-
-def choose_input(runs: pl.DataFrame) -> str:
-    """Default input u: the command if every run has one, else the measured wheels."""
-    on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
-    return "command" if on_command == runs["run"].n_unique() else "measured"
 
 
 def _doubt_commands(compared: ComparedRuns) -> list[str]:
@@ -614,34 +452,3 @@ def _tabulate_windows(samples: Mapping[str, Samples], input_name: str) -> pl.Laz
         for run, own in samples.items()
     ]
     return pl.concat(frames).lazy() if frames else pl.LazyFrame(schema=_WINDOW_COLUMNS)
-
-
-_HASH = 64
-
-
-def gather_features(store: Store) -> tuple[pl.DataFrame, tuple[str, ...]]:
-    """The table `features` of the results, and notes on excluded runs.
-
-    Raises:
-        ComparisonError: ``nothing_to_share``.
-        ComparisonError: ``bad_features``: a value is out of range.
-    """
-    compared, runs, comments = measure_runs(find_material(store, ("dataset",), trusted_only=True))
-    digests = {run: read_digest(manifest) for run, manifest in compared.manifests.items()}
-    nameless = sorted(run for run, digest in digests.items() if len(digest) != _HASH)
-    notes = [*compared.notes, *comments[1:]]
-    if nameless:
-        notes.append(f"left out, the hash of the log is not known: {', '.join(nameless)}")
-    known = runs.filter(~pl.col("run").is_in(nameless)) if not runs.is_empty() else runs
-    if known.is_empty():
-        raise lack_runs("nothing_to_share", "there is no run to share", store.root, ANALYZE_FIRST, notes)
-    schema = Features.create_empty().schema
-    shared = known.with_columns(
-        pl.col("run").replace_strict(digests, return_dtype=pl.String).alias("sha256"),
-        pl.col("input").cast(pl.String),
-        pl.lit(read_version()).alias("made_by"),
-        pl.col("key").alias("from_results"),
-        (pl.col("mass") * pl.col("squared_gyration")).alias("inertia"),
-    ).with_columns(pl.col("sha256").str.slice(0, 16).alias("run"))
-    typed = shared.select(pl.col(name).cast(kind) for name, kind in schema.items())
-    return check_features(typed.sort("sha256", "input"), str(store.root)), tuple(notes)

@@ -1,12 +1,20 @@
 """Selection of the runs of the results that can be compared, with the reasons for exclusions."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import polars as pl
 
 from pipeline.core import guess_names
-from pipeline.datasets import ComparisonError, label_runs
+from pipeline.datasets import (
+    ComparisonError,
+    add_measures,
+    find_unrelated,
+    gather_runs,
+    label_runs,
+    measure_difficulty,
+)
 from pipeline.estimation.stored_diagnosis import DIAGNOSED
 from pipeline.models.catalogue import list_effects
 from pipeline.results.reading import find_refusal, read_findings
@@ -326,3 +334,83 @@ def _square_gyration(vehicle: Mapping[str, object]) -> float | None:
     sides = [vehicle.get(name) for name in ("track_width_m", "wheelbase_m")]
     known = [float(side) for side in sides if isinstance(side, (int, float))]
     return (known[0] ** 2 + known[-1] ** 2) / 12.0 if known else None
+
+
+NOT_VALID = (
+    "plain p (p_uncorrected) is the Mann-Whitney test of published work over all samples; it is not valid "
+    "here, because samples of one run are correlated"
+)
+
+
+@dataclass(frozen=True)
+class Question:
+    """Options of a comparison.
+
+    Attributes:
+        by: columns that define a dataset.
+        input: input u; None: both, the command first if every run has one.
+        as_published: compare the window norms of the published chain instead of the median slip modulus.
+        datasets: compare only these, each with every other; if empty all, and those of one vehicle with each
+            other.
+        vehicle: compare only runs of this vehicle; of any if empty.
+    """
+
+    by: tuple[str, ...] = ("dataset",)
+    input: str | None = None
+    as_published: bool = False
+    datasets: tuple[str, ...] = ()
+    vehicle: str = ""
+
+
+def find_untested(compared: ComparedRuns, question: Question) -> frozenset[frozenset[str]]:
+    """Pairs of datasets without a test; none where datasets are named."""
+    return frozenset() if question.datasets else find_unrelated(compared.labels)
+
+
+def note_untested(untested: Collection[frozenset[str]]) -> list[str]:
+    """The note on pairs of datasets without a test."""
+    if not untested:
+        return []
+    first, second = sorted(min(untested, key=sorted))
+    pairs = f"{len(untested)} pairs" if len(untested) > 1 else "1 pair"
+    why = "of different vehicles"
+    return [f"{pairs} of datasets {why}: no test, unless named, as in: slip compare {first} {second}"]
+
+
+def measure_runs(compared: ComparedRuns) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
+    """Comparable runs, all measures with one row per run and input, and notes."""
+    compared, runs, notes = _agree_on_scale(compared, _gather(compared))
+    if runs.is_empty():
+        return compared, runs, notes
+    scales = runs.unique("run").select("run", "length_scale")
+    vehicles = compared.labels.select("run", "mass", "squared_gyration").join(scales, on="run")
+    return compared, add_measures(runs, measure_difficulty(compared.scan("slip"), vehicles)), notes
+
+
+def _gather(compared: ComparedRuns) -> pl.DataFrame:
+    if not compared.manifests:
+        return pl.DataFrame()
+    return gather_runs(compared.scan("aggregates").collect(), compared.labels).filter(
+        pl.col("median_modulus").is_not_null(), pl.col("median_modulus").is_finite()
+    )
+
+
+def _agree_on_scale(
+    compared: ComparedRuns, runs: pl.DataFrame
+) -> tuple[ComparedRuns, pl.DataFrame, list[str]]:
+    """Exclude runs whose length scale differs from that of most runs: their moduli are not comparable."""
+    if runs.is_empty():
+        return compared, runs, []
+    scales = runs.unique("run")["length_scale"]
+    usual = float(np.min(scales.drop_nulls().mode().to_numpy()))
+    valid = runs.filter(pl.col("length_scale") == usual)["run"].unique().to_list()
+    compared = keep_runs(
+        compared, valid, f"its length scale is not the {usual:g} m of most runs, or it has no slip"
+    )
+    return compared, runs.filter(pl.col("run").is_in(valid)), [NOT_VALID]
+
+
+def choose_input(runs: pl.DataFrame) -> str:
+    """Default input u: the command if every run has one, else the measured wheels."""
+    on_command = runs.filter(pl.col("input") == "command")["run"].n_unique()
+    return "command" if on_command == runs["run"].n_unique() else "measured"

@@ -2,6 +2,7 @@
 
 import re
 import tomllib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,7 +10,9 @@ import polars as pl
 
 from pipeline.core import naming_os_errors
 from pipeline.core.untrusted import format_csv, read_bounded_text, unquote_formulas
-from pipeline.datasets import ComparisonError, Measure
+from pipeline.datasets import MEASURES, ComparisonError, Measure, pool_runs
+from pipeline.datasets.compared_runs import choose_input, find_material, measure_runs, read_digest
+from pipeline.store import Store
 from schemas import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.
@@ -334,3 +337,79 @@ def _join(tables: list[pl.DataFrame], where: str) -> pl.DataFrame:
 
 def _refuse(what: str, where: str, hint: str) -> ComparisonError:
     return ComparisonError("bad_deployments", what, where=where, hint=hint)
+
+
+_SHARED = " (shared)"
+
+
+def draw_up_map(
+    store: Store,
+    table: Path | None = None,
+    *,
+    fed: str | None = None,
+    show: str = "slip",
+    shared: pl.DataFrame | None = None,
+) -> DeploymentMap:
+    """Map the deployments of the literature and the datasets of the results.
+
+    Args:
+        store: the results; may be empty.
+        table: a table of deployments; by default the project's own.
+        fed: input u; None: as `compare_results` chooses it.
+        show: key of `MEASURES` for the colour of the datasets.
+        shared: table `features` of others; runs of the results' own logs are dropped from it.
+
+    Raises:
+        ComparisonError: the table does not exist or violates its schema.
+    """
+    deployments = read_deployments(table or find_own_table())
+    compared, runs, _ = measure_runs(find_material(store, ("dataset",), trusted_only=True))
+    chosen = fed or ("command" if runs.is_empty() else choose_input(runs))
+    own, notes = _empty_own(), list(compared.notes)
+    keys: tuple[str, ...] = ()
+    parts = [] if runs.is_empty() else [pool_runs(runs, ("dataset",))]
+    own_logs = [read_digest(manifest) for manifest in compared.manifests.values()]
+    if shared is not None:
+        parts.append(_pool_shared(shared, own_logs))
+    if parts:
+        pooled = pl.concat(
+            [part.with_columns(pl.col("input").cast(pl.String)) for part in parts], how="diagonal"
+        )
+        datasets = pooled.filter(pl.col("input") == chosen).sort("dataset")
+        missing = sorted(set(pooled["dataset"]) - set(datasets["dataset"]))
+        notes += (
+            [f"not on the map, because there is no {chosen} input: {', '.join(missing)}"] if missing else []
+        )
+        own, comments = rank_datasets(datasets, MEASURES[show].column)
+        notes += comments
+        if shared is not None:
+            notes.append(_count_shared(shared, own_logs, own))
+        keys = tuple(f"{row['dataset']}: {row['keys']}" for row in datasets.iter_rows(named=True))
+    return DeploymentMap(
+        deployments, rank_deployments(deployments), own, keys, tuple(notes), chosen, MEASURES[show]
+    )
+
+
+def _pool_shared(features: pl.DataFrame, own: Sequence[str]) -> pl.DataFrame:
+    others = features.filter(~pl.col("sha256").is_in(list(own))).with_columns(
+        pl.format("{}" + _SHARED, "dataset").alias("group"),
+        pl.col("from_results").alias("key"),
+        pl.lit(None, pl.Float64).alias("published_norm"),
+        pl.lit(None, pl.Float64).alias("equal_modulus"),
+    )
+    return pool_runs(others, ("dataset",))
+
+
+def _count_shared(features: pl.DataFrame, own_logs: Sequence[str], placed: pl.DataFrame) -> str:
+    """Text with the number of shared runs on the map."""
+    digests = features["sha256"].unique()
+    drawn = placed.filter(pl.col("dataset").str.ends_with(_SHARED))["runs"].sum()
+    twice = digests.is_in(list(own_logs)).sum()
+    known = f"; {twice} of them are of your own logs and count once" if twice else ""
+    return f"{drawn} of {digests.len()} shared runs drawn{known}"
+
+
+def _empty_own() -> pl.DataFrame:
+    texts, numbers = ("dataset", "vehicle", "terrain", "zone"), ("energy", "complexity", "value")
+    schema = dict.fromkeys(texts, pl.String()) | dict.fromkeys(numbers, pl.Float64()) | {"runs": pl.Int64()}
+    return pl.DataFrame(schema=pl.Schema(schema))

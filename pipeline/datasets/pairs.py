@@ -12,7 +12,7 @@ import polars.selectors as cs
 
 from pipeline.core import CONFIDENCE, pick
 from pipeline.core.arrays import Floats, Ints
-from pipeline.core.untrusted import format_csv, number_in
+from pipeline.core.untrusted import number_in
 from pipeline.datasets import MEASURES
 from pipeline.datasets.confidence import (
     Blocks,
@@ -312,58 +312,6 @@ def _note_scatter(a: Floats, b: Floats) -> list[str]:
     return ["one side has no variation"] if still else []
 
 
-_LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
-    "datasets": (
-        ("dataset", "dataset", 0),
-        ("runs", "runs", 0),
-        ("samples", "samples", 0),
-        ("distance", "distance [m]", 0),
-        ("median_modulus", "median $\\|g\\|$ [m/s]", 3),
-        ("low", "low", 3),
-        ("high", "high", 3),
-        ("equal_modulus", "at equal driving [m/s]", 3),
-        ("median_window_norm", "window norm [m/s]", 2),
-        ("published_norm", "as published", 2),
-    ),
-    "comparisons": (
-        ("a", "a", 0),
-        ("b", "b", 0),
-        ("unit_of_analysis", "unit", 0),
-        ("ratio", "$b/a$", 2),
-        ("ratio_low", "low", 2),
-        ("ratio_high", "high", 2),
-        ("shift", "shift [m/s]", 3),
-        ("cliffs_delta", "$\\delta$", 2),
-        ("p", "$p$", 4),
-        ("p_adjusted", "$p$ corrected", 4),
-        ("smallest_p", "smallest $p$", 4),
-    ),
-    "causes": (
-        ("dataset", "dataset", 0),
-        ("runs", "runs", 0),
-        ("cause", "cause", 0),
-        ("share", "share", 3),
-        ("low", "low", 3),
-        ("high", "high", 3),
-        ("rms", "slip [m/s]", 3),
-    ),
-    "cause_differences": (
-        ("a", "a", 0),
-        ("b", "b", 0),
-        ("cause", "cause", 0),
-        ("difference", "difference [m/s]", 3),
-        ("low", "low", 3),
-        ("high", "high", 3),
-        ("p_adjusted", "$p$ corrected", 4),
-    ),
-}
-_SPECIAL = {mark: rf"\{mark}" for mark in "&%$#_{}"} | {
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "\\": r"\textbackslash{}",
-}
-
-
 def tabulate_pairs(
     pairs: Sequence[Pair], *, by: Sequence[str], input_name: str, quantity: str, keys: Mapping[str, str]
 ) -> pl.DataFrame:
@@ -425,47 +373,6 @@ def judge_pair(row: Mapping[str, object]) -> str:
     if adjusted <= LEVEL:
         return DIFFERENT if row["unit_of_analysis"] == RUNS else OF_TWO_RUNS
     return ALIKE if smallest <= LEVEL else UNTESTED
-
-
-def write_csv(frame: pl.DataFrame) -> str:
-    """Format a table as CSV with a header line; six decimal places."""
-    return format_csv(frame, digits=6)
-
-
-def write_latex(name: str, frame: pl.DataFrame) -> str:
-    """Format the columns of a table that a paper shows as a LaTeX tabular (booktabs).
-
-    Columns without values are omitted.
-
-    Args:
-        name: `datasets`, `comparisons`, `causes` or `cause_differences`.
-        frame: the table.
-    """
-    columns = [
-        column for column in _LATEX[name] if frame.is_empty() or frame[column[0]].null_count() < frame.height
-    ]
-    kinds = "".join("l" if frame.schema[column] in (pl.String, pl.Enum) else "r" for column, _, _ in columns)
-    lines = [
-        f"\\begin{{tabular}}{{{kinds}}}",
-        "\\toprule",
-        " & ".join(title for _, title, _ in columns) + " \\\\",
-        "\\midrule",
-        *(
-            " & ".join(_write_cell(row[column], digits) for column, _, digits in columns) + " \\\\"
-            for row in frame.iter_rows(named=True)
-        ),
-        "\\bottomrule",
-        "\\end{tabular}",
-    ]
-    return "\n".join(lines) + "\n"
-
-
-def _write_cell(value: object, digits: int) -> str:
-    if value is None:
-        return "--"
-    if isinstance(value, float):
-        return f"{value:.{digits}f}"
-    return "".join(_SPECIAL.get(mark, mark) for mark in str(value))
 
 
 ABOUT_UNIT = (

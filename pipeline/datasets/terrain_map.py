@@ -14,8 +14,7 @@ import polars as pl
 from pipeline.core import SlipError, finite_or_none, format_share
 from pipeline.core.arrays import Floats, interpolate_linearly
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.compare import measure_runs
-from pipeline.datasets.compared_runs import find_material
+from pipeline.datasets.compared_runs import find_material, measure_runs
 from pipeline.datasets.terrain import (
     CELL_M,
     LARGEST_CELL_M,

@@ -10,13 +10,16 @@ from typing import TYPE_CHECKING
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, pick, suffix_unit
-from pipeline.datasets import UNKNOWN
+from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, guess_names, pick, suffix_unit
+from pipeline.datasets import UNKNOWN, ComparisonError, gather_runs
+from pipeline.datasets.compared_runs import ComparedRuns, find_material
 from pipeline.datasets.forecast import leave_out_odd, list_numbers
 from pipeline.datasets.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.datasets.rank_tests import LEVEL
-from pipeline.models.catalogue import find_effect
+from pipeline.models.catalogue import find_effect, list_effects
 from pipeline.models.parameter import UNDETERMINED, Level, cut_interval
+from pipeline.store import Store
+from pipeline.store.stored_runs import lack_runs
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -490,3 +493,189 @@ class Trend:
     keys: tuple[str, ...]
     notes: tuple[str, ...]
     asked: Mapping[str, object]
+
+
+TREND = "trend.json"
+
+
+_SLIP = {
+    "median_modulus": "m/s",
+    "median_window_norm": "m/s",
+    "steady_median_modulus": "m/s",
+    "transitory_median_modulus": "m/s",
+}
+
+
+_HEALTH = ("warnings", "suspect share")
+
+
+_FINDING = "finding "
+
+
+def check_limits(limits: Mapping[str, float]) -> None:
+    """Refuse limits on quantities that no run can have.
+
+    Parameters of the catalogue and findings are accepted before a run has them, as a nightly check needs.
+
+    Raises:
+        ComparisonError: ``no_such_quantity``.
+    """
+    slip = [name + suffix for name in _SLIP for suffix in ("", *(f" ({source})" for source in INPUT_WORDS))]
+    parameters = [f"{effect.id}.{one.name}" for effect in list_effects() for one in effect.parameters]
+    known = [*slip, *_HEALTH, *parameters]
+    for name in limits:
+        if name not in known and not name.startswith(_FINDING):
+            hint = (
+                f"{guess_names(name, known)}There are {', '.join([*_SLIP, *_HEALTH])}, findings "
+                "(as 'finding heading_skew') and parameters of effects (as effective_track.k)."
+            )
+            raise ComparisonError("no_such_quantity", f"{name!r} in --limit is not a quantity", hint=hint)
+
+
+def follow_trend(store: Store, by: Sequence[str], *, threshold: float, limits: Mapping[str, float]) -> Trend:
+    """Analyze trends over dates: of every quantity by group, and of every parameter by vehicle.
+
+    Slip comes from the tables `aggregates`, parameters from the diagnoses' tables `estimates`, data health
+    from findings (their values, and the number of warnings per run) and from the fraction of suspect samples.
+
+    Args:
+        store: the results.
+        by: columns that define a group, for example `vehicle`; parameters are grouped by vehicle.
+        threshold: relative step of slip or health that raises an alert.
+        limits: largest allowed value of the last run, by quantity.
+
+    Raises:
+        ComparisonError: ``nothing_to_follow``: no run has a date.
+        ComparisonError: ``no_such_column``.
+    """
+    compared = find_material(store, by, trusted_only=False, optional=("findings", "estimates"))
+    dated = compared.labels.filter(pl.col("day").is_not_null()).sort("day", "start", "run")
+    followed = set(dated["run"])
+    undated = sorted(set(compared.manifests) - followed)
+    notes = [*compared.notes, *(note for note in compared.date_notes if note not in compared.notes)]
+    if undated:
+        notes.append(f"left out, because no date is known: {', '.join(undated)}")
+    refused = sorted(compared.refusals.items())
+    notes += [f"slip of {run} left out, {why}" for run, why in refused if run in followed]
+    if dated.is_empty():
+        hint = "Analyze logs whose clock was set, or put the date into their names (2026-05-03)."
+        raise lack_runs("nothing_to_follow", "there is no run with a date", store.root, hint, notes)
+    dated = dated.with_row_index("order").with_columns(pl.col("order").cast(pl.Int64))
+    values = (
+        dated.select("run", "group", "day", "order")
+        .join(pl.concat([_read_slip(compared), _read_health(compared)]), on="run")
+        .filter(pl.col("value").is_finite())
+        .sort("order")
+    )
+    series = follow_quantities(values)
+    estimates = compared.read_estimates().filter(pl.col("run").is_in(dated["run"].to_list()))
+    days = dated.select("order", "run", "day")
+    parameters = follow_parameters(estimates, days, level=LEVEL / 2)
+    latest = find_latest(estimates, days)
+    notes += _note_what_lacks(series, parameters)
+    alerts = raise_alerts(
+        series, parameters, latest, vehicles=_find_vehicles(dated), threshold=threshold, limits=limits
+    )
+    numbers = latest.select(pl.format("{}.{}", "effect", "parameter")).to_series()
+    names = [*(one.quantity for one in series), *numbers]
+    known = {*names, *(name.split(" (")[0] for name in names)}
+    missing = [name for name in limits if name not in known]
+    notes[:0] = [f"the limit on {name} is not checked: no run has this quantity" for name in missing]
+    keys = tuple(f"{run}/{compared.manifests[run].key}" for run in dated["run"])
+    asked = {"by": list(by), "threshold": threshold, "limits": dict(limits)}
+    return Trend(tuple(series), parameters, tuple(alerts), keys, tuple(notes), asked)
+
+
+def _find_vehicles(dated: pl.DataFrame) -> dict[str, str]:
+    """The vehicle of each group that has only one."""
+    groups = dated.group_by("group").agg(pl.col("vehicle").unique())
+    return {group: vehicles[0] for group, vehicles in groups.iter_rows() if len(vehicles) == 1}
+
+
+def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> list[str]:
+    """Notes on groups and vehicles with too few runs to detect a change, and on outlying runs."""
+    longest: dict[str, int] = {}
+    for one in series:
+        longest[one.group] = max(longest.get(one.group, 0), one.points.height)
+    short = sorted(group for group, runs in longest.items() if runs < FEWEST_RUNS)
+    notes = []
+    if short:
+        notes.append(f"too few runs to detect a change of slip, {FEWEST_RUNS} are needed: {', '.join(short)}")
+    needs: dict[str, list[str]] = {}
+    lost: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for number in parameters:
+        if number.undetermined:
+            lost.setdefault((number.vehicle, number.undetermined), []).append(number.label)
+        if number.need:
+            needs.setdefault(f"{number.vehicle}, {format_power(number)}", []).append(number.label)
+        if number.odd:
+            notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
+    notes += [
+        f"{', '.join(labels)} of {vehicle}, left out where a run does not determine it: {', '.join(runs)}"
+        for (vehicle, runs), labels in lost.items()
+    ]
+    return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
+
+
+def summarize_trend(trend: Trend) -> dict[str, object]:
+    """The JSON object of `slip fleet trend`."""
+    return {
+        "alerts": [vars(alert) for alert in trend.alerts],
+        "series": [
+            {
+                **pick(one, "group", "quantity", "unit"),
+                "points": one.points.drop("order").to_dicts(),
+                "changes": [step.describe(format_step(one, step)) for step in one.steps],
+            }
+            for one in trend.series
+        ],
+        "parameters": [summarize_parameter(one) for one in trend.parameters],
+        "notes": list(trend.notes),
+    }
+
+
+def _read_slip(compared: ComparedRuns) -> pl.DataFrame:
+    sound = compared.labels.filter(~pl.col("run").is_in(list(compared.refusals)))
+    runs = gather_runs(compared.scan("aggregates").collect(), sound)
+    long = runs.unpivot(list(_SLIP), index=["run", "input"], variable_name="quantity", value_name="value")
+    return long.drop_nulls("value").select(
+        "run",
+        pl.format("{} ({})", "quantity", pl.col("input").cast(pl.String)).alias("quantity"),
+        pl.col("quantity").replace_strict(_SLIP, return_dtype=pl.String).alias("unit"),
+        "value",
+    )
+
+
+def _read_health(compared: ComparedRuns) -> pl.DataFrame:
+    """Values of findings, number of warnings, and fraction of suspect samples of every run."""
+    findings = compared.scan("findings").select("run", "id", "severity", "value").collect()
+    counts = (
+        findings.drop_nulls("value")
+        .group_by("run", "id")
+        .agg(pl.col("value").mean())
+        .select(
+            "run",
+            pl.concat_str(pl.lit(_FINDING), "id").alias("quantity"),
+            pl.lit("").alias("unit"),
+            "value",
+        )
+    )
+    warnings = findings.filter(pl.col("severity") != "info").group_by("run").len()
+    counted = (
+        pl.DataFrame({"run": list(compared.manifests)}, schema={"run": pl.String})
+        .join(warnings, on="run", how="left")
+        .select(
+            "run",
+            pl.lit(_HEALTH[0]).alias("quantity"),
+            pl.lit("1").alias("unit"),
+            pl.col("len").fill_null(0).cast(pl.Float64).alias("value"),
+        )
+    )
+    suspect = (
+        compared.scan("slip")
+        .group_by("run")
+        .agg(pl.col("suspect").mean().alias("value"))
+        .select("run", pl.lit(_HEALTH[1]).alias("quantity"), pl.lit("1").alias("unit"), "value")
+        .collect()
+    )
+    return pl.concat([counts, counted, suspect])

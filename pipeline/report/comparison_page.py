@@ -8,9 +8,8 @@ from pathlib import Path
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, FigureFormat, format_duration
+from pipeline.core.untrusted import format_csv
 from pipeline.datasets import MEASURES, THIS_RUN
-from pipeline.datasets.answer_lines import Line, list_lines, list_pairs, title_line
-from pipeline.datasets.compare import list_shown_notes
 from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
 from pipeline.datasets.pairs import (
     ABOUT_BLOCKS,
@@ -24,8 +23,6 @@ from pipeline.datasets.pairs import (
     View,
     compare_orders,
     judge_pair,
-    write_csv,
-    write_latex,
 )
 from pipeline.datasets.rank_tests import kendall_tau, list_swaps
 from pipeline.report import (
@@ -44,6 +41,7 @@ from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
 from pipeline.store import Store
+from pipeline.words.comparison import Line, list_lines, list_pairs, list_shown_notes, title_line
 
 _ROW_HEIGHT = 34
 _GUTTER = 210
@@ -517,3 +515,98 @@ def write_tables(store: Store, name: str, frame: pl.DataFrame, shown: pl.DataFra
     """Write a table as CSV and the rows for a paper as LaTeX; return the files by name."""
     texts = {f"{name}.csv": write_csv(frame), f"{name}.tex": write_latex(name, shown)}
     return {file: store.write_results_text(file, text) for file, text in texts.items()}
+
+
+def write_csv(frame: pl.DataFrame) -> str:
+    """Format a table as CSV with a header line; six decimal places."""
+    return format_csv(frame, digits=6)
+
+
+def write_latex(name: str, frame: pl.DataFrame) -> str:
+    """Format the columns of a table that a paper shows as a LaTeX tabular (booktabs).
+
+    Columns without values are omitted.
+
+    Args:
+        name: `datasets`, `comparisons`, `causes` or `cause_differences`.
+        frame: the table.
+    """
+    columns = [
+        column for column in _LATEX[name] if frame.is_empty() or frame[column[0]].null_count() < frame.height
+    ]
+    kinds = "".join("l" if frame.schema[column] in (pl.String, pl.Enum) else "r" for column, _, _ in columns)
+    lines = [
+        f"\\begin{{tabular}}{{{kinds}}}",
+        "\\toprule",
+        " & ".join(title for _, title, _ in columns) + " \\\\",
+        "\\midrule",
+        *(
+            " & ".join(_write_cell(row[column], digits) for column, _, digits in columns) + " \\\\"
+            for row in frame.iter_rows(named=True)
+        ),
+        "\\bottomrule",
+        "\\end{tabular}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+_LATEX: dict[str, tuple[tuple[str, str, int], ...]] = {
+    "datasets": (
+        ("dataset", "dataset", 0),
+        ("runs", "runs", 0),
+        ("samples", "samples", 0),
+        ("distance", "distance [m]", 0),
+        ("median_modulus", "median $\\|g\\|$ [m/s]", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("equal_modulus", "at equal driving [m/s]", 3),
+        ("median_window_norm", "window norm [m/s]", 2),
+        ("published_norm", "as published", 2),
+    ),
+    "comparisons": (
+        ("a", "a", 0),
+        ("b", "b", 0),
+        ("unit_of_analysis", "unit", 0),
+        ("ratio", "$b/a$", 2),
+        ("ratio_low", "low", 2),
+        ("ratio_high", "high", 2),
+        ("shift", "shift [m/s]", 3),
+        ("cliffs_delta", "$\\delta$", 2),
+        ("p", "$p$", 4),
+        ("p_adjusted", "$p$ corrected", 4),
+        ("smallest_p", "smallest $p$", 4),
+    ),
+    "causes": (
+        ("dataset", "dataset", 0),
+        ("runs", "runs", 0),
+        ("cause", "cause", 0),
+        ("share", "share", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("rms", "slip [m/s]", 3),
+    ),
+    "cause_differences": (
+        ("a", "a", 0),
+        ("b", "b", 0),
+        ("cause", "cause", 0),
+        ("difference", "difference [m/s]", 3),
+        ("low", "low", 3),
+        ("high", "high", 3),
+        ("p_adjusted", "$p$ corrected", 4),
+    ),
+}
+
+
+def _write_cell(value: object, digits: int) -> str:
+    if value is None:
+        return "--"
+    if isinstance(value, float):
+        return f"{value:.{digits}f}"
+    return "".join(_SPECIAL.get(mark, mark) for mark in str(value))
+
+
+_SPECIAL = {mark: rf"\{mark}" for mark in "&%$#_{}"} | {
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "\\": r"\textbackslash{}",
+}

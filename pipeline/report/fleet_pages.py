@@ -14,10 +14,16 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, FigureFormat, format_share, suffix_unit
 from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.datasets.causes import Budget, Causes, Difference
-from pipeline.datasets.compare import name_causes
+from pipeline.datasets.causes import (
+    Budget,
+    Causes,
+    Difference,
+    format_difference,
+    name_causes,
+    tabulate_budgets,
+    tabulate_differences,
+)
 from pipeline.datasets.forecast import FleetModel
-from pipeline.datasets.over_runs import format_difference, tabulate_budgets, tabulate_differences
 from pipeline.datasets.prediction import FLEET, fit_results, summarize_fleet, tabulate_fleet
 from pipeline.datasets.terrain import SHARE_DIGITS, PassEffect, TerrainMap
 from pipeline.datasets.terrain_map import GEOJSON, PAGE, list_features

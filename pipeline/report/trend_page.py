@@ -16,16 +16,18 @@ from pipeline.core import TREND_THRESHOLD
 from pipeline.core.arrays import Floats
 from pipeline.core.untrusted import read_bounded
 from pipeline.datasets import WHISKER_REACH, ComparisonError
-from pipeline.datasets.over_runs import TREND, follow_trend, summarize_trend
 from pipeline.datasets.trend import (
+    TREND,
     ParameterTrend,
     Series,
     Trend,
+    follow_trend,
     format_change,
     format_power,
     format_quiet,
     format_step,
     name_quantity,
+    summarize_trend,
 )
 from pipeline.models.catalogue import name_parameter
 from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme

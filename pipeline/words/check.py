@@ -10,7 +10,7 @@ from xml.etree import ElementTree as ET
 from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
 from pipeline.datasets.changes import Change
 from pipeline.datasets.check import Check, find_pace
-from pipeline.datasets.stored_fits import (
+from pipeline.datasets.check_readings import (
     ERRORS,
     HEADING_ERROR,
     LOGARITHMS,

@@ -11,7 +11,7 @@ import pytest
 import pipeline
 from pipeline.core.untrusted import format_csv, unquote_formulas
 from pipeline.datasets.deployments import find_own_table, read_deployments, write_deployments
-from pipeline.datasets.pairs import write_csv
+from pipeline.report.comparison_page import write_csv
 
 TEXTS = ["=1+1", "+1", "-x", "@x", "\tx", "\rx", "\nx", "\uff1d1", "'=1", "''=1"]
 PLAIN = ["", "a=b", "'x", "x-y", " =1", None]

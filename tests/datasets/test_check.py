@@ -23,8 +23,8 @@ from pipeline.datasets.check import (
     keep_baseline,
     read_limits,
 )
+from pipeline.datasets.check_readings import POSITION_ERROR
 from pipeline.datasets.check_sides import Sides, read_baseline, read_under, unite_effects
-from pipeline.datasets.stored_fits import POSITION_ERROR
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

@@ -13,8 +13,8 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.changes import AFTER, BEFORE
 from pipeline.datasets.check import BROKEN, Check, check_as_json, compare
+from pipeline.datasets.check_readings import COMMANDED, MULTIPLIER
 from pipeline.datasets.check_sides import Sides, read_under
-from pipeline.datasets.stored_fits import COMMANDED, MULTIPLIER
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile

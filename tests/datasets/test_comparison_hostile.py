@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.datasets.compare import Question, compare_results
-from pipeline.datasets.over_runs import draw_up_map, follow_trend
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
+from pipeline.datasets.deployments import draw_up_map
+from pipeline.datasets.trend import follow_trend
 from pipeline.report import render_catalogue
 from pipeline.report.comparison_page import write_answer
 from pipeline.report.map_page import write_map

@@ -12,8 +12,9 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.compare import Question, compare_results
-from pipeline.datasets.exchange import Limits, follow_published
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
+from pipeline.datasets.published_chain import Limits, follow_published
 from pipeline.store import Store
 
 RATE = 20.0

@@ -9,7 +9,8 @@ import polars as pl
 import pytest
 from comparison_store import Run, write_run
 
-from pipeline.datasets.compare import Question, compare_results
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pairs import Answer, Group, Samples, compare_groups, compare_orders
 from pipeline.report.comparison_page import write_answer

@@ -11,8 +11,7 @@ import pytest
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
-from pipeline.datasets.over_runs import follow_trend
-from pipeline.datasets.trend import Trend
+from pipeline.datasets.trend import Trend, follow_trend
 from pipeline.report.trend_page import write_trend
 from pipeline.store import Store
 from pipeline.store.names import read_day

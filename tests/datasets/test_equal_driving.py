@@ -12,11 +12,12 @@ from comparison_store import Run, make_budget, write_run
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.datasets.answer_lines import list_lines, list_pairs
-from pipeline.datasets.compare import Question, compare_results
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
 from pipeline.datasets.pooled_tests import compare_means
 from pipeline.store import Store
+from pipeline.words.comparison import list_lines, list_pairs
 
 if TYPE_CHECKING:
     from pathlib import Path

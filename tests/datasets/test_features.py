@@ -16,9 +16,8 @@ from comparison_store import Run, write_run
 
 from pipeline.cli import main
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.compare import gather_features
-from pipeline.datasets.exchange import merge_features, read_features, write_features
-from pipeline.datasets.over_runs import draw_up_map
+from pipeline.datasets.deployments import draw_up_map
+from pipeline.datasets.features import gather_features, merge_features, read_features, write_features
 from pipeline.store import Store
 
 PLACE = "/home/somebody/secret_farm"

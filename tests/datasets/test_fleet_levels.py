@@ -14,10 +14,11 @@ from comparison_store import Run, write_run
 from verbs import run_slip
 
 from pipeline.batch.batch_plan import refresh_pools, refresh_remote_pools
-from pipeline.datasets.compare import Question, compare_results
+from pipeline.datasets.compare import compare_results
+from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.forecast import FleetNumber, fit_fleet
-from pipeline.datasets.over_runs import follow_trend
 from pipeline.datasets.prediction import fit_results
+from pipeline.datasets.trend import follow_trend
 from pipeline.models.parameter import Level
 from pipeline.store import Store
 from pipeline.store.mirror import Mirror

@@ -9,7 +9,8 @@ from comparison_store import Run, write_run
 
 from pipeline.analysis.analyze import update_datasets
 from pipeline.batch.batch_work import Entry, Ledger
-from pipeline.datasets.over_runs import draw_up_map, follow_trend
+from pipeline.datasets.deployments import draw_up_map
+from pipeline.datasets.trend import follow_trend
 from pipeline.report import lead_to
 from pipeline.report.map_page import write_map
 from pipeline.report.trend_page import write_trend

@@ -12,7 +12,7 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.cli import main
-from pipeline.datasets.over_runs import follow_trend
+from pipeline.datasets.trend import follow_trend
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 

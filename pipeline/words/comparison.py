@@ -10,6 +10,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, enumerate_texts, format_share
 from pipeline.core.untrusted import number_in
+from pipeline.datasets.compared_runs import NOT_VALID
 from pipeline.datasets.pairs import (
     ALIKE,
     AS_PUBLISHED,
@@ -18,6 +19,7 @@ from pipeline.datasets.pairs import (
     UNTESTED,
     Answer,
     View,
+    compare_orders,
     judge_pair,
 )
 
@@ -290,3 +292,43 @@ def _split_difference(
 def title_line(line: Line) -> str:
     """What a line is about: vehicles and input."""
     return f"{line.family}, {INPUT_WORDS[line.input]}"
+
+
+def list_shown_notes(answer: Answer) -> list[str]:
+    """The notes of an answer, less that on the plain test, which only the files have."""
+    return [note for note in answer.notes if note != NOT_VALID]
+
+
+def summarize_answer(answer: Answer) -> dict[str, object]:
+    """The JSON object of `slip compare`."""
+    return {
+        "input": answer.input,
+        "quantity": answer.quantity,
+        "datasets": _list_rows(answer.datasets.filter(pl.col("input") == answer.input)),
+        "pairs": _list_pair_rows(answer.comparisons),
+        "answer": [vars(line) for line in list_lines(answer)],
+        "views": [
+            {
+                "input": view.input,
+                "quantity": view.quantity,
+                "levels": _list_rows(view.levels),
+                "pairs": _list_pair_rows(view.comparisons),
+            }
+            for view in answer.views
+        ],
+        "carried_by": [
+            {"input": name, "pair": sorted(pair), "by": by} for (name, pair), by in answer.carriers.items()
+        ],
+        "orders": [
+            vars(one) for one in compare_orders(answer.datasets.filter(pl.col("input") == answer.input))
+        ],
+        "notes": list(answer.notes),
+    }
+
+
+def _list_pair_rows(comparisons: pl.DataFrame) -> list[dict[str, object]]:
+    return _list_rows(comparisons.drop("run", "dataset", "vehicle", "terrain"))
+
+
+def _list_rows(frame: pl.DataFrame) -> list[dict[str, object]]:
+    return frame.with_columns(pl.col(pl.Enum).cast(pl.String)).to_dicts()

@@ -1,7 +1,4 @@
-"""Exchange with others: features of deployments in one shareable file, and the published chain.
-
-The file is Parquet under the schema of the table `features`. Its version, columns and number of rows are
-checked before it is read, its values afterwards: they have the types and ranges of the table.
+"""The published chain from commands and poses to window norms.
 
 The chain of Samson et al. 2024 is reimplemented, so that our results can be compared with the paper's. They
 print medians of the norm of g over windows of 2 s. Their u is not the raw command but the response of a
@@ -14,143 +11,14 @@ from __future__ import annotations
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import arrays, make_plain, naming_os_errors
+from pipeline.core import arrays
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
-from pipeline.datasets import ComparisonError
 from pipeline.stages.inputs import WINDOW_S
 from pipeline.stages.slip_stage import PUBLISHED_SAMPLES
-from schemas import Features, contract_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    import pyarrow.parquet as pq
-
-MOST_ROWS = 100_000
-"""Most rows (one per run and input) of a file from elsewhere: ten times a season of 5,000 runs."""
-_LARGEST_PART = 10**9
-"""Upper limit of the parts of a version number: larger ones compare as equal."""
-_PARTS = ("sha256", "input")
-
-
-def write_features(frame: pl.DataFrame, path: Path) -> None:
-    """Write features and replace the previous file.
-
-    Raises:
-        ComparisonError: ``not_written``.
-    """
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
-    from pipeline.store.parquet_tables import encode_parquet  # noqa: PLC0415
-
-    what, hint = "the file cannot be written", "Choose another file."
-    with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
-        replace_file(path, encode_parquet(contract_of("features"), frame, compression="none"))
-
-
-def check_features(frame: pl.DataFrame, where: str) -> pl.DataFrame:
-    """Return the rows if all of them satisfy the contract.
-
-    Raises:
-        ComparisonError: ``bad_features``.
-    """
-    valid, failure = Features.filter(frame)
-    if len(failure):
-        rules = ", ".join(sorted(failure.counts()))
-        raise _refuse(where, f"{len(failure)} of {frame.height} rows break the contract ({rules})")
-    return valid
-
-
-def read_features(path: Path) -> pl.DataFrame:
-    """Read features that others shared.
-
-    Raises:
-        ComparisonError: ``bad_features``: the reason for the rejection.
-    """
-    import pyarrow as pa  # noqa: PLC0415 - heavy
-    import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
-
-    # Opening a pipe could block forever.
-    if not path.is_file():
-        raise _refuse(str(path), "there is no such file")
-    try:
-        with pq.ParquetFile(path) as file:
-            names = _check_schema(file, str(path))
-            # An error in one of several threads can abort the process.
-            table = file.read(use_threads=False)
-        # Invalid UTF-8 would end the program later.
-        table.validate(full=True)
-        frame = pl.DataFrame(pa.Table.from_arrays(table.columns, names=names))
-    except (pa.ArrowException, OSError, ValueError, KeyError, TypeError, pl.exceptions.PolarsError) as error:
-        lines = str(error).splitlines()[:1] or [type(error).__name__]
-        raise _refuse(str(path), f"it cannot be read: {lines[0][:200]}") from error
-    return check_features(frame.select(Features.column_names()), str(path))
-
-
-def _check_schema(file: pq.ParquetFile, where: str) -> list[str]:
-    """Return the names of the columns if the end of the file is that of features of this version."""
-    from pipeline.store.parquet_tables import list_complaints  # noqa: PLC0415 - heavy
-
-    about, contract = file.metadata.metadata or {}, contract_of("features")
-    if about.get(b"contract") != b"features":
-        raise _refuse(where, "it is not a table of features")
-    version = about.get(b"contract_version", b"").decode()
-    if version != str(contract.version):
-        what = f"it is of version {version[:20]} of the table `features`, not of {contract.version}"
-        raise _refuse(where, what)
-    if file.metadata.num_rows > MOST_ROWS:
-        raise _refuse(where, f"it has {file.metadata.num_rows} rows, more than {MOST_ROWS}")
-    theirs, ours = (
-        {field.name: str(field.type).removeprefix("large_") for field in schema}
-        for schema in (
-            file.schema_arrow,
-            Features.create_empty().to_arrow(compat_level=pl.CompatLevel.oldest()).schema,
-        )
-    )
-    if complaints := list_complaints(theirs, ours):
-        raise _refuse(where, "; ".join(complaints))
-    names: list[str] = file.schema_arrow.names
-    return names
-
-
-def merge_features(frames: Sequence[pl.DataFrame], where: str) -> tuple[pl.DataFrame, int]:
-    """Merge features of several files, sorted; return them and the number of duplicate rows.
-
-    A log is identified by the hash of its content. If two versions of slip give different results for one
-    log, the row of the later version remains. The results that a row comes from do not matter.
-
-    Raises:
-        ComparisonError: ``bad_features``: one version has different rows for the same log.
-    """
-    columns = [name for name in Features.column_names() if name != "from_results"]
-    joined = pl.concat(frames).sort("from_results").unique(columns, keep="first", maintain_order=True)
-    newest = pl.col("made_by").map_elements(_order_version, return_dtype=pl.List(pl.Int64))
-    ranked = joined.with_columns(newest.alias("order")).sort(*_PARTS, "order")
-    last = ranked.filter(pl.col("order") == pl.col("order").last().over(_PARTS)).drop("order")
-    twice = last.filter(last.select(_PARTS).is_duplicated())
-    if twice.height:
-        logs = ", ".join(twice["run"].unique().sort().head(5))
-        counts = twice.group_by(_PARTS).n_unique()
-        differ = ", ".join(name for name in columns if name not in _PARTS and (counts[name] > 1).any())
-        raise _refuse(where, f"they contradict each other on the logs {logs}, in {differ}")
-    return last, sum(frame.height for frame in frames) - last.height
-
-
-def _order_version(text: str) -> list[int]:
-    return [min(int(part), _LARGEST_PART) if part.isdigit() else -1 for part in text.split(".")][:8]
-
-
-def _refuse(where: str, why: str) -> ComparisonError:
-    return ComparisonError(
-        "bad_features", f"these features are not taken: {make_plain(why)}", where=where,
-        hint="Have them made again, by this version of slip: slip fleet share --file features.parquet.",
-    )  # fmt: skip
-
 
 _STIFFNESS = 0.8
 """Lambda of the published smoothing spline; it halves the amplitude of a motion of 0.36 Hz."""
