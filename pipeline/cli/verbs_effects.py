@@ -45,7 +45,7 @@ if TYPE_CHECKING:
 
 
 def diagnose(  # noqa: D417 - the shared choices document themselves
-    logs: Annotated[list[str], Parameter(help="logs, or runs of the results folder")],
+    logs: Annotated[list[str], Parameter(help="logs, folders of logs, or runs of the results folder")],
     /,
     *,
     choices: Annotated[Choices, Parameter(name="*")] = Choices(),  # noqa: B008 - frozen
@@ -66,7 +66,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
 ) -> int:
     """Identify the physical effects that the model of a vehicle lacks.
 
-    From one run, or from several of one vehicle jointly.
+    From one run, or from several of one vehicle jointly: all that are given, or that a folder holds.
 
     Args:
         trust_code: trust the Python that the model file names, now and later.
@@ -78,6 +78,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         quiet: print no progress and no summary.
     """
     options = build_options(choices)
+    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
     from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models import check_target  # noqa: PLC0415 - heavy
     from pipeline.words.diagnosis import describe  # noqa: PLC0415 - heavy
@@ -87,6 +88,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     known = _open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
     answers: list[_Answer] = []
+    given, logs = logs, [name for log in logs for name in list_named(log)]
     at_work = [logs[0]]
     opened: dict[str, _Opened] = {}
     # A diagnosis with default options is unique, and is stored for later requests.
@@ -119,7 +121,11 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
         said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
         for answer in answers:
-            names = " ".join(shlex.quote(run.run) for run in answer.runs)
+            runs = [run.run for run in answer.runs]
+            # A folder is shorter than what it holds.
+            names = " ".join(
+                map(shlex.quote, given if len(given) < len(runs) and len(answers) == 1 else runs)
+            )
             following = (
                 f"slip diagnose {names}{said} --apply model.toml"
                 if apply is None
@@ -225,9 +231,12 @@ def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
     from pipeline.words.objects import diagnosis_as_json  # noqa: PLC0415 - heavy
 
     return [
-        {**diagnosis_as_json(run), **one.choices}
+        {
+            **diagnosis_as_json(run),
+            **next(one.choices for one in answer.opened if one.manifest.run == run.run),
+        }
         for answer in answers
-        for run, one in zip(answer.runs, answer.opened, strict=True)
+        for run in answer.runs
     ]
 
 

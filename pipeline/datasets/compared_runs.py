@@ -19,7 +19,7 @@ from pipeline.estimation.stored_diagnosis import DIAGNOSED
 from pipeline.models.catalogue import list_effects
 from pipeline.results.reading import find_refusal, read_findings
 from pipeline.run.signals import GROUND_UNOBSERVABLE
-from pipeline.stages.checks import find_gain, is_grip
+from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
 from pipeline.store import Manifest, Store, StoreError
 from pipeline.store.names import date_runs
 from pipeline.store.parquet_tables import scan_table
@@ -28,7 +28,6 @@ from schemas import contract_of
 
 _DATES = ("day", "month", "year")
 _TABLES = ("aggregates", "slip")
-_RADIUS = "wheel_radius_wrong"
 _SCHEMA = {
     "run": pl.String,
     "key": pl.String,
@@ -208,11 +207,11 @@ def _leave_out_untrusted(compared: ComparedRuns) -> ComparedRuns:
         .sort("run", "id")
         .collect()
     )
-    slippery = _find_slippery(compared) if _RADIUS in set(grave["id"]) else []
+    slippery = _find_slippery(compared) if WRONG_RADIUS in set(grave["id"]) else []
     if slippery:
         reason = "slippery ground and no wrong wheel radius, by other runs of the same vehicle"
         compared = replace(compared, notes=(*compared.notes, f"{reason}: {', '.join(slippery)}"))
-    is_grip = (pl.col("id") == _RADIUS) & pl.col("run").is_in(slippery)
+    is_grip = (pl.col("id") == WRONG_RADIUS) & pl.col("run").is_in(slippery)
     for (finding,), rows in sorted(grave.filter(~is_grip).partition_by("id", as_dict=True).items()):
         compared = _leave_out(compared, pl.col("run").is_in(rows["run"].to_list()), f"finding {finding}")
     return compared
@@ -224,7 +223,7 @@ def _find_slippery(compared: ComparedRuns) -> list[str]:
         run: str([manifest.part("vehicle").get(key) for key in ("id", "name", "wheel_radius_m")])
         for run, manifest in compared.manifests.items()
     }
-    claims = compared.scan("findings").filter(pl.col("id") == _RADIUS).select("run", "value").collect()
+    claims = compared.scan("findings").filter(pl.col("id") == WRONG_RADIUS).select("run", "value").collect()
     claimed = {run: value for run, value in claims.iter_rows() if value is not None}
     asked = {sheets[run] for run in claimed}
     siblings = [
@@ -234,13 +233,12 @@ def _find_slippery(compared: ComparedRuns) -> list[str]:
     ]
     driven = (
         scan_table("slip", root=compared.store.root, manifests=siblings)
-        .filter(pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"))
-        .select("run", "f_x", "v_x", "transitory")
+        .select("run", "input", "suspect", "f_x", "v_x", "transitory")
         .collect()
     )
     gains: dict[str, list[float]] = {}
     for (run,), rows in driven.partition_by("run", as_dict=True).items():
-        gain = find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy(), ~rows["transitory"].to_numpy())
+        gain = find_gain_of(rows)
         if gain is not None:
             gains.setdefault(sheets[str(run)], []).append(gain)
     slippery = []

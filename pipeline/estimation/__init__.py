@@ -37,11 +37,12 @@ from pipeline.estimation.problem import (
     predict_from,
 )
 from pipeline.estimation.state import Free, State
+from pipeline.estimation.together import Member, judge_together
 from pipeline.estimation.unexplained import search_formula
 from pipeline.models import Effect, Model
 from pipeline.models.effect import Place
 from pipeline.results import Finding, Named, RunDiagnosis, Value
-from pipeline.results.reading import find_refusal, read_findings
+from pipeline.results.reading import read_findings
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
 
@@ -118,19 +119,26 @@ def diagnose_runs(
         notify: called with a progress message.
 
     Returns:
-        One diagnosis per run; runs that were judged together share their effects.
+        One diagnosis per run, those that were judged together first: they share their effects. A run that
+        cannot be judged has none, and its reason as a finding.
 
     Raises:
-        DiagnosisError: ``too_short`` or ``no_input``.
+        DiagnosisError: ``too_short`` or ``no_input``, where no run can be judged.
     """
-    fatal = any(find_refusal(recording.list_findings()) for recording in recordings)
-    leading = "command" if "command" in inputs else "measured"
-    if fatal:
-        return Diagnosis(tuple(conclude.refuse(recording, leading, recordings) for recording in recordings))
-    runs = [load_recording(recording, vehicle) for recording in recordings]
     known = () if model is None else model.effects
+    leading = "command" if "command" in inputs else "measured"
 
-    def judge(runs: Sequence[MotionRun]) -> Diagnosis:
+    def judge(members: Sequence[Member]) -> Diagnosis:
+        judged = search(members, [one.run for one in members])
+        misread = find_encoder_scale(judged.runs[0])
+        if misread is None:
+            return judged
+        again = search(members, misread.correct([one.run for one in members]))
+        found = misread.report()
+        runs = (msgspec.structs.replace(run, findings=(found, *run.findings)) for run in again.runs)
+        return replace(again, runs=tuple(runs))
+
+    def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:
         chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
         context = prepare(runs, vehicle, chosen.source)
         driven = sum(run.duration_s for run in runs)
@@ -138,19 +146,9 @@ def diagnose_runs(
         # With more threads, the order of summation would depend on the number of cores.
         with threadpool_limits(limits=1, user_api="blas"):
             paths, clocks = _explore(context, chosen.source, known, budget)
-            return _conclude(recordings, context, chosen, paths, clocks)
+            return _conclude([one.recording for one in members], context, chosen, paths, clocks)
 
-    judged = judge(runs)
-    misread = find_encoder_scale(judged.runs[0])
-    if misread is None:
-        return judged
-    again = judge(misread.correct(runs))
-    return replace(
-        again,
-        runs=tuple(
-            msgspec.structs.replace(run, findings=(misread.report(), *run.findings)) for run in again.runs
-        ),
-    )
+    return judge_together(recordings, vehicle, leading, judge)
 
 
 def _explore(

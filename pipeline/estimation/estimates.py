@@ -160,8 +160,9 @@ def note_brevity(context: Context, common: RunDiagnosis) -> list[Finding]:
     driven = float(count_seconds(context.problem.whole).sum())
     if driven >= least:
         return []
+    have = "the runs together have" if len(context.runs) > 1 else "the run has"
     text = (
-        f"the run has {math.floor(driven)} s of driving: effects estimated from {words} need at least "
+        f"{have} {math.floor(driven)} s of driving: effects estimated from {words} need at least "
         f"{least:.0f} s, with turns and speeds of both signs"
     )
     return [Finding(BREVITY, text, "diagnosis", "warning")]

@@ -315,7 +315,9 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
     what, hint = "the folder holds no recording", "Give one .mcap, .db3 or .bag file, or one rosbag2 folder"
     if here:
         what = "the folder holds several recordings"
-        hint = f"{hint}; `slip batch {path}` analyzes all of them"
+        hint = (
+            f"{hint}; `slip batch {path}` analyzes all of them, `slip diagnose {path}` judges them together"
+        )
     elif any(path.glob("*.zstd")):
         what, hint = ("the recording's files are compressed as a whole", "Unpack them: zstd -d --rm *.zstd")
     raise LogError("not_a_recording", what, where=str(path), hint=hint)

@@ -93,6 +93,8 @@ def _correlate(one: Floats, other: Floats) -> float:
 # reported. A smaller difference is a wrong radius only if the vehicle is as fast as its body command: a
 # controller that knows the radius does not compensate for slip on the ground.
 
+WRONG_RADIUS: Final = "wheel_radius_wrong"
+"""Id of the finding on a wheel radius that the travel of a run contradicts."""
 _LEAST: Final = 0.55
 """Distance over that of the wheels above which it may be slip: with a constant ratio (`ONE_SCALE`), the
 recordings have 0.86 to 0.96. Below it a unit or a radius is wrong."""
@@ -132,7 +134,7 @@ def check_scale(samples: Samples, vehicle: Vehicle) -> list[Finding]:
         f"m roll: if the radius is {radius * gain:.3g} m, give --wheel-radius {radius * gain:.3g} or another "
         f"--vehicle (in the controller: a wheel radius multiplier of {gain:.2g})"
     )
-    return [Finding("wheel_radius_wrong", "error", text, where="wheels", value=radius * gain)]
+    return [Finding(WRONG_RADIUS, "error", text, where="wheels", value=radius * gain)]
 
 
 def is_grip(gain: float, others: Iterable[float]) -> bool:
@@ -141,6 +143,12 @@ def is_grip(gain: float, others: Iterable[float]) -> bool:
     With the radius that this gain implies, a run whose gain may be slip would cover more than its wheels.
     """
     return any(_LEAST < other < _MOST and other > _MOST * gain for other in others)
+
+
+def find_gain_of(slip: pl.DataFrame) -> float | None:
+    """`find_gain` of the measured wheels of a run, from the rows of its table `slip`."""
+    rows = slip.filter(pl.col("input").cast(pl.String) == "measured", ~pl.col("suspect"))
+    return find_gain(rows["f_x"].to_numpy(), rows["v_x"].to_numpy(), ~rows["transitory"].to_numpy())
 
 
 def find_gain(driven: Floats, moved: Floats, steady: Flags) -> float | None:

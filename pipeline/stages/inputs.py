@@ -28,6 +28,9 @@ _GROWTH = 0.6745 * 6.0**0.5
 """Median magnitude of second differences of white noise over its standard deviation."""
 _SHORTEST_STEP = 1.0
 """Shortest command step [s]: a shorter ramp is one change."""
+_ACROSS_RAD = 1.4
+"""Steering angle beyond which the speed of the rear axle does not tell how fast a vehicle turns [rad]: 80
+degrees, where it is a sixth of the front wheel's, and 0.02 rad of steering change the turn by an eighth."""
 WINDOW_S = 2.0
 """Length of a window [s]: that of the published medians, and the shortest hold of a command step."""
 
@@ -223,7 +226,16 @@ def interpolate_wheels(times: Floats, wheels: pl.DataFrame, vehicle: Vehicle) ->
 def _predict(drive: pl.DataFrame, vehicle: Vehicle) -> Floats:
     kinematics = vehicle.kinematics
     inputs = {quantity.name: _read_aligned(drive, quantity.name) for quantity in kinematics.inputs}
-    return np.stack(kinematics.forward(inputs, vehicle), axis=-1)
+    velocity = np.stack(kinematics.forward(inputs, vehicle), axis=-1)
+    velocity[mark_across(drive)] = np.nan
+    return velocity
+
+
+def mark_across(drive: pl.DataFrame) -> Flags:
+    """Rows of a table of the drive whose steered wheel stands across: no turn is known there, shape (n,)."""
+    if "steering" not in drive.columns:
+        return np.zeros(drive.height, dtype=bool)
+    return np.asarray(np.abs(_read_aligned(drive, "steering")) > _ACROSS_RAD, dtype=bool)
 
 
 def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:

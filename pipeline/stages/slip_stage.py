@@ -13,7 +13,7 @@ from pipeline.core import format_duration
 from pipeline.core.arrays import Flags, Floats
 from pipeline.sources import Configuration, Vehicle
 from pipeline.stages import Finding, StageError
-from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, read_inputs
+from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
 from pipeline.stages.spans import find_spans
 from pipeline.stages.velocity import MotionEvents, find_events
 from pipeline.store import JSON
@@ -98,6 +98,7 @@ def compute_slip(
     ).with_columns(step=pl.Series(cut.step), transitory=pl.Series(cut.transitory))
     spans = find_spans(velocities, tables["poses"], known, vehicle, hold_s)
     findings = [*_report_stale(times, ideals, hold_s), *spans.findings]
+    findings += report_across(wheels if "measured" in ideals else commands)
     suspect, motion = spans.excluded | spans.wrong | velocities["outlier"].to_numpy(), MotionEvents()
     if not is_drive_alone:
         motion = find_events(velocities, known, vehicle, spans)
@@ -189,6 +190,21 @@ def _report_stale(times: Floats, ideals: dict[str, Ideal], hold_s: float | None)
     )
     first = float(times[np.flatnonzero(lapsed)[0]])
     return [Finding("stale_command", "warning", text, where="command", t_start=first, count=count)]
+
+
+def report_across(drive: pl.DataFrame) -> list[Finding]:
+    """A finding on a table of the drive whose steered wheel stands across, so that its turn is unknown."""
+    across = np.flatnonzero(mark_across(drive))
+    if not across.size:
+        return []
+    stamps = drive["t"].to_numpy()
+    seconds = across.size * float(np.median(np.diff(stamps))) if stamps.size > 1 else 0.0
+    text = (
+        f"for {format_duration(seconds)} the steered wheel stands across, beyond 80 degrees: the speed of "
+        "the rear axle does not tell how fast the vehicle turns; left out"
+    )
+    first = float(stamps[across[0]])
+    return [Finding("steered_across", "warning", text, where="wheels", t_start=first, count=across.size)]
 
 
 _ROUGHNESS_S = 1.0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
@@ -89,6 +88,8 @@ _IDEAL = {"v0": "ideal forward speed", "s0": "ideal lateral speed", "w0": "ideal
 """Inputs of formulas in words."""
 _FINDINGS_SHOWN = 3
 """Distinct findings that are shown by default; the others are counted, and shown with `--all`."""
+_HEADS_SHOWN = 4
+"""Most runs that are named one a line by default; the names of more are between the first and the last."""
 _EFFECTS_SHOWN = 5
 """Effects with a line by default."""
 _RANK = {"error": 0, "warning": 1, "info": 3}
@@ -106,6 +107,8 @@ def describe(runs: Sequence[RunDiagnosis], following: str = "", *, everything: b
     """
     first, *others = runs
     heads = [run.run for run in runs]
+    if len(runs) > _HEADS_SHOWN and not everything:
+        heads = [f"{len(runs)} runs, {runs[0].run} to {runs[-1].run}"]
     heads[-1] += f"    {'together, ' if others else ''}{_name_input(first.input, first.input_reason or '')}"
     lines = list_lines(first, others, everything=everything)
     rows = format_lines(lines)
@@ -500,38 +503,53 @@ def list_findings(runs: Mapping[str, Sequence[Finding]], verdict: str, *, everyt
         verdict: on them.
         everything: also notes, and more than three.
     """
-    by_text: dict[tuple[str, str], list[str]] = {}
+    by_kind: dict[tuple[str, str, str | None], dict[str, list[str]]] = {}
     for run, findings in runs.items():
-        for key in _join_incidents(findings):
-            if key[1].casefold() not in verdict.casefold():
-                by_text.setdefault(key, []).append(run)
+        for severity, one, text in _join_incidents(findings):
+            if text.casefold() not in verdict.casefold():
+                # Where one run is asked, two findings of a kind are two things.
+                kind = (severity, one.id if len(runs) > 1 else text, one.where)
+                by_kind.setdefault(kind, {}).setdefault(text, []).append(run)
     texts: list[str] = []
     notes = 0
-    for (severity, text), where in sorted(by_text.items(), key=lambda one: _RANK.get(one[0][0], 2)):
+    for (severity, *_), by_text in sorted(by_kind.items(), key=lambda one: _RANK.get(one[0][0], 2)):
         is_note = severity == "info"
         notes += is_note
         if everything or not is_note:
-            which = f"{where[0]}: " if len(runs) > 1 and len(where) == 1 else ""
-            count = f" ({len(where)} runs)" if len(where) > 1 else ""
-            texts.append(f"{mark_finding(severity)}{which}{text}{count}")
+            texts.append(f"{mark_finding(severity)}{_format_of_runs(by_text, len(runs))}")
     if not everything and len(texts) > _FINDINGS_SHOWN:
         rest = len(texts) - _FINDINGS_SHOWN + notes
         texts = [*texts[:_FINDINGS_SHOWN], f"   {rest} more (--all)"]
     return _label("findings", texts)
 
 
-def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, str]]:
-    """Severity and text of every finding, of incidents of one kind and of repeated ones only once."""
+def _format_of_runs(by_text: Mapping[str, Sequence[str]], asked: int) -> str:
+    """A kind of finding: in how many runs, and its text in the first of those in which most say the same."""
+    text = max(by_text, key=lambda one: len(by_text[one]))
+    count = len({run for runs in by_text.values() for run in runs})
+    first = by_text[text][0]
+    if asked == 1:
+        return text
+    if count == 1:
+        return f"{first}: {text}"
+    return f"{count} runs{'' if len(by_text) == 1 else f', as in {first}'}: {text}"
+
+
+def _join_incidents(findings: Sequence[Finding]) -> list[tuple[str, Finding, str]]:
+    """Severity, first and text of every finding: incidents of one kind are one, and so are repeated ones."""
     incidents: dict[str, list[Finding]] = {}
     for one in findings:
         if one.severity != "info" and one.t_start is not None and one.t_end is not None:
             incidents.setdefault(one.id, []).append(one)
-    timed = [(alike[0].severity, _format_timed(alike)) for alike in incidents.values()]
+    timed = [(alike[0].severity, alike[0], _format_timed(alike)) for alike in incidents.values()]
     joined = {one for alike in incidents.values() for one in map(id, alike)}
-    plain = Counter((one.severity, one.text) for one in findings if id(one) not in joined)
+    plain: dict[tuple[str, str], list[Finding]] = {}
+    for one in findings:
+        if id(one) not in joined:
+            plain.setdefault((one.severity, one.text), []).append(one)
     return timed + [
-        (severity, f"{text} ({count} times)" if count > 1 else text)
-        for (severity, text), count in plain.items()
+        (severity, alike[0], f"{text} ({len(alike)} times)" if len(alike) > 1 else text)
+        for (severity, text), alike in plain.items()
     ]
 
 

@@ -19,7 +19,6 @@ from pipeline.core import SlipError
 from pipeline.datasets.compared_runs import find_material
 from pipeline.estimation import Recording as Diagnosed
 from pipeline.estimation import choose_input, diagnose_runs, load_recording
-from pipeline.estimation.context import DiagnosisError
 from pipeline.estimation.stored_diagnosis import read_diagnosis
 from pipeline.logs import open_log, read_topics
 from pipeline.logs.writer import LogWriter
@@ -164,8 +163,10 @@ def test_runs_with_and_without_a_pose_are_not_judged_together(unknown: Analyzed,
     ]
     vehicle = find_preset("turtlebot3_burger")
     assert vehicle is not None
-    with pytest.raises(DiagnosisError, match="holds no pose, so that only its drivetrain"):
-        diagnose_runs(both, vehicle, inputs=("command",))
+    judged, left_out = diagnose_runs(both, vehicle, inputs=("command",)).runs
+    assert (judged.run, judged.joint, bool(judged.ladder)) == ("whole", ("whole",), True)
+    assert (left_out.run, left_out.ladder) == ("alone", ())
+    assert "left out: the log holds no pose, so that only its drivetrain" in left_out.findings[0].text
     alone, other = (load_recording(one, vehicle) for one in both)
     ground = [effect for name in ("effective_track", "drive_lag") if (effect := find_effect(name))]
     effects = [effect() for effect in ground]

@@ -14,7 +14,7 @@ from stage_logs import FIELD, PLAIN, TakeThrough, rms, slope
 from pipeline.simulate import VEHICLES, Program
 from pipeline.sources import Vehicle, find_preset
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
-from pipeline.stages.slip_stage import cut_windows
+from pipeline.stages.slip_stage import cut_windows, report_across
 
 
 def preset(name: str, **changes: float) -> Vehicle:
@@ -137,6 +137,22 @@ def test_measured_wheels_are_interpolated_but_not_across_holes() -> None:
     found = interpolate_wheels(np.array([-0.1, 0.05, 0.2, 1.0, 3.05, 5.2]), wheels, HUSKY)
     speed = found.velocity[:, 0] / 0.165
     assert np.allclose(speed, [np.nan, 0.5, 2.0, np.nan, 9.0, np.nan], equal_nan=True)
+
+
+def test_wheels_that_stand_across_tell_no_turn_and_are_reported() -> None:
+    # Of a tricycle that turns on the spot the rear axle stands: an ideal turn of it would be rounding.
+    times = np.arange(0.0, 10.0, 0.0625)
+    steering = np.where(times >= 5.0, np.pi / 2.0, 0.2)
+    columns = {"t": times, "speed": np.where(times >= 5.0, 1e-9, 0.5), "steering": steering}
+    wheels = pl.DataFrame({**columns, "active": [True] * times.size})
+    found = interpolate_wheels(times, wheels, preset("car")).velocity
+    assert np.isfinite(found[times < 5.0]).all()
+    assert np.isnan(found[times >= 5.0]).all()
+    (finding,) = report_across(wheels)
+    assert finding.count == np.count_nonzero(times >= 5.0)
+    assert "for 5 s the steered wheel stands across" in finding.text
+    assert not report_across(wheels.filter(pl.col("t") < 5.0))
+    assert not report_across(make_drive([0.0, 0.1], [1.0, 1.0]))
 
 
 def test_with_yaw_imu_the_gyro_gives_the_yaw_rate_and_nothing_else(drive: TakeThrough) -> None:

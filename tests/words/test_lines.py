@@ -41,8 +41,30 @@ def test_a_finding_of_many_runs_is_said_once_with_its_count() -> None:
     runs["run3"] = [alike, Finding("stuck", "it was stuck", severity="error")]
     assert list_findings(runs, "", everything=False) == [
         ("findings", "!! run3: it was stuck"),
-        ("", "!  no command had arrived (48 runs)"),
+        ("", "!  48 runs: no command had arrived"),
     ]
+
+
+def test_findings_of_a_kind_are_said_once_of_many_runs_where_their_numbers_differ() -> None:
+    late = {"run20": 20, "run30": 30, "run31": 30}
+    runs = {
+        run: [Finding("late", f"poses are late by {ms} ms", "pose", "warning")] for run, ms in late.items()
+    }
+    assert list_findings(runs, "", everything=False) == [
+        ("findings", "!  3 runs, as in run30: poses are late by 30 ms")
+    ]
+    # Of one run, each is a finding.
+    both = [one for findings in runs.values() for one in findings][:2]
+    assert len(list_findings({"run": both}, "", everything=False)) == 2
+
+
+def test_many_runs_have_one_head() -> None:
+    names = [f"day/run{number:02}" for number in range(12)]
+    runs = [RunDiagnosis(name, "command", joint=tuple(names)) for name in names]
+    assert (
+        describe(runs).splitlines()[0].startswith("12 runs, day/run00 to day/run11    together, from command")
+    )
+    assert set(names[:-1]) < set(describe(runs, everything=True).splitlines())
 
 
 def test_incidents_of_a_kind_are_one_finding() -> None:

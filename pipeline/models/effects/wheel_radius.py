@@ -29,7 +29,9 @@ WheelRadius = declare(
         "true over nominal radius",
         0.92,
         least=Least(0.004, Least.DATA_SHEET),
-        plausible=Plausible(0.4, 1.3, "radii are off by 2 to 25 %, wheels slip by half on loose ground"),
+        plausible=Plausible(
+            0.2, 1.3, "radii are off by 2 to 25 %, wheels slip by half or more on soft ground"
+        ),
         # On slippery floors wheels spin nearly on the spot; they never fall far behind the vehicle.
         physical=(0.0, 1.3),
         quantities=(Quantity.RADIUS,),
