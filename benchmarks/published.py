@@ -3,7 +3,7 @@
     make published [ARGS="FOLDER"]
 
 The recordings stand in ../shared/published, which is no part of the repository; where they are absent it says
-so. Every answer is read from the ids and numbers of a diagnosis, as `pipeline.analyze`, `Run.diagnose` and
+so. Every answer is read from the ids and numbers of a diagnosis, as `slip.analyze`, `Run.diagnose` and
 `slip fleet fit` give it. A question that the program refuses counts as `refused`.
 """
 
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-import pipeline as slip
+import slip
 
 PUBLISHED = Path(__file__).parents[2] / "shared" / "published"
 """Public recordings, which are no part of the repository."""

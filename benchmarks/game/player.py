@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-import pipeline as slip
+import slip
 from game.baselines import drive_ideally
 from game.read_task import Read, predict_windows, walk_velocities
 from game.score import (

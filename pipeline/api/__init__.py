@@ -1,6 +1,6 @@
 """slip in Python: runs, diagnoses and models as objects, with the numbers of the command line.
 
-Users import the names from `pipeline` itself; each is thin over the functions that the verbs call. What
+Users import the names from `slip`; each is thin over the functions that the verbs call. What
 cannot be done raises `SlipError`: one line that says what is wrong, where, and what to do.
 """
 
@@ -36,7 +36,7 @@ from pipeline.estimation import parse_budget
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis
 from pipeline.models.model_file import ModelFile, read_model
 from pipeline.report import format_distance
-from pipeline.report.motion_view import view_diagnosis
+from pipeline.report.motion_view import MotionView, view_diagnosis
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
@@ -190,24 +190,32 @@ class Run:
             {"run": self.name},
         )
 
-    def plot(self, figure: str = "trajectory") -> ShownFigure:
+    def plot(self, figure: str = "trajectory", *, model: Model | None = None) -> ShownFigure:
         """One figure of its report, which a notebook shows.
 
         Args:
-            figure: its id, one of `figures`.
+            figure: its id, one of `figures`, or the beginning of one: `path` is the measured path and where
+                the model goes, over the half minute in which the ideal model is worst.
+            model: a model to draw, with its values as they are, in place of the one that was diagnosed.
 
         Raises:
             SlipError: ``no_figure``, the report of this run has none of that id.
         """
-        figures = self.figures()
-        if figure not in figures:
+        figures = self.figures(model=model)
+        chosen = (
+            figure if figure in figures else next((name for name in figures if name.startswith(figure)), "")
+        )
+        if not chosen:
             what = f"the report has no figure {figure!r}"
             raise SlipError("no_figure", what, where=self.name, hint=f"It has {', '.join(figures)}.")
-        return figures[figure]
+        return figures[chosen]
 
-    def figures(self) -> dict[str, ShownFigure]:
-        """The figures of its report by id."""
-        return self._draw(read_result(mapping_in(self.summary, "diagnosis"), RunDiagnosis))
+    def figures(self, *, model: Model | None = None) -> dict[str, ShownFigure]:
+        """The figures of its report by id; with a model, those of the model and of the data."""
+        if model is None:
+            return self._draw(read_result(mapping_in(self.summary, "diagnosis"), RunDiagnosis))
+        take_file(model)
+        return self._draw(RunDiagnosis(), model.view(self))
 
     def diagnose(
         self,
@@ -277,9 +285,9 @@ class Run:
             ]
         )
 
-    def _draw(self, diagnosis: RunDiagnosis) -> dict[str, ShownFigure]:
+    def _draw(self, diagnosis: RunDiagnosis, motion: MotionView | None = None) -> dict[str, ShownFigure]:
         tables = {name: self.manifest.read(name) for name in self.tables}
-        motion = view_diagnosis(tables, self.vehicle, diagnosis)
+        motion = motion or view_diagnosis(tables, self.vehicle, diagnosis)
         peers = find_peers(self._store, dict(self.manifest.read_json(SUMMARY)))
         return show_figures(RunReport(self.summary, tables, diagnosis, motion, peers))
 

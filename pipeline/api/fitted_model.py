@@ -15,16 +15,19 @@ from threadpoolctl import threadpool_limits
 from pipeline.core import INPUT_WORDS
 from pipeline.core.untrusted import number_in, objects_in
 from pipeline.datasets.stored_fits import ModelFit, fit_to_runs, read_runs
+from pipeline.estimation import Problem, State
+from pipeline.estimation.additions import Tries
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
-from pipeline.estimation.problem import carry_over
+from pipeline.estimation.problem import carry_over, fit_as_it_is, predict_at_from
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.export import export_model, read_current
 from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
 from pipeline.models import Model as MotionModel
 from pipeline.models.catalogue import refuse_taken
 from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
+from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
@@ -241,6 +244,96 @@ class Model:
         with threadpool_limits(1):
             return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
 
+    def predict(
+        self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None
+    ) -> pl.DataFrame:
+        """Velocities that it predicts for a run, with its values as they are, beside the measured ones.
+
+        Args:
+            run: an analyzed run.
+            input: what it is fed with; None as at the last fit, else as the effects need it.
+            vehicle_of: whose geometry counts where the run is of another vehicle.
+
+        Returns:
+            A row a time step of the table ``slip``, with its names: ``t`` [s]; measured ``v_x v_y v_w``, of
+            the ideal model ``f_x f_y f_w``, of this model ``model_x model_y model_w``, each forward and left
+            [m/s] and the yaw rate [rad/s] of base_link. The model's are null where its input has a gap.
+
+        Raises:
+            SlipError: the run has no such input, is too short, or is of another vehicle.
+        """
+        problem, state = self._prepare(run, input, vehicle_of)
+        slip = run.slip.filter(pl.col("input").cast(pl.String) == problem.source.value).collect()
+        velocity = predict_at_from(
+            problem.comparisons[0], state.effects_of(0), state.timing[0], slip["t"].to_numpy()
+        )
+        names = [f"{kind}_{axis}" for kind in ("v", "f") for axis in COMPONENTS]
+        made = [pl.Series(f"model_{axis}", velocity[:, i]) for i, axis in enumerate(COMPONENTS)]
+        return slip.select("t", *names).with_columns(made).with_columns(pl.col("^model_.$").fill_nan(None))
+
+    def missing(
+        self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None
+    ) -> pl.DataFrame:
+        """What it lacks to describe a run: the effects that help, the most helpful first.
+
+        The model is fitted to the run, then with each effect whose signature is in its residual, and judged
+        on data that the fit has not seen, as the workbench does it; what does not help is left out.
+
+        Args:
+            run: an analyzed run.
+            input: what it is fed with; None as at the last fit, else as the effects need it.
+            vehicle_of: whose geometry counts where the run is of another vehicle.
+
+        Returns:
+            A row an effect: ``effect``, its id; ``sentence``, what the vehicle does by it; ``t_mrmse_m`` [m]
+            and ``r_mrmse_rad`` [rad], the errors over 2 s with it; ``t_removed`` and ``r_removed``, the
+            shares of the errors without it that it removes, below zero where one grows; ``same_as``, ids of
+            effects that this run does not tell from it. No row where nothing helps.
+
+        Raises:
+            SlipError: the run has no such input, is too short, or is of another vehicle.
+        """
+        problem, state = self._prepare(run, input, vehicle_of)
+        model = replace(self.file.model, vehicle=problem.vehicle, effects=state.effects_of(0))
+        with threadpool_limits(1):
+            tries = Tries(problem, model)
+            helping = tries.fold([one for one in tries.try_each() if one is not None])
+        before = errors_as_json(tries.before)
+        rows = []
+        for one in helping:
+            after = errors_as_json(one.errors)
+            rows.append(
+                {
+                    "effect": one.effect.id,
+                    "sentence": one.effect.describe_motion(problem.vehicle, model),
+                    **{name: after[name] for name in _OVER_2S},
+                    **{f"{name[0]}_removed": _share_removed(before[name], after[name]) for name in _OVER_2S},
+                    "same_as": list(one.twins),
+                }
+            )
+        numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
+        texts = {"effect": pl.String, "sentence": pl.String}
+        return pl.DataFrame(rows, schema={**texts, **numbers, "same_as": pl.List(pl.String)})
+
+    def view(self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None) -> MotionView:
+        """Its motion on a run, with its values as they are, as rows for figures."""
+        problem, state = self._prepare(run, input, vehicle_of)
+        known = run.manifest.tables
+        places = (
+            run.table("velocities").select("t", "x", "y").sort("t").collect()
+            if "velocities" in known
+            else None
+        )
+        return MotionStage(problem, places).view(state, (), None)
+
+    def _prepare(self, run: Run, input: Source | None, owner: Owner | None) -> tuple[Problem, State]:
+        """The run as a problem, and the model on it: its values as they are, the run's own delays."""
+        file, read = self._read(run, owner)
+        source = choose_input(read, input, file.model, last=file.last_input).source
+        problem = Problem(read, file.model.vehicle, source)
+        with threadpool_limits(1):
+            return problem, fit_as_it_is(problem, file.model, file.per_run).state
+
     def export(self, to: str, *, current: str | Path | None = None) -> str:
         """Its values as parameters of what people run, as `slip model export` writes them.
 
@@ -262,6 +355,12 @@ class Model:
     def _repr_html_(self) -> str:
         ids = ", ".join(self.file.model.ids) or "the ideal model, no effect"
         return write_html(f"{self.file.model.vehicle.name}: {ids}", self.parameters)
+
+
+def _share_removed(before: object, after: object) -> float | None:
+    if not isinstance(before, float) or not isinstance(after, float) or before <= 0.0:
+        return None
+    return 1.0 - after / before
 
 
 def _take_effect(given: object) -> Effect:

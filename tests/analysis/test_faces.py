@@ -8,7 +8,7 @@ from pathlib import Path
 
 from verbs import ask_verb
 
-import pipeline as slip
+import slip
 from pipeline.cli.screen import format_run
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.web.stored_runs import summarize_run as describe_in_workbench

@@ -11,7 +11,7 @@ import polars as pl
 import pytest
 from verbs import ask_verb
 
-import pipeline as slip
+import slip
 from pipeline.simulate import simulate_case
 
 if TYPE_CHECKING:
@@ -164,6 +164,9 @@ def test_a_notebook_shows_names_as_text(run: slip.Run, diagnosis: slip.Diagnosis
         (lambda _: slip.Model("husky_a200") + 3, "3 is not an effect"),
         (lambda _: slip.Model("husky_a200").fit("run.mcap"), "'run.mcap' is not a run"),
         (lambda _: slip.Model("husky_a200").fit([]), "[] is not a run"),
+        (lambda _: slip.Model("husky_a200").predict("run.mcap"), "'run.mcap' is not a run"),
+        (lambda run: slip.Model("warthog").missing(run), "the run is of a Clearpath Husky A200"),
+        (lambda run: run.plot("path", model="model.toml"), "'model.toml' is not a model"),
         (lambda run: run.diagnose(model="model.toml"), "'model.toml' is not a model"),
         (lambda run: run.compare_models({"mine": 3}), "3 is not a model"),
         (lambda _: slip.Model("hunky"), "no vehicle preset is called 'hunky'"),
@@ -208,3 +211,50 @@ def test_a_run_has_its_slip_its_length_and_a_figure_of_its_own(run: slip.Run) ->
     assert run.plot("trajectory").to_dict() == run.figures()["trajectory"].to_dict()
     with pytest.raises(slip.SlipError, match="no figure 'trajectories'"):
         run.plot("trajectories")
+
+
+def test_a_model_predicts_the_velocities_of_a_run(run: slip.Run) -> None:
+    ideal = slip.Model(run.vehicle)
+    table = run.slip.filter(pl.col("input") == "command").collect()
+    predicted = ideal.predict(run, input="command")
+    assert predicted.columns == ["t", *(f"{kind}_{axis}" for kind in ("v", "f", "model") for axis in "xyw")]
+    assert predicted["v_w"].to_list() == table["v_w"].to_list()
+    fitted = (ideal + EFFECT + "drive_lag").fit(run, input="command").model
+    errors = [
+        model.predict(run, input="command").select((pl.col("model_w") - pl.col("v_w")).std()).item()
+        for model in (ideal, fitted)
+    ]
+    assert errors[1] < 0.1 * errors[0]
+    # The turning rate alone is what an effective track changes: the simulation has 1.8.
+    turning = fitted.predict(run, input="command").filter(pl.col("f_w").abs() > 0.3)
+    assert turning.select((pl.col("f_w") / pl.col("model_w")).median()).item() == pytest.approx(1.8, abs=0.1)
+
+
+def test_a_model_ranks_what_it_lacks(run: slip.Run) -> None:
+    ideal = slip.Model(run.vehicle)
+    ranked = ideal.missing(run, input="command")
+    assert ranked["effect"][0] == EFFECT
+    one = ranked.row(0, named=True)
+    assert one["sentence"].startswith("Effective track 0.99 m (nominal 0.55)")
+    with_it = (ideal + EFFECT).fit(run, input="command")
+    assert one["t_mrmse_m"] == pytest.approx(with_it.errors["t_mrmse_m"], rel=1e-3)
+    without = ideal.fit(run, input="command").errors["r_mrmse_rad"]
+    assert one["r_removed"] == pytest.approx(1.0 - one["r_mrmse_rad"] / without, rel=1e-3)
+
+    assert "drive_lag" in with_it.model.missing(run, input="command")["effect"].to_list()
+    whole = (with_it.model + "drive_lag").fit(run, input="command").model
+    assert whole.missing(run, input="command").columns == ranked.columns
+    assert whole.missing(run, input="command").filter(pl.col("t_removed") > 0.2).is_empty()
+
+
+def test_the_path_is_drawn_with_a_model_of_ones_own(run: slip.Run) -> None:
+    ideal = slip.Model(run.vehicle)
+    fitted = (ideal + EFFECT + "drive_lag").fit(run, input="command").model
+    ends = []
+    for model in (ideal, fitted):
+        chart = run.plot("path", model=model).to_dict()
+        assert chart["title"] == "Path: measured and model"
+        rows = chart["datasets"]["stretch_errors"]
+        ends.append(sum(((row["x"] - row["x2"]) ** 2 + (row["y"] - row["y2"]) ** 2) ** 0.5 for row in rows))
+    assert ends[1] < 0.3 * ends[0]
+    assert "ladder" not in run.figures(model=fitted)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from verbs import run_verb
 
-import pipeline as slip
+import slip
 from pipeline.simulate import simulate_case
 
 HOLD = {"drive_lag": {"tau": 0.3}}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,7 +15,7 @@ from blocks import find_difference, open_session, read_commands
 ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 SAID = {
-    "first_log": "wheel_separation_multiplier: 1.7985",
+    "first_log": "wheel_separation_multiplier: 1.805",
     "hidden_effect": "Wheel asymmetry: the right wheels are 5.3 % larger",
     "own_effect": "mine.k",
 }
@@ -37,6 +38,28 @@ def test_each_notebook_is_stored_without_outputs() -> None:
     for path in NOTEBOOKS:
         cells = [cell for cell in nbformat.read(path, as_version=4).cells if cell.cell_type == "code"]
         assert [cell for cell in cells if cell.outputs or cell.execution_count] == []
+
+
+def test_the_first_notebook_runs_from_top_to_bottom(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its cells one after the other, without a notebook server: the last expression of each is shown."""
+    (tmp_path / "data_samples").symlink_to(ROOT / "data_samples")
+    (tmp_path / "examples").mkdir()
+    monkeypatch.chdir(tmp_path / "examples")
+    names: dict[str, object] = {}
+    shown = []
+    for cell in nbformat.read(ROOT / "examples" / "first_log.ipynb", as_version=4).cells:
+        if cell.cell_type != "code":
+            continue
+        body = ast.parse(cell.source)
+        last = body.body.pop() if isinstance(body.body[-1], ast.Expr) else None
+        exec(compile(body, "first_log", "exec"), names)  # noqa: S102 - the notebook's own cells
+        if isinstance(last, ast.Expr):
+            value = eval(compile(ast.Expression(last.value), "first_log", "eval"), names)  # noqa: S307 - likewise
+            for how in ("_repr_html_", "_repr_svg_"):
+                shown += [getattr(value, how)()] if hasattr(value, how) else []
+    assert sum("<svg" in text for text in shown) == 3
+    assert any("effective_track" in text and "drive_lag" in text for text in shown)
+    assert (tmp_path / "examples" / "husky.toml").is_file()
 
 
 @pytest.mark.long

@@ -9,7 +9,7 @@ import published
 import pytest
 from verbs import run_verb
 
-import pipeline as slip
+import slip
 
 
 def make_content(
