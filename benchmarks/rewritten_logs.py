@@ -173,6 +173,8 @@ def list_changes() -> list[Change]:
         Change("sides exchanged", _exchange, "exchanged"),
         Change("both encoders backward", _on_wheels(-1.0, -1.0), "counts? backward"),
         Change("left encoder dead", _on_wheels(0.0, 1.0), "left wheels' encoder"),
+        Change("left encoder dies", _die("left", 0.0), "left wheels' encoder reads nothing"),
+        Change("right encoder holds", _die("right", None), "right wheels' encoder reads nothing"),
         Change("wheels in rpm", _on_wheels(30.0 / math.pi, 30.0 / math.pi), "rpm"),
         Change("wheels x 3", _on_wheels(3.0, 3.0), "radius|unit"),
         Change("command reversed", _on_command(-1.0, 1.0), "linear.x|sign"),
@@ -306,6 +308,40 @@ def _scale_sides(log: Log, topics: tuple[str, ...], factors: tuple[float, float]
     ):
         return None
     return _each(log, scale)
+
+
+def _die(side: str, reads: float | None) -> Callable[[Log, Roles], Log | None]:
+    """One encoder reads a number after 60 % of the log, or its last one."""
+
+    def make(log: Log, roles: Roles) -> Log | None:
+        first, last = log.length
+        dies = first + 0.6 * (last - first)
+        joints, held = _joints(log, roles), dict[str, float]()
+
+        def read(name: str, value: float, time: int) -> float:
+            if side not in name or "steer" in name or time < dies:
+                held[name] = value
+                return value
+            return held.get(name, 0.0) if reads is None else reads
+
+        def change(one: Message) -> Message:
+            if one.topic == joints:
+                content = _copy(one.content)
+                for field in ("velocity", "position"):
+                    if len(content[field]) == len(content["name"]):
+                        content[field] = [
+                            read(name if field == "velocity" else f"{name} angle", value, one.log_time)
+                            for name, value in zip(content["name"], content[field], strict=True)
+                        ]
+                return replace(one, content=content)
+            if one.topic in roles.wheels:
+                return replace(one, content={"data": read(one.topic, one.content.data, one.log_time)})
+            return one
+
+        known = all(hasattr(one.content, "data") for one in log.messages if one.topic in roles.wheels)
+        return _each(log, change) if joints or (len(roles.wheels) == 2 and known) else None
+
+    return make
 
 
 def _find_factor(joint: str, factors: tuple[float, float]) -> float:

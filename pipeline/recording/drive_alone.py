@@ -99,6 +99,14 @@ class _DriveExamination(Examination):
         if command is None:
             return None
         steered = wheels.reading.form == "steering"
+        if self.leave_out(wheels, command, None):
+            kind = "ackermann" if steered else "differential"
+            reading = self._read(wheels.source, is_measured=True, kind=kind, section=self._complete().wheels)
+            rolled = None if reading is None else roll_wheels(reading)
+            if reading is not None and rolled is not None:
+                wheels.reading = reading
+                for one in commands:
+                    one.reading.explain(rolled)
         if wheels.reading.form == "sides":
             self._report_dead_side(wheels)
             self._find_unit(wheels, command)

@@ -33,6 +33,7 @@ from pipeline.recording.geometry import (
     measure_geometry,
 )
 from pipeline.recording.motion import Motion, measure_motion
+from pipeline.recording.outages import find_outages
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
 from pipeline.run import Alignment
@@ -42,6 +43,7 @@ from pipeline.sources import (
     DriveForm,
     DriveSection,
     DriveSource,
+    OutageSection,
     PoseContent,
     Sources,
     Vehicle,
@@ -233,6 +235,9 @@ class Examination:
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
         if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
+            self._read_again(wheels, motion)
+        if wheels is not None and self.leave_out(wheels, command, motion):
+            wheels.reading.explained = None
             self._read_again(wheels, motion)
         is_judged = self._report_sides(motion, command, wheels)
         if wheels is not None and "reversed" in self.changes.get("wheels", {}):
@@ -527,6 +532,65 @@ class Examination:
             )
             return True
         return False
+
+    def leave_out(self, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
+        """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""
+        reading, section = wheels.reading, self._complete().wheels
+        if section.left_out is not None or reading.dead_side or not reading.inputs:
+            return False
+        names = SIDES if reading.form == "sides" else ("both",)
+        sides = {name: one for name, one in zip(names, (reading.first, reading.second), strict=False) if one}
+        made = reading.explained
+        late = (0.0, 0.0) if made is None else (made.lag, made.delay)
+        asked = command.reading if command is not None and command.is_sure else None
+        found = find_outages(sides, late, asked, motion)
+        table = self.extraction.read_drive(wheels.source, section, held=False)
+        stamps = table["t"].to_numpy()
+        clock = (table["log_time"].to_numpy() - self.extraction.data.index.start_ns) / 1e9
+        words = {
+            "the commands": asked,
+            "the poses": motion,
+            "the other wheels": asked is None or motion is None,
+        }
+        witnesses = [word for word, is_there in words.items() if is_there]
+        texts, spans = [], []
+        for one in found:
+            inside = (stamps >= one.start) & (stamps < one.end)
+            columns = [name for name in (*SIDES, "speed") if one.side in {name, "both"}]
+            is_read = table.filter(pl.Series(inside)).filter(pl.any_horizontal(pl.col(columns).is_finite()))
+            ends = [max(one.start, stamps[0]), *is_read["t"].to_list(), min(one.end, stamps[-1])]
+            is_silent = is_read.height < 2 or max(np.diff(ends)) > 0.5 * (ends[-1] - ends[0])  # noqa: PLR2004
+            reads = "nothing" if is_silent else one.reads
+            start, end = (
+                at if np.isinf(at) else float(np.interp(at, stamps, clock)) for at in (one.start, one.end)
+            )
+            when = f"from {start:.0f} to {end:.0f} s"
+            if end == np.inf:
+                when = f"from {start:.0f} s on"
+            elif start == -np.inf:
+                when = f"until {end:.0f} s"
+            who = (
+                "both wheels' encoders read"
+                if one.side == "both"
+                else f"the {one.side} wheels' encoder reads"
+            )
+            texts.append(f"{who} nothing {when} ({_READS[reads]} while {enumerate_texts(witnesses)} go on)")
+            # In hundredths, which the line of the text has as well.
+            first = None if np.isinf(start) else float(np.floor(1e2 * start) / 1e2)
+            last = None if np.isinf(end) else float(np.ceil(1e2 * end) / 1e2)
+            spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
+        if not found:
+            return False
+        self.changes.setdefault("wheels", {})["left_out"] = spans
+        text = (
+            f"{'; '.join(texts)}: left out, as left_out = {_write_spans(spans)} under [wheels] in run.toml "
+            "does; left_out = [] takes it as recorded"
+        )
+        begun = None if np.isinf(found[0].start) else found[0].start
+        self.findings.append(
+            Finding("encoder_dead", "warning", text, where="wheels", t_start=begun, count=len(found))
+        )
+        return True
 
     def _report_dead(self, wheels: Candidate) -> bool:
         dead = wheels.reading.dead_side
@@ -851,6 +915,24 @@ _REMEDIES = {
     "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
     "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",
 }
+
+
+_READS = {
+    "nothing": "no reading is recorded",
+    "zero": "zero is recorded",
+    "one value": "one value is repeated",
+    "noise": "noise is recorded",
+}
+
+
+def _write_spans(spans: Sequence[OutageSection]) -> str:
+    """As a line of TOML."""
+    parts = []
+    for one in spans:
+        ends = {"start_s": one.start_s, "end_s": one.end_s}
+        keys = [f'side = "{one.side}"', *(f"{key} = {at:g}" for key, at in ends.items() if at is not None)]
+        parts.append(f"{{{', '.join(keys)}}}")
+    return f"[{', '.join(parts)}]"
 
 
 def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:

@@ -101,15 +101,20 @@ def lay_grid(run: MotionRun, rate_hz: float) -> Grid:
 def find_silences(series: DriveSeries, at: Floats) -> Floats:
     """Times of poses [s] within the gaps of a drive's readings, where its motion is unknown, and their ends.
 
+    Before its first and after its last reading it is unknown as well.
+
     Args:
         series: readings.
         at: times of poses [s], increasing, shape (n,).
     """
-    steps = np.diff(series.times)
+    times = series.times
+    steps = np.diff(times)
     # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
     longest = max(SILENT_S, PERIODS * float(np.quantile(steps, 0.75))) if steps.size else np.inf
-    gaps = np.flatnonzero(steps > longest + ROUNDING_S)
-    begins, ends = series.times[gaps] + 0.05, series.times[gaps + 1] - 0.05
+    if at.size:
+        times = np.concatenate((np.minimum(at[:1], times[0]), times, np.maximum(at[-1:], times[-1])))
+    gaps = np.flatnonzero(np.diff(times) > longest + ROUNDING_S)
+    begins, ends = times[gaps] + 0.05, times[gaps + 1] - 0.05
     first = np.searchsorted(begins, at, side="right") - 1
     inside = at[(first >= 0) & (at <= ends[np.maximum(first, 0)])] if gaps.size else at[:0]
     return np.unique(np.concatenate((begins, inside, ends)))

@@ -28,6 +28,7 @@ from pipeline.sources.configuration import (
     Configuration,
     ConfigurationError,
     DriveSection,
+    OutageSection,
     Vehicle,
     convert_unit,
     find_preset,

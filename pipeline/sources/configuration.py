@@ -100,6 +100,20 @@ class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
     map: Annotated[str, msgspec.Meta(min_length=1, max_length=120)] | None = None
 
 
+class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """``left_out`` of ``[wheels]``: readings that are none, of one side or of both.
+
+    Attributes:
+        side: ``left``, ``right`` or ``both``.
+        start_s: first of them, in seconds after the start of the log; by default its start.
+        end_s: end of them; by default that of the log.
+    """
+
+    side: Literal["left", "right", "both"] = "both"
+    start_s: float | None = None
+    end_s: float | None = None
+
+
 class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[command]`` or ``[wheels]``: source of wheel speeds, of a body command, or of speed and steering.
 
@@ -123,6 +137,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         reversed: side that counts backward.
         exchanged: whether left and right are exchanged.
         scale: factor on recorded speeds, where an encoder counts low or high.
+        left_out: spans whose readings are none; empty: all are taken as recorded.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
     """
@@ -144,6 +159,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     reversed: Literal["left", "right"] | None = None
     exchanged: bool = False
     scale: Positive | None = None
+    left_out: list[OutageSection] | None = None
     time: Clock | None = None
     hold_s: Positive | None = None
 

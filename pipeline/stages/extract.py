@@ -9,7 +9,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import SlipError, format_share
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core.arrays import PERIODS, Flags, Floats, Ints
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -17,6 +17,7 @@ from pipeline.sources import (
     DriveForm,
     DriveSection,
     DriveSource,
+    OutageSection,
     PoseContent,
     PoseSource,
     Sources,
@@ -547,7 +548,25 @@ class Extraction:
         frame = pl.DataFrame(
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
+        if section.left_out:
+            frame = self._leave_out(frame, section.left_out, held=held)
         return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
+
+    def _leave_out(self, frame: pl.DataFrame, spans: Sequence[OutageSection], *, held: bool) -> pl.DataFrame:
+        """A drive without the readings that are none: rows of it, or values that would be held."""
+        seconds = (frame["log_time"].to_numpy() - self.data.index.start_ns) / 1e9
+        for one in spans:
+            inside = np.ones(seconds.size, dtype=bool)
+            inside &= True if one.start_s is None else seconds >= one.start_s
+            inside &= True if one.end_s is None else seconds < one.end_s
+            sides = {one.side, "sideways"} if one.side != "both" else set(Drive.list_signals())
+            frame = frame.with_columns(
+                pl.when(pl.Series(inside)).then(np.nan).otherwise(pl.col(name)).alias(name)
+                for name in sides.intersection(frame.columns)
+            )
+            if not held:
+                frame, seconds = frame.filter(~pl.Series(inside)), seconds[~inside]
+        return frame
 
     def read_rates(self, source: DriveSource) -> tuple[Floats, dict[str, Floats]]:
         """Times [s] and rates [rad/s] of all joints of a topic that turn, by name."""
@@ -627,8 +646,7 @@ class Extraction:
         if np.array_equal(first, second):
             return first, log_first, (a, b)
         if not held:
-            inside = (first >= second[0]) & (first <= second[-1])
-            return first[inside], log_first[inside], (a[inside], np.interp(first[inside], second, b))
+            return _join_sides(series)
         union, index = np.unique(np.concatenate((first, second)), return_index=True)
         log_time = np.concatenate((log_first, log_second))[index]
         known = union >= max(first[0], second[0])
@@ -653,6 +671,33 @@ class Extraction:
                 "active": is_inside(times, self._spans),
             }
         )
+
+
+def _join_sides(
+    series: Sequence[tuple[Stamps, Stamps, Floats]],
+) -> tuple[Stamps, Stamps, tuple[Floats, Floats]]:
+    """Two measurements at the times of the first, while neither is silent.
+
+    Args:
+        series: stamps, log times and values of each.
+    """
+    (first, log_first, a), (second, _, b) = series
+    known = (first >= second[0]) & (first <= second[-1]) & ~_find_silent(first, second, b)
+    return first[known], log_first[known], (a[known], np.interp(first[known], second, b))
+
+
+def _find_silent(at: Stamps, stamps: Stamps, values: Floats) -> Flags:
+    """Times in a long silence between two readings.
+
+    After a reading of zero a wheel may stand whose changes alone are published.
+    """
+    steps = np.diff(stamps)
+    longest = max(_LONGEST_STEP_S * 1e9, PERIODS * float(np.quantile(steps, 0.75))) if steps.size else np.inf
+    last = np.searchsorted(stamps, at, side="right") - 1
+    before = np.clip(last, 0, steps.size - 1)
+    return np.asarray(
+        (last == before) & (steps[before] > longest) & (values[before] != 0.0) & (stamps[before] != at)
+    )
 
 
 def _find_breaks(clock: TopicClock, log_time: Stamps) -> Flags:

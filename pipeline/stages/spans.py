@@ -221,6 +221,35 @@ def _follow(values: Floats, is_first: Flags, gain: float) -> None:
                 values[k, i] = values[k - 1, i] + gain * (values[k, i] - values[k - 1, i])
 
 
+def price_change(count: int) -> float:
+    """Log-likelihood that a change of the hypothesis costs: any of so many blocks might have one."""
+    return float(np.log(count / LEVEL))
+
+
+def follow_likeliest(gains: Floats, price: float) -> list[tuple[int, slice]]:
+    """Likeliest spans of other hypotheses, with their numbers (Viterbi).
+
+    Args:
+        gains: log-likelihood of other hypotheses less that of the usual one, shape (m, k).
+        price: of a change [nats]; see `price_change`.
+    """
+    gains = np.column_stack((np.zeros(len(gains)), gains - _LASTS_NATS))
+    change = price * (1.0 - np.eye(gains.shape[1]))
+    # A recording may begin and end at any time.
+    score, origin = np.zeros(gains.shape[1]), np.zeros(gains.shape, dtype=np.int64)
+    for k, gain in enumerate(gains):
+        routes = score[:, None] - change
+        origin[k] = routes.argmax(axis=0)
+        score = routes.max(axis=0) + gain
+    states = np.zeros(len(gains), dtype=np.int64)
+    state = int(score.argmax())
+    for k in range(len(gains) - 1, -1, -1):
+        states[k], state = state, int(origin[k, state])
+    return [
+        (which - 1, slice(*one)) for which in range(1, gains.shape[1]) for one in find_runs(states == which)
+    ]
+
+
 class _Blocks:
     """Blocks of the grid, none across a gap.
 
@@ -276,30 +305,10 @@ class _Blocks:
         product = np.hstack((ahead * turned, ahead * np.abs(turned), np.abs(ahead) * turned))
         return np.hstack((now, before, self.follow(before), product))
 
-    def list_spans(self, gains: Floats) -> list[slice]:
-        """Likeliest spans that do not follow (Viterbi).
-
-        Args:
-            gains: log-likelihood of other hypotheses less that of following, shape (m, k).
-        """
-        gains = np.column_stack((np.zeros(len(gains)), gains - _LASTS_NATS))
-        change = self.price * (1.0 - np.eye(gains.shape[1]))
-        # A recording may begin and end at any time.
-        score, origin = np.zeros(gains.shape[1]), np.zeros(gains.shape, dtype=np.int64)
-        for k, gain in enumerate(gains):
-            routes = score[:, None] - change
-            origin[k] = routes.argmax(axis=0)
-            score = routes.max(axis=0) + gain
-        states = np.zeros(len(gains), dtype=np.int64)
-        state = int(score.argmax())
-        for k in range(len(gains) - 1, -1, -1):
-            states[k], state = state, int(origin[k, state])
-        return [slice(*one) for which in range(1, gains.shape[1]) for one in find_runs(states == which)]
-
     @property
     def price(self) -> float:
-        """Log-likelihood that a change of the hypothesis costs: any block might have one."""
-        return float(np.log(self.start.size / LEVEL))
+        """See `price_change`."""
+        return price_change(self.start.size)
 
 
 @dataclass(frozen=True)
@@ -458,7 +467,7 @@ class _Contradiction(NamedTuple):
 def _list_contradictions(blocks: _Blocks, fit: _Fit, source: Floats) -> list[_Contradiction]:
     gains, made = fit.compare(), []
     size = np.abs(source).sum(axis=1)
-    for part in blocks.list_spans(gains[:, 2:]):
+    for _, part in follow_likeliest(gains[:, 2:], blocks.price):
         stands, free, mixed, turned = gains[part].T
         moved, usual = (np.hypot(one[part, 0], one[part, 1]).sum() for one in (fit.target, fit.expected))
         free_as = "longer" if moved > usual else "shorter"

@@ -27,6 +27,8 @@ QUICK = {
     ("husky_tile", "right wheels reversed"),
     ("husky_tile", "clock back by 10 s"),
     ("ackermann_gravel", "both encoders backward"),
+    ("husky_tile", "left encoder dies"),
+    ("turtlebot4", "right encoder holds"),
     ("husky_tile", "poses in JSON"),
     ("husky_tile", "wheels in rpm"),
     ("husky_tile", "a measured twist beside"),

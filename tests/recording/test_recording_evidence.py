@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import polars as pl
 import pytest
+from drawn_motion import GAIN, LAG, RADIUS, STEP, TRACK, command, draw, measured, sides, tabulate
 
 from pipeline.recording.evidence import (
     find_body_units,
@@ -16,94 +17,9 @@ from pipeline.recording.evidence import (
     rate_command,
 )
 from pipeline.recording.geometry import measure_controller, measure_geometry
-from pipeline.recording.motion import Motion, measure_motion
+from pipeline.recording.motion import measure_motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit
-
-RADIUS, TRACK, GAIN, LAG = 0.1, 0.5, 0.77, 0.25
-STEP = 0.01
-
-
-@dataclass(frozen=True)
-class Drive:
-    """A drive at 100 Hz: commands, what the body did, and its pose with noise at 10 Hz."""
-
-    time: np.ndarray
-    asked: np.ndarray
-    speed: np.ndarray
-    rate: np.ndarray
-    place: np.ndarray
-    yaw: np.ndarray
-    rows: np.ndarray
-
-    def wheels(self) -> tuple[np.ndarray, np.ndarray]:
-        """Speeds of the left and the right wheels [rad/s]: they turn as asked, after the lag."""
-        turn = self.rate / GAIN
-        return (self.speed - 0.5 * TRACK * turn) / RADIUS, (self.speed + 0.5 * TRACK * turn) / RADIUS
-
-
-def draw(seed: int = 1, seconds: float = 100.0) -> Drive:
-    rng = np.random.default_rng(seed)
-    time = np.arange(0.0, seconds, STEP)
-    holds = np.cumsum(rng.uniform(1.0, 3.0, 200))
-    number = np.searchsorted(holds, time)
-    asked = np.stack([rng.uniform(-1.0, 1.0, 200)[number], rng.uniform(-1.0, 1.0, 200)[number]], axis=1)
-    made = np.zeros_like(asked)
-    for k in range(1, time.size):
-        made[k] = made[k - 1] + STEP / LAG * (asked[k - 1] - made[k - 1])
-    speed, rate = made[:, 0], GAIN * made[:, 1]
-    yaw = np.cumsum(rate) * STEP
-    place = np.cumsum(speed * np.exp(1j * yaw)) * STEP
-    rows = np.arange(0, time.size, 10)
-    noise = rng.normal(0.0, 0.002, (2, rows.size))
-    return Drive(
-        time,
-        asked,
-        speed,
-        rate,
-        place[rows] + noise[0] + 1j * noise[1],
-        yaw[rows] + rng.normal(0, 0.002, rows.size),
-        rows,
-    )
-
-
-def tabulate(drive: Drive, *, turned: float = 0.0, axis: int = 2, backward: bool = False) -> pl.DataFrame:
-    """Table `poses`, with the heading turned [rad], or in a frame whose given axis is up."""
-    half = 0.5 * (drive.yaw + turned)
-    zero = np.zeros(half.size)
-    place = -drive.place if backward else drive.place
-    flat = {2: (place.real, place.imag, zero), 1: (place.real, zero, -place.imag)}[axis]
-    spin = {2: (zero, zero, np.sin(half)), 1: (zero, np.sin(half), zero)}[axis]
-    return pl.DataFrame({
-        "t": drive.time[drive.rows], "segment": np.zeros(half.size, dtype=np.int32),
-        **dict(zip("xyz", flat, strict=True)),
-        "q_x": spin[0], "q_y": spin[1], "q_z": spin[2], "q_w": np.cos(half),
-        "held": np.zeros(half.size, dtype=bool), "active": np.ones(half.size, dtype=bool),
-    })  # fmt: skip
-
-
-def measured(poses: pl.DataFrame) -> Motion:
-    motion = measure_motion(poses)
-    assert motion is not None
-    return motion
-
-
-def command(drive: Drive, ahead: float = 1.0, turn: float = 1.0) -> Reading:
-    at = slice(None, None, 10)
-    return Reading(
-        "body",
-        "/cmd_vel",
-        Held(drive.time[at], ahead * drive.asked[at, 0]),
-        Held(drive.time[at], turn * drive.asked[at, 1]),
-    )
-
-
-def sides(drive: Drive, left: float = 1.0, right: float = 1.0) -> Reading:
-    at = slice(None, None, 5)
-    one, two = drive.wheels()
-    return Reading(
-        "sides", "/joint_states", Held(drive.time[at], left * one[at]), Held(drive.time[at], right * two[at])
-    )
 
 
 def test_gain_and_delay_of_a_command_are_recovered() -> None:

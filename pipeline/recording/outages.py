@@ -1,0 +1,370 @@
+"""Spans in which an encoder reads nothing while the command and the poses go on.
+
+Three signals vote: in every block of half a second the reading of a side follows the poses, or it follows the
+command, as where a wheel is blocked or spins; or it follows neither: it repeats a value, or is noise. One
+hypothesis holds until the gain in likelihood of another one is worth a change. A span counts where the body
+moves as commanded, so that only the encoder can be wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
+from pipeline.core.student import find_scale, list_likelihoods
+from pipeline.recording.motion import STEP_S, Motion
+from pipeline.recording.readings import Held, Reading
+from pipeline.recording.score import Steps
+from pipeline.run.signals import LIVE_SHARE
+from pipeline.stages.spans import BLOCK_S, follow_likeliest, price_change
+
+_LEAST = 0.03
+"""Fraction of the usual largest speed of a side below which a difference is no contradiction."""
+_SILENT_S = 2.0
+"""Shortest silence of a side that is told [s]: shorter ones are bridged, or lost messages."""
+_FEWEST_BLOCKS = 40
+"""Least number of blocks for a judgment: twenty seconds."""
+_STILL = 1e-6
+"""Speed below which a body stands throughout, for a scale above zero."""
+_SMALLEST_PART = 20
+"""Least number of blocks of the part of a run in which an encoder may have been alive."""
+_PARTS = 8
+"""Number of parts of the finest division in which a living encoder is looked for."""
+_EXACT = 0.95
+"""Share of the readings that repeat the one before, from which on they do so exactly."""
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A span without readings of a side.
+
+    Attributes:
+        side: name of the signal, or ``both``.
+        start, end: in the time of the motion [s].
+        reads: ``nothing``, ``zero``, ``one value`` or ``noise``.
+        nats: gain in log-likelihood; infinite where there are no readings at all.
+    """
+
+    side: str
+    start: float
+    end: float
+    reads: str
+    nats: float
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Sums of the motion's steps over half a second.
+
+    Attributes:
+        steps: the steps.
+        label: number of the block of each step.
+        elapsed: length of the steps of each block [s], shape (m,).
+        begins: first step of each block, shape (m,).
+        breaks: whether a block does not follow the one before, shape (m,).
+    """
+
+    steps: Steps
+    label: Ints
+    elapsed: Floats
+    begins: Ints
+    breaks: Flags
+
+    def average(self, values: Floats) -> Floats:
+        """Rates of some increments, shape (m,)."""
+        return np.asarray(np.bincount(self.label, values) / self.elapsed, dtype=np.float64)
+
+    def hold_all(self, flags: Flags) -> Flags:
+        """Whether all steps of a block have a flag, shape (m,)."""
+        return np.asarray(np.bincount(self.label, ~flags) == 0, dtype=bool)
+
+    def spread(self, values: Floats) -> Floats:
+        """Columns of a block, of the one before and of the one after it, shape (m, 3 k)."""
+        before, after = np.roll(values, 1, axis=0), np.roll(values, -1, axis=0)
+        before[self.breaks] = values[self.breaks]
+        ends = np.roll(self.breaks, -1)
+        after[ends] = values[ends]
+        return np.hstack((values, before, after))
+
+
+def _cut(steps: Steps) -> _Blocks:
+    number = np.floor((steps.start - steps.start[0]) / BLOCK_S).astype(np.int64)
+    numbers, begins, label = np.unique(number, return_index=True, return_inverse=True)
+    elapsed = np.asarray(np.bincount(label, steps.end - steps.start), dtype=np.float64)
+    return _Blocks(steps, label, elapsed, begins, np.append(True, np.diff(numbers) > 1))
+
+
+@dataclass(frozen=True)
+class _Follows:
+    """How likely each block of a series is if it follows another one, and what it would be there.
+
+    Attributes:
+        expected: shape (m,).
+        scale: of the noise.
+    """
+
+    expected: Floats
+    scale: float
+
+    def rate(self, values: Floats) -> Floats:
+        """Log-likelihood of every block, shape (m,)."""
+        return list_likelihoods(values - self.expected, self.scale)
+
+
+def _fit(columns: Floats, values: Floats, rows: Flags, least: float) -> _Follows:
+    gains, rest = fit_robustly(columns[rows], values[rows])
+    return _Follows(columns @ gains, float(np.hypot(find_scale(rest), least)))
+
+
+def find_outages(
+    sides: Mapping[str, Held],
+    late: tuple[float, float],
+    command: Reading | None,
+    motion: Motion | None,
+) -> list[Outage]:
+    """Spans in which a side's encoder reads nothing.
+
+    Args:
+        sides: readings by name.
+        late: lag and delay of the motion after the wheels [s].
+        command: fitted to the motion; None without one that is followed.
+        motion: of the poses; None where no pose is recorded.
+    """
+    if motion is not None:
+        steps = motion.steps
+    else:
+        ends = [one.times[[0, -1]] for one in sides.values()]
+        edges = np.arange(min(start for start, _ in ends), max(end for _, end in ends), STEP_S)
+        steps = Steps(edges[:-1], edges[1:])
+    blocks = _cut(steps)
+    if blocks.elapsed.size < _FEWEST_BLOCKS:
+        return []
+    moved = asked = None
+    if motion is not None:
+        moved = np.column_stack([blocks.average(one) for one in (motion.body.real, motion.yaw)])
+    known = np.ones(blocks.elapsed.size, dtype=bool)
+    if command is not None and command.explained is not None:
+        made = command.explained
+        known = blocks.hold_all(np.logical_and.reduce([one.is_there(steps) for one in command.inputs]))
+        columns = command.columns(steps, made.lag, made.delay, crossed=False)
+        asked = np.column_stack([blocks.average(one) for one in columns])
+    sources = [blocks.spread(one) for one in (moved, asked) if one is not None]
+    read = {name: _read_side(side, late, blocks, known, sources) for name, side in sides.items()}
+    goes_on = None
+    if moved is not None and asked is not None:
+        goes_on = _rate_going_on(moved, sources[1], known)
+    found: list[Outage] = []
+    for name, side in sides.items():
+        one, beside = read[name], goes_on
+        if one is None:
+            # Too little is read for a judgment of it, and silence needs none.
+            size = np.abs(sources[0][:, :2]).sum(axis=1)
+            found += _list_silent(name, side, blocks, size, float(np.quantile(size, 0.95)))
+            continue
+        if beside is None:
+            # With one witness alone the other side is the second one.
+            others = [other for key, other in read.items() if key != name and other is not None]
+            beside = others[0].usual - others[0].broad if others else np.zeros(known.size)
+        found += _list_dead(name, side, late[1], blocks, one, sources, beside)
+    return _join_sides(sorted(found, key=lambda one: one.start))
+
+
+@dataclass(frozen=True)
+class _Side:
+    """A side's readings in blocks.
+
+    Attributes:
+        values: mean speed, shape (m,).
+        there: whether it is read, shape (m,).
+        fits: how it follows each source.
+        usual: log-likelihood of following the nearest of them, shape (m,).
+        broad: that of noise, shape (m,).
+        top: usual largest speed.
+    """
+
+    values: Floats
+    there: Flags
+    fits: Sequence[_Follows]
+    usual: Floats
+    broad: Floats
+    top: float
+
+
+def _read_side(
+    side: Held, late: tuple[float, float], blocks: _Blocks, known: Flags, sources: Sequence[Floats]
+) -> _Side | None:
+    """How a side follows the sources; None if too little is read, or it follows none in any part."""
+    there = blocks.hold_all(side.is_there(blocks.steps)) & known if side.moves else known & False
+    if there.sum() < _SMALLEST_PART:
+        return None
+    values = blocks.average(side.integrate(blocks.steps, *late))
+    top = float(np.quantile(np.abs(values[there]), 0.95))
+    least = _LEAST * top
+    if top == 0.0:
+        return None
+    broad = list_likelihoods(values, float(np.hypot(find_scale(values[there]), least)))
+    fits, gain = _follow_best(values, there, sources, broad, least)
+    if gain < price_change(values.size):
+        return None
+    return _Side(values, there, fits, np.max([one.rate(values) for one in fits], axis=0), broad, top)
+
+
+def _join_sides(found: Sequence[Outage]) -> list[Outage]:
+    """Outages in order; those of two sides at once are one."""
+    made = list[Outage]()
+    for one in found:
+        last = made[-1] if made else one
+        apart = max(abs(last.start - one.start), abs(last.end - one.end) if one.end != last.end else 0.0)
+        if last.side != one.side and not apart > _SILENT_S:
+            made[-1] = Outage(
+                "both", min(last.start, one.start), max(last.end, one.end), one.reads, last.nats + one.nats
+            )
+        else:
+            made.append(one)
+    return made
+
+
+def _rate_going_on(moved: Floats, asked: Floats, known: Flags) -> Floats:
+    """Gain in likelihood of a body that moves as commanded over one that does not, shape (m,)."""
+    gain = np.zeros(known.size)
+    for values in moved.T:
+        least = _LEAST * float(np.quantile(np.abs(values), 0.95)) + _STILL
+        fit = _fit(asked, values, known, least)
+        gain += fit.rate(values) - list_likelihoods(values, float(np.hypot(find_scale(values[known]), least)))
+    return np.where(known, gain, 0.0)
+
+
+def _list_dead(
+    name: str,
+    side: Held,
+    delay: float,
+    blocks: _Blocks,
+    one: _Side,
+    sources: Sequence[Floats],
+    goes_on: Floats,
+) -> list[Outage]:
+    """Spans in which the readings are none, and silences of a side.
+
+    Args:
+        name: of the side.
+        side: its readings.
+        delay: of the motion after them [s].
+        blocks: of the motion.
+        one: the readings in blocks.
+        sources: columns of what they may follow.
+        goes_on: gain in likelihood where the other signals agree, shape (m,).
+    """
+    gains = np.column_stack((_rate_repeating(one.values, one.fits), one.broad)) - one.usual[:, None]
+    gains[~one.there] = 0.0
+    price, made = price_change(one.values.size), list[Outage]()
+    ends = np.append(blocks.steps.start[blocks.begins], np.inf)
+    ends[0] = -np.inf
+    for which, part in follow_likeliest(gains, price):
+        start, end = float(ends[part.start]) - delay, float(ends[part.stop]) - delay
+        span = _describe(name, side, start, end, float(gains[part, which].sum()))
+        columns = [each[part] for each in sources]
+        if goes_on[part].sum() > price and not _follows_otherwise(
+            one.values[part], columns, one.fits, span, 2.0 * price
+        ):
+            made.append(span)
+    return made + _list_silent(name, side, blocks, one.fits[0].expected, one.top)
+
+
+def _follows_otherwise(
+    values: Floats, sources: Sequence[Floats], fits: Sequence[_Follows], outage: Outage, price: float
+) -> bool:
+    """Whether a source explains a span by numbers of its own, as on other ground or at a limit.
+
+    Noise is what nothing explains. A value that stands throughout is one that no source has; that of zero is
+    explained by no gain at all.
+    """
+    if outage.reads == "zero":
+        return False
+    # The blocks of each source and those before them, not as many numbers as there are blocks.
+    counts = [min(columns.shape[1] // 3 * 2, values.size // 3) for columns in sources]
+    rests = [fit_robustly(one[:, :count], values)[1] for one, count in zip(sources, counts, strict=True)]
+    least = min(one.scale for one in fits)
+    if outage.reads == "one value":
+        stands = float(_rate_repeating(values, fits).sum())
+        return max(float(list_likelihoods(rest, least).sum()) for rest in rests) > stands - price
+    plain = float(list_likelihoods(values, float(np.hypot(find_scale(values), least))).sum())
+    return any(
+        float(list_likelihoods(rest, float(np.hypot(find_scale(rest), least))).sum())
+        > plain + 0.5 * count * np.log(values.size)
+        for rest, count in zip(rests, counts, strict=True)
+    )
+
+
+def _describe(name: str, side: Held, start: float, end: float, nats: float) -> Outage:
+    """The span with the readings that repeat, from the first one on."""
+    first, last = np.searchsorted(side.times, (start, end)).tolist()
+    read = side.values[first:last]
+    is_exact = read.size > 1 and float(np.mean(np.diff(read) == 0.0)) > _EXACT
+    if not is_exact:
+        return Outage(name, start, end, "noise", nats)
+    value = float(np.median(read))
+    same = side.values == value
+    while first > 0 and same[first - 1]:
+        first -= 1
+    while last < same.size and same[last]:
+        last += 1
+    start = float(side.times[first]) if first else -np.inf
+    end = float(side.times[last]) if last < same.size else np.inf
+    return Outage(name, start, end, "zero" if value == 0.0 else "one value", nats)
+
+
+def _follow_best(
+    values: Floats, there: Flags, sources: Sequence[Floats], broad: Floats, least: float
+) -> tuple[list[_Follows], float]:
+    """How a side follows each source in the part of the run in which it does so best, and by how much.
+
+    An encoder may be dead in most of it: following counts by what it gains over noise and over one value.
+    """
+    best, most = list[_Follows](), 0.0
+    number, divided = np.arange(values.size), 1
+    while divided <= _PARTS:
+        for part in range(divided):
+            rows = there & (number * divided // values.size == part)
+            if rows.sum() < _SMALLEST_PART:
+                continue
+            fits, gain = _rate_following(values, rows, sources, broad, least)
+            lives = there & (gain > 0.0)
+            if lives.sum() >= _SMALLEST_PART:
+                fits, gain = _rate_following(values, lives, sources, broad, least)
+            total = float(np.maximum(gain, 0.0)[there].sum())
+            if total > most:
+                most, best = total, fits
+        divided *= 2
+    return best, most
+
+
+def _rate_following(
+    values: Floats, rows: Flags, sources: Sequence[Floats], broad: Floats, least: float
+) -> tuple[list[_Follows], Floats]:
+    """Fits to some blocks, and the gain in likelihood of following over noise and over one value."""
+    fits = [_fit(columns, values, rows, least) for columns in sources]
+    usual = np.max([one.rate(values) for one in fits], axis=0)
+    return fits, usual - np.maximum(broad, _rate_repeating(values, fits))
+
+
+def _rate_repeating(values: Floats, fits: Sequence[_Follows]) -> Floats:
+    """Log-likelihood of every block if it has the value of the one before."""
+    return list_likelihoods(np.diff(values, prepend=values[0]), min(one.scale for one in fits))
+
+
+def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: float) -> list[Outage]:
+    """Silences of a side in which it should turn."""
+    steps = blocks.steps
+    begins = steps.start[blocks.begins]
+    edges = np.concatenate(([steps.start[0]], side.times, [steps.end[-1]]))
+    made = []
+    for index in np.flatnonzero(np.diff(edges) > _SILENT_S).tolist():
+        start, end = edges[index], edges[index + 1]
+        inside = (begins >= start) & (begins + BLOCK_S <= end)
+        if (np.abs(expected[inside]) > LIVE_SHARE * top).sum() * BLOCK_S > 0.5 * _SILENT_S:
+            is_last = index == side.times.size
+            made.append(Outage(name, float(start), np.inf if is_last else float(end), "nothing", np.inf))
+    return made

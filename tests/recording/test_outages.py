@@ -1,0 +1,197 @@
+"""An encoder that dies during a run is found, by what the other signals say, and left out."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_motion import Drive, command, draw, measured, sides, tabulate
+from mcap_ros2.writer import Writer
+
+from pipeline.job import Options
+from pipeline.job.keys import set_up_log
+from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.outages import Outage, find_outages
+from pipeline.recording.readings import SIDES, Held, Reading
+
+DIES, LIVES = 40.0, 70.0
+
+
+def kill(side: Held, kind: str, end: float = np.inf, start: float = DIES) -> Held:
+    """A side whose encoder dies at a time, and comes back at another."""
+    times, values = side.times, side.values.copy()
+    inside = (times >= start) & (times < end)
+    if kind == "silent":
+        return Held(times[~inside], values[~inside])
+    last = values[np.flatnonzero(inside)[0] - 1]
+    noise = np.random.default_rng(3).normal(0.0, 4.0, values.size)
+    shown = {"zero": np.zeros(values.size), "held": np.full(values.size, last), "noise": noise}[kind]
+    values[inside] = shown[inside]
+    return Held(times, values)
+
+
+def look(drive: Drive, wheels: Reading, *, asked: bool = True, seen: bool = True) -> list[Outage]:
+    """Outages of a drive's wheels by its command and its poses."""
+    motion = measured(tabulate(drive)) if seen else None
+    one = command(drive)
+    rolled = motion or roll_wheels(sides(drive))
+    assert rolled is not None
+    one.explain(rolled)
+    pair = dict(zip(SIDES, (wheels.first, wheels.second), strict=True))
+    return find_outages({k: v for k, v in pair.items() if v}, (0.0, 0.0), one if asked else None, motion)
+
+
+READS = {"zero": "zero", "held": "one value", "noise": "noise", "silent": "nothing"}
+
+
+@pytest.mark.parametrize("kind", READS)
+@pytest.mark.parametrize("side", [*SIDES, "both"])
+@pytest.mark.parametrize("end", [np.inf, LIVES])
+def test_a_dead_encoder_is_found(kind: str, side: str, end: float) -> None:
+    drive = draw(21)
+    wheels = sides(drive)
+    if side in {"left", "both"}:
+        wheels = replace(wheels, first=kill(wheels.first, kind, end))
+    if side in {"right", "both"}:
+        wheels = replace(wheels, second=kill(wheels.second, kind, end))
+    (found,) = look(drive, wheels)
+    assert (found.side, found.reads) == (side, READS[kind])
+    assert found.start == pytest.approx(DIES, abs=1.0)
+    assert found.end == pytest.approx(end, abs=1.5)
+
+
+@pytest.mark.parametrize("kind", READS)
+@pytest.mark.parametrize(("asked", "seen"), [(False, True), (True, False)])
+def test_one_other_signal_and_the_other_side_are_enough(kind: str, *, asked: bool, seen: bool) -> None:
+    drive = draw(22)
+    wheels = sides(drive)
+    (found,) = look(drive, replace(wheels, first=kill(wheels.first, kind)), asked=asked, seen=seen)
+    assert (found.side, found.reads) == ("left", READS[kind])
+
+
+def test_an_encoder_that_dies_early_is_found() -> None:
+    drive = draw(23)
+    wheels = sides(drive)
+    (found,) = look(drive, replace(wheels, second=kill(wheels.second, "held", start=15.0)))
+    assert (found.side, found.reads) == ("right", "one value")
+    assert found.start == pytest.approx(15.0, abs=1.0)
+
+
+def test_wheels_that_follow_are_never_left_out() -> None:
+    for seed in range(30, 40):
+        drive = draw(seed)
+        assert look(drive, sides(drive)) == []
+
+
+def test_a_wheel_that_stands_and_turns_the_body_is_no_dead_encoder() -> None:
+    """What the poses confirm is not the encoder's fault: that side of the drive stands."""
+    drive = draw(24)
+    stands = drive.time > DIES
+    left, right = drive.wheels()
+    left = np.where(stands, 0.0, left)
+    speed, rate = 0.05 * (left + right), 0.77 * 0.2 * (right - left)
+    yaw = np.cumsum(rate) * 0.01
+    place = np.cumsum(speed * np.exp(1j * yaw)) * 0.01
+    stuck = replace(drive, speed=speed, rate=rate, yaw=yaw[drive.rows], place=place[drive.rows])
+    assert look(stuck, sides(stuck)) == []
+
+
+def test_both_wheels_that_stand_while_the_body_is_pushed_are_no_dead_encoders() -> None:
+    """Without a command nobody knows whether the body was pushed."""
+    drive = draw(25)
+    wheels = sides(drive)
+    pushed = replace(wheels, first=kill(wheels.first, "zero"), second=kill(wheels.second, "zero"))
+    assert look(drive, pushed, asked=False) == []
+
+
+FLOAT = "float64 data\n"
+TWIST = """Vector3 linear
+Vector3 angular
+================================================================================
+MSG: geometry_msgs/Vector3
+float64 x
+float64 y
+float64 z
+"""
+POSE = """std_msgs/Header header
+geometry_msgs/Pose pose
+================================================================================
+MSG: std_msgs/Header
+builtin_interfaces/Time stamp
+string frame_id
+================================================================================
+MSG: builtin_interfaces/Time
+int32 sec
+uint32 nanosec
+================================================================================
+MSG: geometry_msgs/Pose
+Point position
+Quaternion orientation
+================================================================================
+MSG: geometry_msgs/Point
+float64 x
+float64 y
+float64 z
+================================================================================
+MSG: geometry_msgs/Quaternion
+float64 x
+float64 y
+float64 z
+float64 w
+"""
+BEGUN = 1_700_000_000
+
+
+def write_log(drive: Drive, wheels: Reading, path: Path) -> Path:
+    """A log with a topic a side, a Twist and poses."""
+    rows: list[tuple[float, str, dict[str, object]]] = []
+    for side, one in zip(SIDES, (wheels.first, wheels.second), strict=True):
+        assert one is not None
+        rows += [
+            (time, f"/{side}_wheel/velocity", {"data": value})
+            for time, value in zip(one.times.tolist(), one.values.tolist(), strict=True)
+        ]
+    for time, (ahead, turn) in zip(drive.time[::10].tolist(), drive.asked[::10].tolist(), strict=True):
+        rows.append((time, "/cmd_vel", {"linear": {"x": ahead, "y": 0.0, "z": 0.0},
+                                        "angular": {"x": 0.0, "y": 0.0, "z": turn}}))  # fmt: skip
+    for time, place, yaw in zip(drive.time[drive.rows].tolist(), drive.place, drive.yaw, strict=True):
+        stamp = {"sec": BEGUN + int(time), "nanosec": round(time % 1.0 * 1e9)}
+        pose = {
+            "position": {"x": place.real, "y": place.imag, "z": 0.0},
+            "orientation": {"x": 0.0, "y": 0.0, "z": np.sin(0.5 * yaw), "w": np.cos(0.5 * yaw)},
+        }
+        header = {"stamp": stamp, "frame_id": "map"}
+        rows.append((time, "/lio/pose", {"header": header, "pose": pose}))
+    with path.open("wb") as file:
+        writer = Writer(file)
+        types = {
+            "velocity": writer.register_msgdef("std_msgs/msg/Float64", FLOAT),
+            "cmd_vel": writer.register_msgdef("geometry_msgs/msg/Twist", TWIST),
+            "pose": writer.register_msgdef("geometry_msgs/msg/PoseStamped", POSE),
+        }
+        for time, topic, content in sorted(rows, key=lambda row: row[0]):
+            at = BEGUN * 10**9 + round(time * 1e9)
+            writer.write_message(topic, types[topic.rsplit("/")[-1]], content, at, at)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("kind", ["held", "silent"])
+def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> None:
+    drive = draw(26)
+    wheels = sides(drive)
+    log = write_log(drive, replace(wheels, first=kill(wheels.first, kind, LIVES)), tmp_path / "log.mcap")
+    setup = set_up_log(log, Options(out=tmp_path))
+    (told,) = [one for one in setup.choice.findings if one.id == "encoder_dead"]
+    assert told.severity == "warning"
+    assert "the left wheels' encoder reads nothing from 40 to 70 s" in told.text
+    (span,) = setup.configuration.wheels.left_out
+    line = f'left_out = [{{side = "left", start_s = {span.start_s:g}, end_s = {span.end_s:g}}}]'
+    assert line in told.text
+    for given, left_out in ((line, [span]), ("left_out = []", [])):
+        (tmp_path / "line.toml").write_text(f"[wheels]\n{given}")
+        settled = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))
+        assert settled.configuration.wheels.left_out == left_out
+        assert "encoder_dead" not in {one.id for one in settled.choice.findings}
