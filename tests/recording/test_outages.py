@@ -10,9 +10,9 @@ import pytest
 from drawn_motion import Drive, command, draw, measured, sides, tabulate
 from mcap_ros2.writer import Writer
 
-from pipeline.job import Options
-from pipeline.job.keys import set_up_log
+from pipeline.analysis import Options
 from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
 
