@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, product
 from typing import Literal
 
 import numpy as np
@@ -167,7 +167,11 @@ def _list_factors(*units: str) -> dict[str, float]:
 SPEEDS = _list_factors("m/s", "km/h", "mm/s", "cm/s")
 RATES = _list_factors("rad/s", "deg/s", "mrad/s")
 WHEELS = _list_factors("rad/s", "rpm", "deg/s")
-_STRANGE = {"rpm": 4.0, "deg/s": 4.0, "km/h": 4.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0}
+USUAL = ("m/s", "rad/s", "rad")
+"""Units of message types."""
+_STRANGE = {
+    "rpm": 4.0, "deg/s": 4.0, "deg": 3.0, "km/h": 3.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0,
+}  # fmt: skip
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
 _NAMED = 4.0
 """Surprise of another unit than that which a topic's name says [nats]."""
@@ -175,33 +179,111 @@ _GOOD = 0.7
 """Least share of the motion that a signal explains whose unit is in question."""
 _WIN = 5.0
 """Least gain of another unit [nats]."""
+_CLEAR = 2.0
+"""The same of one whose factor is that of the gain; with less both are told [nats]."""
+_EXACT = 0.03
+"""Spread of the logarithm of a gain of a robot that moves as it is commanded."""
+_COMMON, _OWN = 0.5, (0.35, 0.5)
+"""The same of one that does not: of both gains, by a wrong radius or slip, and of each alone; turning slips
+more than driving."""
 
 
-def find_body_units(gains: Sequence[float | None], shares: Sequence[float]) -> tuple[str, str]:
-    """Units of a body command by its gains, which slip and a wrong radius change by a factor of two at most.
+@dataclass(frozen=True)
+class Units:
+    """Units of a signal's two inputs.
 
-    A poor fit attenuates a gain, and shows no unit.
+    Attributes:
+        likeliest: of the first and the second input.
+        rival: another pair that is as likely; None if there is none.
+    """
+
+    likeliest: tuple[str, str]
+    rival: tuple[str, str] | None = None
+
+
+def find_body_units(gains: Sequence[float | None], shares: Sequence[float], name: str = "") -> Units:
+    """Units of a body command by its gains.
+
+    Half of all robots move as they are commanded, to within a few percent: a gain that is a unit's factor is
+    rarely anything else. A poor fit attenuates a gain, and shows no unit.
 
     Args:
         gains: motion over command, ahead and turning; None where it is not excited.
         shares: part of the motion that is explained, of both.
+        name: of the signals; a unit that it names is no surprise.
     """
     gains = [gain if share > _GOOD else None for gain, share in zip(gains, shares, strict=True)]
-    costs = {}
-    for speed, of_speed in SPEEDS.items():
-        for rate, of_rate in RATES.items():
-            # A gain is the motion in SI units over the command in its own unit.
-            pairs = zip(gains, (of_speed, of_rate), strict=True)
-            logs = [float(np.log(abs(gain) / of)) for gain, of in pairs if gain]
-            common = float(np.mean(logs)) if logs else 0.0
-            costs[speed, rate] = (
-                common**2 / (2 * 0.6**2)
-                + sum((one - common) ** 2 for one in logs) / (2 * 0.35**2)
-                + _STRANGE.get(speed, 0.0)
-                + _STRANGE.get(rate, 0.0)
-            )
+    usual, costs, exact = ("m/s", "rad/s"), dict[tuple[str, str], float](), set[tuple[str, str]]()
+    for pair in product(SPEEDS, RATES):
+        # A gain is the motion in SI units over the command in its own unit.
+        factors = (SPEEDS[pair[0]], RATES[pair[1]])
+        logs = [np.log(abs(gain) / of) if gain else None for gain, of in zip(gains, factors, strict=True)]
+        surprise = sum(0.0 if _is_named(unit, name) else _STRANGE.get(unit, 0.0) for unit in pair)
+        costs[pair] = surprise - _rate_gains(logs)
+        strange = [log for log, unit, one in zip(logs, pair, usual, strict=True) if unit != one]
+        if all(log is not None and abs(log) < 4.0 * _EXACT for log in strange):
+            exact.add(pair)
     best = min(costs, key=lambda key: costs[key])
-    return best if costs["m/s", "rad/s"] - costs[best] > _WIN else ("m/s", "rad/s")
+    gain = costs[usual] - costs[best]
+    if gain > _WIN or (best in exact and best != usual and gain > _CLEAR):
+        return Units(best)
+    rivals = [pair for pair in exact if pair != usual and costs[pair] < costs[usual] + _CLEAR]
+    return Units(usual, min(rivals, key=lambda pair: costs[pair], default=None))
+
+
+def _is_named(unit: str, name: str) -> bool:
+    """Whether the name of a signal says its unit."""
+    word = {"km/h": "km_?p?_?h|kph", "deg/s": "deg", "deg": "deg", "rpm": "rpm"}.get(unit)
+    return word is not None and bool(re.search(rf"(?<![a-z])(?:{word})(?![a-z])", name.lower()))
+
+
+def _rate_gains(logs: Sequence[float | None]) -> float:
+    """Log-likelihood of the logarithms of a command's gains in the right units."""
+    known = [index for index, one in enumerate(logs) if one is not None]
+    seen = np.array([logs[index] for index in known], dtype=np.float64)
+    if not known:
+        return 0.0
+    total = 0.0
+    for common in (_EXACT, _COMMON):
+        for own in product(*((_EXACT, _OWN[index]) for index in known)):
+            spread = common**2 + np.diag(np.square(own))
+            quadratic = float(seen @ np.linalg.solve(spread, seen))
+            total += np.exp(-0.5 * quadratic) / np.sqrt(np.linalg.det(spread)) / 2.0 ** (1 + len(known))
+    return float(np.log(total + 1e-300))
+
+
+_LENGTH = (0.8, 1.0)
+"""Usual wheelbase [m], and the spread of its logarithm: models of a hand's length to lorries."""
+
+
+def _rate_wheelbase(length: float | None, known: float | None) -> float:
+    """Log-likelihood of a wheelbase [m] by the motion, against a known one or the usual ones."""
+    middle, spread = (known, 0.35) if known else _LENGTH
+    apart = 2.0 if not length else np.log(length / middle) / spread
+    return float(-0.5 * min(apart**2, 40.0) - np.log(spread))
+
+
+def find_steering_unit(
+    nats: Mapping[str, float], lengths: Mapping[str, float | None], known: float | None, name: str
+) -> Units:
+    """Unit of a steering angle by how well it explains the turning, and by the wheelbase that it means.
+
+    Args:
+        nats: gain in log-likelihood by unit, ``rad`` and ``deg``.
+        lengths: wheelbase by unit [m]; None where the body does not turn by it.
+        known: the vehicle's wheelbase [m]; None if it is not known.
+        name: of the signals.
+    """
+    scores = {
+        unit: nats[unit]
+        + _rate_wheelbase(lengths[unit], known)
+        - (0.0 if _is_named(unit, name) else _STRANGE.get(unit, 0.0))
+        for unit in nats
+    }
+    gain = scores["deg"] - scores["rad"]
+    if gain > _CLEAR:
+        return Units(("", "deg"))
+    return Units(("", "rad"), ("", "deg") if gain > -_CLEAR else None)
 
 
 def _shrink(log: float, share: float) -> float:

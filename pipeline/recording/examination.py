@@ -14,13 +14,17 @@ from pipeline.core.arrays import Floats
 from pipeline.logs import LogData
 from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
+    RATES,
     SPEEDS,
+    USUAL,
     WHEELS,
     Axis,
     Reversal,
+    Units,
     find_body_units,
     find_frame,
     find_reversed,
+    find_steering_unit,
     find_wheel_unit,
     is_named_measured,
     rate_command,
@@ -152,12 +156,14 @@ class Candidate:
         reading: its signals.
         rank: its place by type and name among those of its role.
         is_measured: whether type and name say that it is measured.
+        steering: unit of its steering angle.
     """
 
     source: DriveSource
     reading: Reading
     rank: int
     is_measured: bool
+    steering: Units = field(default_factory=lambda: Units(("", "rad")))
 
     @property
     def is_sure(self) -> bool:
@@ -232,6 +238,8 @@ class Examination:
         readings = [*(drive.reading for drive in drives), *gyros]
         for one in readings:
             one.explain(motion)
+        for drive in drives:
+            self._settle_steering(drive, motion)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
         if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
@@ -692,36 +700,68 @@ class Examination:
 
     # Units.
 
+    def _settle_steering(self, drive: Candidate, motion: Motion) -> None:
+        """Read a steering angle in the unit in which the body turns by it; which one it is is told later."""
+        reading = drive.reading
+        section = self._find_section(drive.source, is_measured=drive.is_measured)
+        is_free = drive.source.form is DriveForm.STEERING and section.steering_unit is None
+        if not is_free or drive.source.signals[1].unit or not isinstance(reading.second, Bent):
+            return
+        tried = {"rad": reading, "deg": replace(reading, second=reading.second.rescale(np.pi / 180.0))}
+        nats, lengths = {}, dict[str, float | None]()
+        for unit, one in tried.items():
+            made = one.explain(motion) if unit != "rad" else one.explained
+            nats[unit] = 0.0 if made is None else float((made.turned.blocks - made.none[1]).sum())
+            turns = made is not None and made.sign("turned") and made.sign("ahead")
+            lengths[unit] = (
+                abs(float(made.ahead.gains[0] / made.turned.gains[0])) if made is not None and turns else None
+            )
+        known = self.vehicle.wheelbase_m if self.is_known else None
+        drive.steering = find_steering_unit(nats, lengths, known, str(drive.source))
+        if drive.steering.likeliest[1] == "deg":
+            reading.second, reading.explained = tried["deg"].second, tried["deg"].explained
+
     def _find_units(self, command: Candidate | None, wheels: Candidate | None) -> None:
-        if command is not None and command.reading.form == "body" and self._is_usable(command):
+        for role, one in (("command", command), ("wheels", wheels)):
+            if one is not None and one.reading.form == "steering":
+                self._report_units(role, one, one.steering)
+        if command is not None and command.reading.form != "sides" and self._is_usable(command):
             explained = command.reading.explained
             if explained is None:
                 return
+            # A car turns by its wheelbase, and not by a unit.
+            turns = command.reading.form == "body" and command.sign("turned")
             gains = [
-                abs(float(one.gains[0])) if drive_sign else None
-                for drive_sign, one in (
-                    (command.sign("ahead"), explained.ahead),
-                    (command.sign("turned"), explained.turned),
-                )
+                abs(float(one.gains[0])) if is_seen else None
+                for is_seen, one in ((command.sign("ahead"), explained.ahead), (turns, explained.turned))
             ]
-            speed, rate = find_body_units(gains, explained.shares)
-            section = self.configuration.command
-            if speed != "m/s" and section.unit is None:
-                self._correct(
-                    "command",
-                    f"the speed of {command.source} is in {speed}",
-                    f'unit = "{speed}"',
-                    {"unit": speed},
-                )
-            if rate != "rad/s" and section.yaw_unit is None:
-                self._correct(
-                    "command",
-                    f"the yaw rate of {command.source} is in {rate}",
-                    f'yaw_unit = "{rate}"',
-                    {"yaw_unit": rate},
-                )
+            units = find_body_units(gains, explained.shares, str(command.source))
+            self._report_units("command", command, units, gains)
         if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
             self._find_wheel_unit(command, wheels)
+
+    def _report_units(
+        self, role: str, drive: Candidate, units: Units, gains: Sequence[float | None] = (None, None)
+    ) -> None:
+        """Correct units of a drive, or tell two readings that are as likely."""
+        section = getattr(self.configuration, role)
+        turn_key, turn = (
+            ("steering_unit", "steering angle") if drive.steering is units else ("yaw_unit", "yaw rate")
+        )
+        for index, (key, what) in enumerate((("unit", "speed"), (turn_key, turn))):
+            unit, of = units.likeliest[index], f"the {what} of {drive.source}"
+            if getattr(section, key) is not None or not unit:
+                continue
+            if unit not in USUAL:
+                self._correct(role, f"{of} is in {unit}", f'{key} = "{unit}"', {key: unit})
+            elif units.rival is not None and units.rival[index] != unit:
+                other, gain = units.rival[index], gains[index]
+                seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"
+                text = (
+                    f"{of} may be in {other}{seen}; it is taken as {unit}, and no other signal tells which "
+                    f'({key} = "{other}" under [{role}] in run.toml takes it so, {key} = "{unit}" settles it)'
+                )
+                self.findings.append(Finding("unit_undecided", "warning", text, where=role, value=gain))
 
     def _find_wheel_unit(self, command: Candidate | None, wheels: Candidate) -> None:
         """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
@@ -732,7 +772,8 @@ class Examination:
             driven = self.driven = explain_wheels(command.reading, wheels.reading)
         if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
             # Wheels follow a command closely on any ground.
-            gain = (radius if command.reading.form == "sides" else 1.0) / float(driven.ahead.gains[0])
+            of_command = radius if command.reading.form == "sides" else self._command_factors()[0]
+            gain = of_command / float(driven.ahead.gains[0])
         elif explained is not None and wheels.is_sure and wheels.sign("ahead"):
             gain, share = float(explained.ahead.gains[0]), explained.shares[0]
         else:
@@ -784,7 +825,7 @@ class Examination:
         if self.is_known or not is_body:
             gain, made_of = None, command.reading.explained
             if is_body and made_of is not None and command.sign("ahead") > 0:
-                gain = float(made_of.ahead.gains[0]) / SPEEDS.get(made.command.unit or "m/s", 1.0)
+                gain = float(made_of.ahead.gains[0]) / self._command_factors()[0]
             late = None if self.driven is None else (self.driven.lag, self.driven.delay)
             alignment, findings = measure_command_scale(
                 asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
@@ -810,7 +851,8 @@ class Examination:
         if car is not None and car.reading.explained is not None and car.sign("turned"):
             explained = car.reading.explained
             ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
-            scale = ahead if car is wheels else 1.0
+            # A car that is slower than commanded turns by the speed that it has.
+            scale = ahead if car.sign("ahead") else 1.0
             error = scale / bent / abs(float(explained.turned.t[0]))
             is_rolled = car is wheels and car.sign("ahead")
             rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if is_rolled else None
@@ -836,8 +878,15 @@ class Examination:
         ):
             lengths = measure_controller(command.reading, wheels.reading)
             if lengths is not None:
-                made = replace(made, radius=_scale(lengths[0], self._wheel_factor()), track=lengths[1])
+                speed, rate = self._command_factors()
+                radius = _scale(lengths[0], speed * self._wheel_factor())
+                made = replace(made, radius=radius, track=_scale(lengths[1], speed / rate))
         return made
+
+    def _command_factors(self) -> tuple[float, float]:
+        """Factors from a body command as it was read to m/s and rad/s."""
+        found = self.changes.get("command", {})
+        return SPEEDS[str(found.get("unit", "m/s"))], RATES[str(found.get("yaw_unit", "rad/s"))]
 
     def _wheel_factor(self) -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""
@@ -883,8 +932,12 @@ class Examination:
 _HALF_TURN = 180.0
 _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0"},
-    "wheels": {"unit": 'unit = "rad/s"'},
-    "command": {"unit": 'unit = "m/s"', "yaw_unit": 'yaw_unit = "rad/s"'},
+    "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
+    "command": {
+        "unit": 'unit = "m/s"',
+        "yaw_unit": 'yaw_unit = "rad/s"',
+        "steering_unit": 'steering_unit = "rad"',
+    },
 }
 """Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
 _AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}

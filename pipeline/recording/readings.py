@@ -119,6 +119,7 @@ class Bent(Held):
     """Speed times the tangent of a steering angle, each lagged before the product."""
 
     def __init__(self, speed: Held, times: Floats, angle: Floats) -> None:
+        self._recorded = times, angle
         self._angle = Held(times, angle)
         self.__dict__.update({key: value for key, value in vars(speed).items() if key != "_sums"})
         self._sums = {}
@@ -129,6 +130,11 @@ class Bent(Held):
                 self._angle.times, self._start + GRID_S * np.arange(speed.grid.size), side="right"
             )
             self._bent = np.where(at > 0, self._angle.values[np.maximum(at - 1, 0)], 0.0)
+
+    def rescale(self, factor: float) -> Bent:
+        """The same with an angle in another unit."""
+        times, angle = self._recorded
+        return Bent(self._speed, times, factor * angle)
 
     def lagged(self, lag: float) -> Floats:
         """The product on the grid, both factors after a first-order lag."""

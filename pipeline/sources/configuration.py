@@ -133,6 +133,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         unit: unit of wheel speeds, or of wheel angles; by default that of the message type.
         per_turn: ticks per turn of the wheel.
         yaw_unit: unit of the yaw rate of a body command; by default that of the message type.
+        steering_unit: unit of the steering angle; by default that of the message type.
         sign: -1 if forward is recorded as negative.
         reversed: side that counts backward.
         exchanged: whether left and right are exchanged.
@@ -155,6 +156,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     unit: Unit | None = None
     per_turn: Positive | None = None
     yaw_unit: Literal["rad/s", "deg/s", "mrad/s"] | None = None
+    steering_unit: Literal["rad", "deg"] | None = None
     sign: Literal[1, -1] = 1
     reversed: Literal["left", "right"] | None = None
     exchanged: bool = False

@@ -369,7 +369,8 @@ def read_signal(
         per_turn = float(np.nanmedian(reading.numbers(columns, signal.per_turn))) or None
     if per_turn is not None:
         own["ticks"] = OwnUnit(per_turn / (2.0 * np.pi), "rad")
-    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else section.yaw_unit
+    second = section.steering_unit if source.form is DriveForm.STEERING else section.yaw_unit
+    asked = section.unit if number == 0 or source.form is DriveForm.SIDES else second
     unit = asked or signal.unit or _USUAL_UNITS[source.form][number]
     if unit == "ticks":
         raw = unwrap_counter(raw)

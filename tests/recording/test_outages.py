@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_motion import Drive, command, draw, measured, sides, tabulate
-from mcap_ros2.writer import Writer
+from written_logs import write_log
 
 from pipeline.analysis import Options
-from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
+from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
 
@@ -106,83 +106,13 @@ def test_both_wheels_that_stand_while_the_body_is_pushed_are_no_dead_encoders() 
     assert look(drive, pushed, asked=False) == []
 
 
-FLOAT = "float64 data\n"
-TWIST = """Vector3 linear
-Vector3 angular
-================================================================================
-MSG: geometry_msgs/Vector3
-float64 x
-float64 y
-float64 z
-"""
-POSE = """std_msgs/Header header
-geometry_msgs/Pose pose
-================================================================================
-MSG: std_msgs/Header
-builtin_interfaces/Time stamp
-string frame_id
-================================================================================
-MSG: builtin_interfaces/Time
-int32 sec
-uint32 nanosec
-================================================================================
-MSG: geometry_msgs/Pose
-Point position
-Quaternion orientation
-================================================================================
-MSG: geometry_msgs/Point
-float64 x
-float64 y
-float64 z
-================================================================================
-MSG: geometry_msgs/Quaternion
-float64 x
-float64 y
-float64 z
-float64 w
-"""
-BEGUN = 1_700_000_000
-
-
-def write_log(drive: Drive, wheels: Reading, path: Path) -> Path:
-    """A log with a topic a side, a Twist and poses."""
-    rows: list[tuple[float, str, dict[str, object]]] = []
-    for side, one in zip(SIDES, (wheels.first, wheels.second), strict=True):
-        assert one is not None
-        rows += [
-            (time, f"/{side}_wheel/velocity", {"data": value})
-            for time, value in zip(one.times.tolist(), one.values.tolist(), strict=True)
-        ]
-    for time, (ahead, turn) in zip(drive.time[::10].tolist(), drive.asked[::10].tolist(), strict=True):
-        rows.append((time, "/cmd_vel", {"linear": {"x": ahead, "y": 0.0, "z": 0.0},
-                                        "angular": {"x": 0.0, "y": 0.0, "z": turn}}))  # fmt: skip
-    for time, place, yaw in zip(drive.time[drive.rows].tolist(), drive.place, drive.yaw, strict=True):
-        stamp = {"sec": BEGUN + int(time), "nanosec": round(time % 1.0 * 1e9)}
-        pose = {
-            "position": {"x": place.real, "y": place.imag, "z": 0.0},
-            "orientation": {"x": 0.0, "y": 0.0, "z": np.sin(0.5 * yaw), "w": np.cos(0.5 * yaw)},
-        }
-        header = {"stamp": stamp, "frame_id": "map"}
-        rows.append((time, "/lio/pose", {"header": header, "pose": pose}))
-    with path.open("wb") as file:
-        writer = Writer(file)
-        types = {
-            "velocity": writer.register_msgdef("std_msgs/msg/Float64", FLOAT),
-            "cmd_vel": writer.register_msgdef("geometry_msgs/msg/Twist", TWIST),
-            "pose": writer.register_msgdef("geometry_msgs/msg/PoseStamped", POSE),
-        }
-        for time, topic, content in sorted(rows, key=lambda row: row[0]):
-            at = BEGUN * 10**9 + round(time * 1e9)
-            writer.write_message(topic, types[topic.rsplit("/")[-1]], content, at, at)
-        writer.finish()
-    return path
-
-
 @pytest.mark.parametrize("kind", ["held", "silent"])
 def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> None:
     drive = draw(26)
     wheels = sides(drive)
-    log = write_log(drive, replace(wheels, first=kill(wheels.first, kind, LIVES)), tmp_path / "log.mcap")
+    log = write_log(
+        tmp_path / "log.mcap", drive, wheels=replace(wheels, first=kill(wheels.first, kind, LIVES))
+    )
     setup = set_up_log(log, Options(out=tmp_path))
     (told,) = [one for one in setup.choice.findings if one.id == "encoder_dead"]
     assert told.severity == "warning"

@@ -10,9 +10,11 @@ import pytest
 from drawn_motion import GAIN, LAG, RADIUS, STEP, TRACK, command, draw, measured, sides, tabulate
 
 from pipeline.recording.evidence import (
+    Units,
     find_body_units,
     find_frame,
     find_reversed,
+    find_steering_unit,
     find_wheel_unit,
     rate_command,
 )
@@ -120,22 +122,64 @@ def test_of_two_that_contradict_each_other_both_may_be_wrong() -> None:
     assert {made.faults, *made.rivals} == {("pose_backward",), ("command_ahead",)}
 
 
+DEGREE = np.pi / 180.0
+
+
 @pytest.mark.parametrize(
     ("gains", "units"),
     [
         ((0.95, 0.6), ("m/s", "rad/s")),
-        ((1.0, 0.77 * np.pi / 180.0), ("m/s", "deg/s")),
-        ((1.0 / 3.6, 0.9), ("m/s", "rad/s")),
+        ((1.0, 0.77 * DEGREE), ("m/s", "deg/s")),
+        ((1.0 / 3.6, 0.9), ("km/h", "rad/s")),
+        ((0.99 / 3.6, 0.77), ("km/h", "rad/s")),
         ((1e-3, 0.9e-3), ("mm/s", "mrad/s")),
         ((0.3, 0.3), ("m/s", "rad/s")),
+        ((0.4, 0.5), ("m/s", "rad/s")),
+        ((0.01, None), ("cm/s", "rad/s")),
     ],
 )
-def test_units_of_a_body_command(gains: tuple[float, float], units: tuple[str, str]) -> None:
-    assert find_body_units(gains, (0.95, 0.95)) == units
+def test_units_of_a_body_command(gains: tuple[float, float | None], units: tuple[str, str]) -> None:
+    assert find_body_units(gains, (0.95, 0.95)) == Units(units)
+
+
+def test_of_two_readings_that_are_as_likely_both_are_told() -> None:
+    """Straight ahead a third of the speed is km/h, or a robot that is a third as fast."""
+    made = find_body_units((1.0 / 3.6, None), (0.95, 0.95))
+    assert made == Units(("m/s", "rad/s"), ("km/h", "rad/s"))
+    assert find_body_units((1.0 / 3.6, None), (0.95, 0.95), "/cmd_kph.data").likeliest == ("km/h", "rad/s")
+    assert find_body_units((0.35, None), (0.95, 0.95)) == Units(("m/s", "rad/s"))
 
 
 def test_a_poor_fit_shows_no_unit() -> None:
-    assert find_body_units((0.9, 0.076), (0.5, 0.1)) == ("m/s", "rad/s")
+    assert find_body_units((0.9, 0.076), (0.5, 0.1)) == Units(("m/s", "rad/s"))
+
+
+@pytest.mark.parametrize(
+    ("nats", "lengths", "known", "unit", "rival"),
+    [
+        # Large angles fit in their own unit only.
+        ((900.0, 100.0), (1.0, None), None, "rad", None),
+        ((100.0, 900.0), (None, 1.0), None, "deg", None),
+        # Small ones fit in both, and the wheelbase tells.
+        ((900.0, 900.0), (0.33, 0.0057), None, "rad", None),
+        ((900.0, 900.0), (57.0, 1.0), None, "deg", None),
+        ((900.0, 900.0), (10.0, 0.175), None, "rad", "deg"),
+        ((900.0, 900.0), (10.0, 0.175), 9.0, "rad", None),
+    ],
+)
+def test_unit_of_a_steering_angle(
+    nats: tuple[float, float],
+    lengths: tuple[float | None, float | None],
+    known: float | None,
+    unit: str,
+    rival: str | None,
+) -> None:
+    names = ("rad", "deg")
+    made = find_steering_unit(
+        dict(zip(names, nats, strict=True)), dict(zip(names, lengths, strict=True)), known, "/drive"
+    )
+    assert made.likeliest[1] == unit
+    assert (made.rival[1] if made.rival else None) == rival
 
 
 @pytest.mark.parametrize(

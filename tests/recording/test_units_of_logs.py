@@ -1,0 +1,72 @@
+"""Units of commands that no name says: logs of one drawn drive, and the line that settles each."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_motion import STEP, draw
+from written_logs import write_log
+
+from pipeline.analysis import Options
+from pipeline.recording.log_setup import LogSetup, set_up_log
+
+
+def set_up(log: Path, line: str = "") -> LogSetup:
+    (log.parent / "line.toml").write_text(f"[command]\n{line}")
+    return set_up_log(log, Options(out=log.parent, config=log.parent / "line.toml"))
+
+
+def test_a_speed_in_kilometres_per_hour(tmp_path: Path) -> None:
+    drive = draw(41)
+    faster = drive.asked * [3.6, 1.0]
+    setup = set_up(write_log(tmp_path / "log.mcap", drive, asked=faster))
+    told = " ".join(one.text for one in setup.choice.findings)
+    assert 'unit = "km/h"' in told
+    assert setup.configuration.command.unit == "km/h"
+    # The geometry is that of the command as it is meant.
+    assert setup.vehicle.wheel_radius_m == pytest.approx(0.1, rel=0.02)
+    assert setup.vehicle.track_width_m == pytest.approx(0.5, rel=0.02)
+
+
+def write_car(path: Path, speed: float, angle: float, wheelbase: float = 0.9) -> Path:
+    """A car that takes its commands in other units."""
+    drive = draw(42)
+    asked = np.column_stack([drive.asked[:, 0], 0.35 * drive.asked[:, 1]])
+    made = np.zeros_like(asked)
+    for k in range(1, made.shape[0]):
+        made[k] = made[k - 1] + STEP / 0.2 * (asked[k - 1] - made[k - 1])
+    rate = made[:, 0] * np.tan(made[:, 1]) / wheelbase
+    yaw = np.cumsum(rate) * STEP
+    place = np.cumsum(made[:, 0] * np.exp(1j * yaw)) * STEP
+    rng = np.random.default_rng(4)
+    rows = drive.rows
+    noise = rng.normal(0.0, 0.002, (3, rows.size))
+    drive = type(drive)(
+        drive.time,
+        drive.asked,
+        made[:, 0],
+        rate,
+        place[rows] + noise[0] + 1j * noise[1],
+        yaw[rows] + noise[2],
+        rows,
+    )
+    return write_log(path, drive, car=asked * [speed, angle])
+
+
+@pytest.mark.parametrize(
+    ("speed", "angle", "line"),
+    [(1.0, 1.0, ""), (1.0, 180.0 / np.pi, 'steering_unit = "deg"'), (3.6, 180.0 / np.pi, 'unit = "km/h"')],
+)
+def test_a_car_in_other_units(speed: float, angle: float, line: str, tmp_path: Path) -> None:
+    log = write_car(tmp_path / "log.mcap", speed, angle)
+    setup = set_up(log)
+    told = " ".join(one.text for one in setup.choice.findings)
+    assert line in told
+    assert ("unit" in told) == bool(line)
+    assert setup.configuration.command.steering_unit == ("deg" if angle != 1.0 else None)
+    assert setup.vehicle.wheelbase_m == pytest.approx(0.9, rel=0.03)
+    if line:
+        settled = [one.text for one in set_up(log, line).choice.findings]
+        assert not [text for text in settled if line in text]
