@@ -11,8 +11,8 @@ from drawn_motion import Drive, command, draw, measured, sides, tabulate
 from written_logs import write_log
 
 from pipeline.analysis import Options
-from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
 
