@@ -1,4 +1,4 @@
-"""Confidence intervals of fitted parameters, with the errors of clocks that a fit takes as given."""
+"""Confidence intervals of fitted parameters, with errors of clocks and lengths that a fit takes as given."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.state import Free
 
 _ALWAYS_CARRIED = 0.25
-"""Share of a clock's error invisible in residuals: lines between readings miss up to an eighth of a bend."""
+"""Share of an error invisible in residuals: lines between readings miss up to an eighth of a bend."""
 _RISEN = 3.84
 """Rise of chi-square at the ends of a 95 % interval."""
 _STRONG = 0.8
@@ -160,7 +160,7 @@ def estimate_part(fit: PartFit) -> Estimates:
     ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
     plain = join_covariance(fit, known + np.diag(1.0 / ranges**2))
     carried = carry_clocks(fit, plain)
-    variance = np.diag(plain) + carried
+    variance = np.diag(plain) + carried + carry_lengths(fit, plain)
     errors = np.where(observable, np.sqrt(variance), math.nan)
     for index, number in enumerate(fit.free):
         if not number.is_smooth:
@@ -207,13 +207,33 @@ def carry_clocks(fit: PartFit, covariance: Floats) -> Floats:
         mine, change = part.run == run, np.zeros((*fit.residual.shape, 1))
         late = part.shift_clock(fit.state, run, CLOCK_STEP_S) - fit.residual[mine]
         change[mine, :, 0] = -error * late / CLOCK_STEP_S
-        white = whiten_columns(fit, change)[:, 0]
-        influence = covariance @ (fit.white.columns.T @ white) / fit.overdispersion
-        # What the residuals say of the clock beside the numbers: its error after them.
-        shared = fit.white.columns.T @ white
-        alone = float(white @ white) - float(shared @ influence)
-        rest = 1.0 / (1.0 + max(alone, 0.0) / fit.overdispersion)
-        carried += influence**2 * max(rest, _ALWAYS_CARRIED**2)
+        carried += _carry(fit, covariance, change)
+    return carried
+
+
+def carry_lengths(fit: PartFit, covariance: Floats) -> Floats:
+    """Variance of each number by dimensions of the vehicle that were estimated from the log, shape (p,)."""
+    shifts = fit.part.list_length_shifts(fit.state)
+    return np.asarray(
+        sum((_carry(fit, covariance, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))
+    )
+
+
+def _carry(fit: PartFit, covariance: Floats, change: Floats) -> Floats:
+    """Variance of each number by one that the fit takes as given, shape (p,).
+
+    Args:
+        fit: the fit.
+        covariance: of its numbers, shape (p, p).
+        change: of the residuals by one standard error of what is given, shape (n, 3, 1).
+    """
+    white = whiten_columns(fit, change)[:, 0]
+    influence = covariance @ (fit.white.columns.T @ white) / fit.overdispersion
+    # What the residuals say of it beside the numbers: its error after them.
+    shared = fit.white.columns.T @ white
+    alone = float(white @ white) - float(shared @ influence)
+    rest = 1.0 / (1.0 + max(alone, 0.0) / fit.overdispersion)
+    carried: Floats = influence**2 * max(rest, _ALWAYS_CARRIED**2)
     return carried
 
 

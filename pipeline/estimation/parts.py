@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from pipeline.core.arrays import Complex, Flags, Floats, Ints
     from pipeline.estimation.noise import Noise
+    from pipeline.run.signals import Velocity
 
 BLOCK_S = 20.0
 """Length of blocks that are held out, and that count as independent [s]: ten times as long as any noise."""
@@ -135,6 +136,38 @@ class Part(ABC):
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """Increments of one run with that clock delayed by ``late_s`` [s], shape (m, 3)."""
 
+    @abstractmethod
+    def list_rolled(self, state: State) -> tuple[Floats, float]:
+        """Increments that are computed from speeds of wheels by the vehicle's dimensions, shape (n, 3).
+
+        Returns:
+            The increments, and the sign with which they stand in the residuals; zero if dimensions cancel.
+        """
+
+    def list_length_shifts(self, state: State) -> list[Floats]:
+        """Changes of the residuals by one standard error of each estimated dimension, shape (n, 3) each.
+
+        Speeds of wheels times a radius, over a track or a wheelbase, are the body's motion.
+        """
+        vehicle = self.comparisons[0].context.vehicle
+        if not vehicle.errors:
+            return []
+        rolled, sign = self.list_rolled(state)
+        shifts = []
+        for name, error in vehicle.errors.items() if sign else ():
+            share = sign * error / float(getattr(vehicle, name))
+            is_radius = name == "wheel_radius_m"
+            shifts.append(share * rolled if is_radius else -share * rolled * np.array([0.0, 0.0, 1.0]))
+        return shifts
+
+    def _average(self, velocities: Sequence[Velocity]) -> Floats:
+        """Increments of each run by its velocities, shape (n, 3)."""
+        means = [
+            average_windows(one, velocity, locate_windows(one))
+            for one, velocity in zip(self.comparisons, velocities, strict=True)
+        ]
+        return np.asarray(np.concatenate(means) * self.spans[:, None], dtype=np.float64)
+
     def learn(self, residual: Floats, start: Noise | None = None, *, exact: bool = False) -> Noise:
         """Noise of residuals of shape (n, 3)."""
         return learn_noise(residual, self.steps, self.channels, start, exact=exact)
@@ -240,6 +273,18 @@ class BodyPart(Part):
         is_exact = self.whole and not comparison.run.is_drive_alone
         return 0.0 if is_exact else comparison.run.wheel_period_s / _UNIFORM
 
+    def list_rolled(self, state: State) -> tuple[Floats, float]:
+        """See `Part`: the whole prediction, unless it is that of body commands."""
+        rolls = all(
+            one.source is Input.MEASURED or one.run.alignment.body_multiplier is None
+            for one in self.comparisons
+        )
+        predicted = [
+            one.predict_velocity(state.effects_of(run), state.timing[run])
+            for run, one in enumerate(self.comparisons)
+        ]
+        return self._average(predicted), -1.0 if rolls else 0.0
+
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: the poses are later by ``late_s`` than assumed."""
         effects, timing = state.effects_of(run), state.timing[run]
@@ -314,6 +359,15 @@ class WheelPart(Part):
     def list_clock_errors(self) -> Floats:
         """See `Part`: wheels that are read periodically change at an unknown time between two readings."""
         return np.array([comparison.run.wheel_period_s for comparison in self.comparisons]) / _UNIFORM
+
+    def list_rolled(self, state: State) -> tuple[Floats, float]:
+        """See `Part`: the measured wheels, which body commands are compared with."""
+        seen = [
+            one.predict_velocity((), Timing(state.timing[run].wheel_delay_s))
+            for run, one in enumerate(self.measured)
+        ]
+        is_body = all(one.run.alignment.body_multiplier is not None for one in self.comparisons)
+        return self._average(seen), 1.0 if is_body else 0.0
 
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: the encoders are later by ``late_s`` than assumed."""

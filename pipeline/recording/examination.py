@@ -33,6 +33,7 @@ from pipeline.recording.geometry import (
     Geometry,
     Length,
     explain_wheels,
+    measure_car,
     measure_controller,
     measure_geometry,
 )
@@ -849,14 +850,7 @@ class Examination:
             (one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None
         )
         if car is not None and car.reading.explained is not None and car.sign("turned"):
-            explained = car.reading.explained
-            ahead, bent = abs(float(explained.ahead.gains[0])), abs(float(explained.turned.gains[0]))
-            # A car that is slower than commanded turns by the speed that it has.
-            scale = ahead if car.sign("ahead") else 1.0
-            error = scale / bent / abs(float(explained.turned.t[0]))
-            is_rolled = car is wheels and car.sign("ahead")
-            rolled = Length(ahead, ahead / abs(float(explained.ahead.t[0]))) if is_rolled else None
-            return Geometry(rolled=rolled, wheelbase=Length(scale / bent, error))
+            return measure_car(car.reading.explained, is_measured=car is wheels)
         if wheels is None or wheels.reading.form != "sides":
             sides = command if command is not None and command.reading.form == "sides" else None
         else:

@@ -22,6 +22,10 @@ LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _ROUGH = 2e-3
 """Relative standard error from which on it is stated."""
 
+_METHOD = 1.5e-3
+"""Relative error of a length beyond that of its fit: of delays on a grid and of what happens between samples.
+Over 24 drawn drives the root mean square is 0.4e-3 to 1.8e-3, and fits alone state a fifth of it."""
+
 
 @dataclass(frozen=True)
 class Length:
@@ -111,7 +115,7 @@ def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None
     if made is None:
         return None
     ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
-    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (made.ahead, made.turned)]
+    errors = _list_errors(made)
     radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
     track = (
         Length(bent / ahead, bent / ahead * float(np.hypot(errors[0], errors[1])))
@@ -121,10 +125,15 @@ def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None
     return radius, track
 
 
+def _list_errors(made: Explained) -> list[float]:
+    """Relative standard errors of the gains ahead and turning."""
+    return [float(np.hypot(1.0 / max(abs(one.t[0]), 1e-9), _METHOD)) for one in (made.ahead, made.turned)]
+
+
 def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
     """Wheel radius and effective track by the motion, each None where it is not excited."""
     ahead, bent = abs(float(wheels.ahead.gains[0])), abs(float(wheels.turned.gains[0]))
-    errors = [abs(1.0 / one.t[0]) if one.t[0] else np.inf for one in (wheels.ahead, wheels.turned)]
+    errors = _list_errors(wheels)
     radius = Length(ahead, errors[0] * ahead) if wheels.sign("ahead") else None
     track = (
         Length(ahead / bent, ahead / bent * float(np.hypot(errors[0], errors[1])))
@@ -132,6 +141,17 @@ def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
         else None
     )
     return radius, track
+
+
+def measure_car(car: Explained, *, is_measured: bool) -> Geometry:
+    """Wheelbase of a car that turns by its steering, and the radius of its wheels where they are measured."""
+    ahead, bent = abs(float(car.ahead.gains[0])), abs(float(car.turned.gains[0]))
+    of_speed, of_turn = _list_errors(car)
+    if not car.sign("ahead"):
+        return Geometry(wheelbase=Length(1.0 / bent, of_turn / bent))
+    # A car that is slower than commanded turns by the speed that it has.
+    wheelbase = Length(ahead / bent, ahead / bent * float(np.hypot(of_speed, of_turn)))
+    return Geometry(rolled=Length(ahead, ahead * of_speed) if is_measured else None, wheelbase=wheelbase)
 
 
 def describe_vehicle(

@@ -553,7 +553,9 @@ def _fit_vehicle(
         # The arrangement of the rollers is unknown: only body motion can be evaluated.
         kind = "omni"
     known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
-    fitted = {key: length.value for key, length in recording.geometry.list_lengths(kind).items()}
+    lengths = recording.geometry.list_lengths(kind)
+    fitted = {key: length.value for key, length in lengths.items()}
+    errors = {key: float(length.error) for key, length in lengths.items() if key not in known}
     values = {key: value for key, value in {**fitted, **known}.items() if key in LENGTHS}
     standing_in = None if sources.pose is None else sources.pose.wheels
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
@@ -587,6 +589,7 @@ def _fit_vehicle(
         chosen.vehicle,
         **{**bare, "id": name, "kind": kind, **assumed, **values, **given},
         stand_ins=[*assumed],
+        errors={} if is_body else errors,
     )
     is_given = all(key in known for key in values) and not is_body
     findings.append(Finding("vehicle_fitted", "info" if is_given else "warning", text, where="vehicle"))

@@ -308,6 +308,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
         units: units of the platform's topics, by name.
         stand_ins: names of dimensions that are not known. Their values only convert body motion into wheel
             speeds and back, and are none of the vehicle's.
+        errors: standard errors of the dimensions that were estimated from a log, by name [m].
     """
 
     id: str
@@ -331,6 +332,7 @@ class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=T
     controller: VendorController = VendorController()
     units: dict[str, OwnUnit] = {}
     stand_ins: list[StandIn] = []
+    errors: dict[str, float] = {}
 
     @property
     def kinematics(self) -> Kinematics:

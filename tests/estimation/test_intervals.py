@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
+from msgspec.structs import replace
 
 from pipeline.estimation import Estimates, Fitted, Input, Problem, estimate_intervals, fit_model
 from pipeline.estimation.ambiguity import DETECTED, _find_detectable
@@ -54,6 +55,22 @@ def test_errors_of_clocks_are_carried_into_the_numbers_that_they_move(
             )
     assert not exact.find("timing.wheel_delay_s").trades_with_clock
     assert poor.find("timing.wheel_delay_s").trades_with_clock
+
+
+def test_errors_of_a_track_that_was_estimated_are_carried() -> None:
+    """A track that is known to a percent gives a factor on it that is known no better."""
+    run = simulate({"effective_track": 1.7}, duration_s=60.0, program=Program("teleop"))
+
+    def estimate(errors: dict[str, float]) -> Estimates:
+        vehicle = replace(HUSKY, errors=errors)
+        model = Model(vehicle, (find_effect("effective_track")(),))
+        return estimate_intervals(fit_model(Problem([run], vehicle, Input.MEASURED), model, exact=True))
+
+    known, estimated = estimate({}), estimate({"track_width_m": 0.01 * (HUSKY.track_width_m or 1.0)})
+    exact, carried = (one.find("effective_track.k") for one in (known, estimated))
+    assert carried.value == exact.value
+    expected = math.hypot(exact.standard_error, 0.01 * exact.value)
+    assert carried.standard_error == pytest.approx(expected, rel=0.1)
 
 
 def _change_track(state: State) -> tuple[float, float, float]:

@@ -51,6 +51,20 @@ def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None
     assert [one.value for one in found if one] == pytest.approx([RADIUS, TRACK], rel=0.01)
 
 
+def test_lengths_are_as_good_as_is_said_of_them() -> None:
+    far = []
+    for seed in range(40, 48):
+        drive = draw(seed, 60.0)
+        found = measure_controller(command(drive), sides(drive))
+        assert found is not None
+        far += [
+            (one.value - true) / one.error for one, true in zip(found, (RADIUS, TRACK), strict=True) if one
+        ]
+    assert len(far) == 16
+    assert np.sqrt(np.mean(np.square(far))) < 2.0
+    assert max(np.abs(far)) < 4.0
+
+
 def test_a_straight_drive_shows_a_radius_and_no_track() -> None:
     drive = draw(3)
     place = (np.cumsum(drive.speed) * STEP)[drive.rows] + 0j
