@@ -299,11 +299,28 @@ class Examination:
     ) -> Reading | None:
         """The signals of a source, with unit lengths; None if they cannot be read as the user says."""
         section = section or self._find_section(source, is_measured=is_measured)
+        self.extraction.vehicle = unit = self._make_unit(source, kind)
+        try:
+            table = self.extraction.read_drive(source, section, held=True)
+        except SlipError:
+            return None
+        if source.form is DriveForm.BODY:
+            names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
+            return Reading("body", str(source), *(Held(*_column(table, name)) for name in names))
+        if unit.kind == "ackermann":
+            speed = Held(*_column(table, "speed"))
+            bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
+            return Reading("steering", str(source), speed, bent)
+        names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
+        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
+
+    def _make_unit(self, source: DriveSource, kind: str) -> Vehicle:
+        """A vehicle of unit lengths whose inputs are those of a source."""
         if source.form is DriveForm.STEERING:
             kind = "ackermann"
         elif self.moves_sideways:
             kind = "omni" if source.form is DriveForm.BODY else "mecanum"
-        self.extraction.vehicle = Vehicle(
+        return Vehicle(
             id="unit",
             name="unit",
             kind=kind,
@@ -312,19 +329,6 @@ class Examination:
             track_width_m=1.0,
             wheelbase_m=1.0,
         )
-        try:
-            table = self.extraction.read_drive(source, section, held=True)
-        except SlipError:
-            return None
-        if source.form is DriveForm.BODY:
-            names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
-            return Reading("body", str(source), *(Held(*_column(table, name)) for name in names))
-        if kind == "ackermann":
-            speed = Held(*_column(table, "speed"))
-            bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
-            return Reading("steering", str(source), speed, bent)
-        names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
-        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
 
     def _find_section(self, source: DriveSource, *, is_measured: bool) -> DriveSection:
         """What the user says of a source: of the topic that is named, or of any if none is."""
@@ -553,6 +557,10 @@ class Examination:
         late = (0.0, 0.0) if made is None else (made.lag, made.delay)
         asked = command.reading if command is not None and command.is_sure else None
         found = find_outages(sides, late, asked, motion)
+        if not found:
+            return False
+        kind = "ackermann" if reading.form == "steering" else "differential"
+        self.extraction.vehicle = self._make_unit(wheels.source, kind)
         table = self.extraction.read_drive(wheels.source, section, held=False)
         stamps = table["t"].to_numpy()
         clock = (table["log_time"].to_numpy() - self.extraction.data.index.start_ns) / 1e9
@@ -588,8 +596,6 @@ class Examination:
             first = None if np.isinf(start) else float(np.floor(1e2 * start) / 1e2)
             last = None if np.isinf(end) else float(np.ceil(1e2 * end) / 1e2)
             spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
-        if not found:
-            return False
         self.changes.setdefault("wheels", {})["left_out"] = spans
         text = (
             f"{'; '.join(texts)}: left out, as left_out = {_write_spans(spans)} under [wheels] in run.toml "

@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_motion import Drive, command, draw, measured, sides, tabulate
+from front import find_roles
+from rewritten_logs import list_changes, read, write
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -15,6 +17,7 @@ from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.log_setup import set_up_log
 from pipeline.recording.outages import Outage, find_outages
 from pipeline.recording.readings import SIDES, Held, Reading
+from pipeline.simulate import simulate_case
 
 DIES, LIVES = 40.0, 70.0
 
@@ -125,3 +128,13 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
         settled = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))
         assert settled.configuration.wheels.left_out == left_out
         assert "encoder_dead" not in {one.id for one in settled.choice.findings}
+
+
+def test_an_encoder_of_mecanum_wheels_dies_beside_a_body_that_is_commanded(tmp_path: Path) -> None:
+    log = simulate_case(None, {}, out=tmp_path / "log.mcap", seed=5, duration_s=60.0, platform="dingo_o")
+    roles = find_roles(log)
+    (change,) = [one for one in list_changes() if one.name == "right encoder holds"]
+    made = change.make(read(log), roles)
+    assert made is not None
+    setup = set_up_log(write(made, tmp_path / "changed.mcap"), Options(out=tmp_path))
+    assert "encoder_dead" in {one.id for one in setup.choice.findings}
