@@ -26,7 +26,10 @@ STAGES = {
     "import modules": ("_frozen_importlib._find_and_load",),
     "read the log, its stages, store": ("pipeline.analysis.analyze.analyze_log",),
     "pages of the results folder": ("pipeline.report.write_page",),
-    "read the tables": ("pipeline.estimation.stored_diagnosis.read_recording", "pipeline.run.load_run"),
+    "read the tables": (
+        "pipeline.estimation.stored_diagnosis.read_recording",
+        "pipeline.run.motion_run.load_run",
+    ),
     "make runs ready": ("pipeline.estimation.problem.Problem.__init__",),
     "noise of residuals by any input": ("pipeline.estimation.parts.measure_noise",),
     "evidence": (

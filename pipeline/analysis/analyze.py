@@ -22,14 +22,19 @@ from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.report import lead_up
 from pipeline.report.drive_pages import read_preview
 from pipeline.results import RunDiagnosis
-from pipeline.store import JSON, Generation, LogIdentities, Manifest, Store, see_log
-from pipeline.store.stored_runs import (
+from pipeline.store import (
     DIAGNOSIS,
+    JSON,
     REPORT,
+    Generation,
+    LogIdentities,
+    Manifest,
+    Store,
     find_recorded_log,
     find_run,
     hash_json,
     name_run,
+    see_log,
     stored_contexts,
     stored_keys,
 )
@@ -65,7 +70,7 @@ class Outcome:
     @property
     def refusal(self) -> str:
         """Reason why slip is not observable in the log; empty if it is."""
-        from pipeline.results.reading import find_refusal, read_findings  # noqa: PLC0415 - heavy
+        from pipeline.results import find_refusal, read_findings  # noqa: PLC0415 - heavy
 
         return find_refusal(read_findings(self.summary))
 
@@ -195,7 +200,7 @@ def _write_outputs(
     verdict: str,
 ) -> None:
     """Write summary, report and figures of a finished run."""
-    from pipeline.words.objects import diagnosis_as_json  # noqa: PLC0415 - heavy
+    from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
 
     summary = summarize_run(work, log)
     summary["verdict"] = verdict
@@ -276,8 +281,11 @@ def update_datasets(store: Store) -> None:
 
     Columns that only `slip compare` computes are null until it has run.
     """
-    from pipeline.datasets import gather_runs, pool_runs  # noqa: PLC0415 - heavy
-    from pipeline.datasets.compared_runs import find_material  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        find_material,
+        gather_runs,
+        pool_runs,
+    )
     from pipeline.report import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
 
     write_page(store, CATALOGUE, render_catalogue(store))

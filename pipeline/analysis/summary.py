@@ -10,13 +10,7 @@ from importlib.metadata import version
 from typing import TYPE_CHECKING
 
 from pipeline.analysis.work import Work
-from pipeline.core import PACKAGE, SlipError, read_version
-from pipeline.core.untrusted import (
-    mapping_in,
-    number_in,
-    objects_in,
-    read_object,
-)
+from pipeline.core import PACKAGE, SlipError, mapping_in, number_in, objects_in, read_object, read_version
 from pipeline.estimation.stored_diagnosis import (
     DIAGNOSED,
     STAGE,
@@ -28,16 +22,9 @@ from pipeline.estimation.stored_diagnosis import (
 )
 from pipeline.logs import ROS1_BAG, SQLITE_BAG
 from pipeline.recording.log_setup import LogSetup
-from pipeline.results import Finding, RunDiagnosis, read_result, to_json
-from pipeline.results.reading import read_findings
-from pipeline.stages.reading import list_wanted
-from pipeline.stages.slip_stage import SUMMARY_DIGITS, pick_row, round_number, summarize_inputs
-from pipeline.store import JSON, Store, StoreError
-from pipeline.store.checksums import load_manifest
-from pipeline.store.stored_runs import (
-    DIAGNOSIS,
-    SUMMARY,
-)
+from pipeline.results import Finding, RunDiagnosis, read_findings, read_result, to_json
+from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number, summarize_inputs
+from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_manifest
 
 if TYPE_CHECKING:
     import polars as pl
@@ -140,7 +127,7 @@ def judge_run(findings: pl.DataFrame, diagnosis: RunDiagnosis | None) -> str:
         findings: the run's findings.
         diagnosis: None if it was not requested.
     """
-    from pipeline.words.verdict import format_refusal, format_verdict  # noqa: PLC0415 - heavy
+    from pipeline.words import format_refusal, format_verdict  # noqa: PLC0415 - heavy
 
     if diagnosis is None:
         return format_refusal(read_findings({"findings": findings.to_dicts()}))

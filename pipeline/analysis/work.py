@@ -11,22 +11,33 @@ import msgspec
 import polars as pl
 
 from pipeline.analysis import STAGES, Options
-from pipeline.core import naming_os_errors, pick
-from pipeline.core.compute import return_freed_memory
-from pipeline.core.untrusted import read_bounded
+from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.logs import LogData, Loss, read_topics
 from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
-from pipeline.sources import Vehicle
-from pipeline.sources.message_types import describe_types
-from pipeline.stages import Finding, checks, slip_stage, tabulate_findings, velocity
-from pipeline.stages.align import align_tables
-from pipeline.stages.extract import extract_tables
-from pipeline.stages.reading import list_wanted
-from pipeline.store import JSON, Generation, Manifest, TableReport
-from pipeline.store.parquet_tables import CheckedTable, check_table
-from pipeline.store.stored_runs import hash_json, stored_contexts, stored_keys
+from pipeline.sources import Vehicle, describe_types
+from pipeline.stages import (
+    Finding,
+    align_tables,
+    checks,
+    extract_tables,
+    list_wanted,
+    slip_stage,
+    tabulate_findings,
+    velocity,
+)
+from pipeline.store import (
+    JSON,
+    CheckedTable,
+    Generation,
+    Manifest,
+    TableReport,
+    check_table,
+    hash_json,
+    stored_contexts,
+    stored_keys,
+)
 from schemas import contract_of
 
 

@@ -26,28 +26,32 @@ from pipeline.api.fitted_model import (
     write_html,
 )
 from pipeline.batch.recordings import list_named
-from pipeline.core import INPUTS, SlipError, format_recorded
-from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.datasets.check import Check as RunsCheck
-from pipeline.datasets.check import check_as_json, check_runs, keep_baseline, read_limits
-from pipeline.datasets.check_sides import Baseline, read_baseline
-from pipeline.datasets.stored_fits import Against, contest_models, read_runs
+from pipeline.core import INPUTS, SlipError, format_recorded, mapping_in, number_in, objects_in
+from pipeline.datasets import (
+    Against,
+    Baseline,
+    check_as_json,
+    check_runs,
+    contest_models,
+    keep_baseline,
+    read_baseline,
+    read_limits,
+    read_runs,
+)
+from pipeline.datasets import Check as RunsCheck
 from pipeline.estimation import parse_budget
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis
-from pipeline.models.model_file import ModelFile, read_model
+from pipeline.models import ModelFile, read_model
 from pipeline.report import format_distance
 from pipeline.report.motion_view import MotionView, view_diagnosis
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_result
-from pipeline.results.reading import ERRORS_OVER_2S
-from pipeline.results.reading import read_model as read_diagnosed_model
-from pipeline.sources.one_vehicle import Owner, load_vehicle
-from pipeline.store import Manifest, Store
-from pipeline.store.stored_runs import REPORT, find_run, read_choices
+from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result
+from pipeline.results import read_model as read_diagnosed_model
+from pipeline.sources import Owner, load_vehicle
+from pipeline.store import REPORT, Manifest, Store, find_run, read_choices
 from pipeline.words import diagnosis as words
-from pipeline.words.check import format_junit, format_markdown, list_lines
-from pipeline.words.objects import diagnosis_as_json
+from pipeline.words import diagnosis_as_json, format_junit, format_markdown, list_lines
 from schemas import contract_of
 
 if TYPE_CHECKING:

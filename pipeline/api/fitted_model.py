@@ -12,9 +12,8 @@ from typing import TYPE_CHECKING, Literal, Self, cast
 import polars as pl
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import INPUT_WORDS
-from pipeline.core.untrusted import number_in, objects_in
-from pipeline.datasets.stored_fits import ModelFit, fit_to_runs, read_runs
+from pipeline.core import INPUT_WORDS, number_in, objects_in
+from pipeline.datasets import ModelFit, fit_to_runs, read_runs
 from pipeline.estimation import Problem, State
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.comparison import choose_input
@@ -23,23 +22,29 @@ from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.problem import carry_over, fit_as_it_is, predict_at_from
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.export import export_model, read_current
-from pipeline.models import Effect, ModelFile, find_effect, read_model, write_model
+from pipeline.models import (
+    CHANNELS,
+    Effect,
+    FormulaEffect,
+    ModelFile,
+    find_effect,
+    make_parameter,
+    read_model,
+    refuse_taken,
+    write_model,
+)
 from pipeline.models import Model as MotionModel
-from pipeline.models.catalogue import refuse_taken
-from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
 from pipeline.report.motion_view import COMPONENTS, MotionStage, MotionView
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
-from pipeline.run import MotionError, MotionRun
-from pipeline.run.windows import HORIZON_S
-from pipeline.sources import Vehicle, resolve_vehicle
-from pipeline.sources.configuration import VehicleSection
-from pipeline.words.models import format_ladder, format_parameters
+from pipeline.run import HORIZON_S, MotionError, MotionRun
+from pipeline.sources import Vehicle, VehicleSection, resolve_vehicle
+from pipeline.words import format_ladder, format_parameters
 
 if TYPE_CHECKING:
     from pipeline.api import Run
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.sources import Owner
     from pipeline.store import Manifest
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")

@@ -8,13 +8,23 @@ from pipeline.batch.batch_plan import forget_pools, measure_results
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
 from pipeline.core import SlipError
 from pipeline.logs import LogError, hash_log, locate_recorded
-from pipeline.store import RUNS, Store, StoreError
-from pipeline.store.checksums import parse_manifest
-from pipeline.store.files import MANIFEST, Manifest
-from pipeline.store.mirror import Mirror
-from pipeline.store.names import Sample, Tally, check_home, encode_run
-from pipeline.store.stored_runs import UPLOADS
-from pipeline.store.verification import DiskFiles, Examination, Problem
+from pipeline.store import (
+    MANIFEST,
+    RUNS,
+    UPLOADS,
+    DiskFiles,
+    Examination,
+    Manifest,
+    Mirror,
+    Problem,
+    Sample,
+    Store,
+    StoreError,
+    Tally,
+    check_home,
+    encode_run,
+    parse_manifest,
+)
 
 _UNREADABLE = ("manifest_damaged", "name_clash")
 

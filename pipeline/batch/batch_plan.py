@@ -15,16 +15,22 @@ from pipeline.analysis import Options
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.core import SlipError
-from pipeline.core.untrusted import read_bounded, walk_files
+from pipeline.core import SlipError, read_bounded, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
-from pipeline.sources import list_configuration_files, list_presets
-from pipeline.sources.message_types import read_tables
-from pipeline.store import LogIdentities, LogSighting, Manifest, Store, StoreError, see_log
-from pipeline.store.mirror import Mirror
-from pipeline.store.names import path_unread
-from pipeline.store.stored_runs import hash_json, name_plainly
+from pipeline.sources import list_configuration_files, list_presets, read_tables
+from pipeline.store import (
+    LogIdentities,
+    LogSighting,
+    Manifest,
+    Mirror,
+    Store,
+    StoreError,
+    hash_json,
+    name_plainly,
+    path_unread,
+    see_log,
+)
 
 # Basis of a log: a hash of everything that its results depend on except the log itself.
 #
@@ -379,8 +385,10 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
     catalogue links them.
     """
-    from pipeline.datasets.prediction import FLEET  # noqa: PLC0415 - heavy
-    from pipeline.datasets.trend import TREND  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        FLEET,
+        TREND,
+    )
     from pipeline.report import PAGES  # noqa: PLC0415 - heavy
 
     mirror.pull_index()

@@ -23,8 +23,7 @@ import msgspec
 
 from pipeline.core import SlipError, end_with, silence_warnings
 from pipeline.logs import FETCHED
-from pipeline.store import JSON, LOG_NOTES, LogSighting, Store, StoreError
-from pipeline.store.mirror import Mirror
+from pipeline.store import JSON, LOG_NOTES, LogSighting, Mirror, Store, StoreError
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -213,7 +212,7 @@ def work_on(task: Task) -> Report:
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
     # Workers without any work need no table library.
     from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415
-    from pipeline.store.stored_runs import REPORT  # noqa: PLC0415
+    from pipeline.store import REPORT  # noqa: PLC0415
 
     if mirror is not None:
         mirror.pull_run(entry.run)
@@ -240,8 +239,8 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 
 def _format_losses(outcome: Outcome) -> str:
-    from pipeline.core.untrusted import objects_in  # noqa: PLC0415 - heavy
-    from pipeline.store.stored_runs import stored_contexts  # noqa: PLC0415 - heavy
+    from pipeline.core import objects_in  # noqa: PLC0415 - heavy
+    from pipeline.store import stored_contexts  # noqa: PLC0415 - heavy
 
     losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
     return "; ".join(str(loss.get("text")) for loss in losses)

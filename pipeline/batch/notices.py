@@ -15,13 +15,10 @@ from pathlib import Path
 from pipeline.batch import BatchError
 from pipeline.batch.season import Outcome
 from pipeline.core import SlipError, make_plain, shorten
-from pipeline.datasets.check import BROKEN, Limits, check_runs
-from pipeline.datasets.check_sides import Baseline, read_baseline
-from pipeline.datasets.compared_runs import read_digest
-from pipeline.datasets.trend import format_quiet
-from pipeline.models.model_file import ModelFile, read_model
+from pipeline.datasets import BROKEN, Baseline, Limits, check_runs, format_quiet, read_baseline, read_digest
+from pipeline.models import ModelFile, read_model
 from pipeline.report.trend_page import renew_trend
-from pipeline.sources.one_vehicle import load_vehicle
+from pipeline.sources import load_vehicle
 from pipeline.store import Manifest, Store
 from pipeline.words.check import format_verdict
 

@@ -15,7 +15,7 @@ from queue import Empty, SimpleQueue
 from typing import TypeVar
 
 from pipeline.batch import BatchError
-from pipeline.core.untrusted import walk_tree
+from pipeline.core import walk_tree
 from pipeline.logs import SUFFIXES, RemotePath, is_finished, list_files
 from pipeline.logs.index import LISTING, are_separate, split_number
 from pipeline.logs.other_formats import recognize_text_folder

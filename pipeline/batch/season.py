@@ -37,8 +37,7 @@ from pipeline.batch.batch_work import (
 from pipeline.batch.executors import SCHEMES, LocalExecutor, open_cluster
 from pipeline.batch.recordings import find_recordings
 from pipeline.core import SlipError
-from pipeline.store import Store
-from pipeline.store.mirror import Mirror
+from pipeline.store import Mirror, Store
 
 STOPPING = ("disk_full", "read_only", "no_locks", "cluster_lost")
 """Errors that would affect every other log as well."""

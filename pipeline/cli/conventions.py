@@ -22,8 +22,7 @@ from pipeline.core import INPUTS, SlipError, measure_memory
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
-    from pipeline.store import Store
-    from pipeline.store.mirror import Mirror
+    from pipeline.store import Mirror, Store
 
 CLEAN = 0
 FAILED = 1
@@ -328,8 +327,10 @@ class ResultsLocation:
         Raises:
             StoreError: ``no_results``, there is no such folder; or the object store does not answer.
         """
-        from pipeline.store import Store  # noqa: PLC0415 - verbs that only help need none
-        from pipeline.store.names import no_results  # noqa: PLC0415 - likewise
+        from pipeline.store import (  # noqa: PLC0415 - heavy
+            Store,
+            no_results,
+        )
 
         if self.mirror is None:
             if not self.root.is_dir():
@@ -346,7 +347,7 @@ def open_results(results: Path) -> ResultsLocation:
         StoreError: ``no_object_store``.
     """
     from pipeline.logs import RemotePath, to_location  # noqa: PLC0415 - verbs that only help need none
-    from pipeline.store.mirror import Mirror  # noqa: PLC0415 - likewise
+    from pipeline.store import Mirror  # noqa: PLC0415 - likewise
 
     location = to_location(results)
     if not isinstance(location, RemotePath):

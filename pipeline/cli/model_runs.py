@@ -16,14 +16,11 @@ from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError
 
 if TYPE_CHECKING:
     from pipeline.cli.verb_model import On
-    from pipeline.datasets.forecast import Forecast
+    from pipeline.datasets import Forecast
     from pipeline.estimation.problem import Problem
-    from pipeline.models.literature import LiteratureModel
-    from pipeline.models.model import Model
-    from pipeline.models.model_file import ModelFile
+    from pipeline.models import LiteratureModel, Model, ModelFile
     from pipeline.run import MotionRun
-    from pipeline.sources import Vehicle
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.sources import Owner, Vehicle
     from pipeline.store import Manifest
 
 
@@ -35,8 +32,8 @@ def trust_named(path: Path | None, *, wanted: bool) -> None:
     """
     if path is None or not wanted:
         return
-    from pipeline.models.catalogue import trust as trust_hashes  # noqa: PLC0415
-    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models import trust as trust_hashes  # noqa: PLC0415
 
     trust_hashes(list_code(path))
 
@@ -47,7 +44,7 @@ def open_model(path: Path, *, trust_code: bool) -> ModelFile:
     Raises:
         MotionError: the file is wrong.
     """
-    from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.models import read_model  # noqa: PLC0415 - heavy
 
     trust_named(path, wanted=trust_code)
     file = read_model(path)
@@ -68,9 +65,11 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
             one of the names.
     """
-    from pipeline.models import format_model  # noqa: PLC0415
-    from pipeline.models.catalogue import list_effects  # noqa: PLC0415 - heavy
-    from pipeline.models.model_file import read_model  # noqa: PLC0415 - heavy
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        format_model,
+        list_effects,
+        read_model,
+    )
     from pipeline.run import MotionError  # noqa: PLC0415
 
     trust_named(path, wanted=trust_code)
@@ -96,8 +95,10 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models import write_text  # noqa: PLC0415
-    from pipeline.models.catalogue import draft_effect  # noqa: PLC0415 - heavy
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        draft_effect,
+        write_text,
+    )
     from pipeline.run import MotionError  # noqa: PLC0415
 
     text = draft_effect(file)
@@ -128,8 +129,8 @@ def trust(files: list[Path], /, *, json: bool = False) -> int:
         files: model files, or Python files.
         json: print one JSON object.
     """
-    from pipeline.models.catalogue import trust as trust_hashes  # noqa: PLC0415
-    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models import trust as trust_hashes  # noqa: PLC0415
 
     hashes = {code: name for path in files for code, name in list_code(path).items()}
     trust_hashes(hashes)
@@ -143,8 +144,11 @@ def untrust(codes: list[str], /, *, json: bool = False) -> int:
         codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
         json: print one JSON object.
     """
-    from pipeline.models.catalogue import distrust, list_trusted  # noqa: PLC0415
-    from pipeline.models.model_file import list_code  # noqa: PLC0415 - heavy
+    from pipeline.models import (  # noqa: PLC0415
+        distrust,
+        list_code,
+        list_trusted,
+    )
 
     gone: dict[str, str] = {}
     known = list_trusted()
@@ -165,7 +169,7 @@ def trusted(*, json: bool = False) -> int:
     Args:
         json: print one JSON object.
     """
-    from pipeline.models.catalogue import list_trusted  # noqa: PLC0415 - heavy
+    from pipeline.models import list_trusted  # noqa: PLC0415 - heavy
 
     return _print(list_trusted(), "no Python is trusted", json=json)
 
@@ -196,7 +200,7 @@ def gather_runs(
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
     from pipeline.analysis import Options  # noqa: PLC0415
-    from pipeline.datasets.stored_fits import read_runs  # noqa: PLC0415 - heavy
+    from pipeline.datasets import read_runs  # noqa: PLC0415 - heavy
 
     if not names:
         raise SlipError("no_runs", "--on names no run", hint="Give logs, or runs of the results folder")
@@ -305,7 +309,7 @@ def cut_first(runs: Sequence[MotionRun], first_s: float) -> list[MotionRun]:
     Raises:
         MotionError: ``too_short``: a run was not driven for so long.
     """
-    from pipeline.run.windows import cut_run, find_driven  # noqa: PLC0415 - heavy
+    from pipeline.run import cut_run, find_driven  # noqa: PLC0415 - heavy
 
     return [cut_run(run, end_s=find_driven(run, first_s)) for run in runs]
 
@@ -318,7 +322,7 @@ def forecast_runs(
     Raises:
         SlipError: there is no fleet; or ``several_terrains``.
     """
-    from pipeline.plan.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.plan import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
     from pipeline.store import Store  # noqa: PLC0415
 
@@ -341,8 +345,10 @@ def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: 
         SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415
-    from pipeline.models.model import Model  # noqa: PLC0415
-    from pipeline.models.model_file import ModelFile  # noqa: PLC0415
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        Model,
+        ModelFile,
+    )
 
     vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
     chosen = choose_input(runs, source)
@@ -363,8 +369,10 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
 
 def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        cut_interval,
+        find_effect,
+    )
 
     values: dict[str, dict[str, object]] = {}
     for label, (mean, deviation) in problem.parts[0].prior.numbers.items():
@@ -394,7 +402,7 @@ def literature(name: str | None = None, /, *, json: bool = False) -> int:
         name: a model of the literature.
         json: print one JSON object.
     """
-    from pipeline.models.literature import MODELS, find_model  # noqa: PLC0415 - heavy
+    from pipeline.models import MODELS, find_model  # noqa: PLC0415 - heavy
 
     if name is None:
         rows = [_list_model(model) for model in MODELS]
@@ -445,9 +453,9 @@ def compare_rivals(
         spoken: the runs, and how the answer is printed.
         against: what they are compared with.
     """
-    from pipeline.datasets.stored_fits import contest_models  # noqa: PLC0415 - heavy
-    from pipeline.models.literature import list_models  # noqa: PLC0415 - heavy
-    from pipeline.words.models import format_contest  # noqa: PLC0415 - heavy
+    from pipeline.datasets import contest_models  # noqa: PLC0415 - heavy
+    from pipeline.models import list_models  # noqa: PLC0415 - heavy
+    from pipeline.words import format_contest  # noqa: PLC0415 - heavy
 
     quiet = spoken.quiet or spoken.json
     known = next((file.model.vehicle for file in files.values()), None)

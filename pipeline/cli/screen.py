@@ -16,8 +16,10 @@ from pipeline.core import (
     format_interval,
     format_recorded,
     format_share,
+    mapping_in,
+    number_in,
+    objects_in,
 )
-from pipeline.core.untrusted import mapping_in, number_in, objects_in
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
@@ -208,7 +210,7 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
-    from pipeline.results.reading import has_no_pose, read_findings  # noqa: PLC0415 - heavy
+    from pipeline.results import has_no_pose, read_findings  # noqa: PLC0415 - heavy
 
     named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
     if has_no_pose(read_findings(summary)):
@@ -268,8 +270,8 @@ def _format_topics(summary: Summary) -> list[str]:
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
     """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    from pipeline.results.reading import read_findings  # noqa: PLC0415 - heavy
-    from pipeline.words.diagnosis import list_findings  # noqa: PLC0415 - heavy
+    from pipeline.results import read_findings  # noqa: PLC0415 - heavy
+    from pipeline.words import list_findings  # noqa: PLC0415 - heavy
 
     findings = read_findings(summary)
     known = {finding.text for finding in findings}
@@ -279,7 +281,8 @@ def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> lis
 
 def _format_diagnosis(summary: Summary, *, everything: bool) -> list[str]:
     """Lines of the diagnosis, without the verdict and the findings, which are shown elsewhere."""
-    from pipeline.words.diagnosis import VERDICT, list_lines  # noqa: PLC0415 - heavy
+    from pipeline.words import VERDICT  # noqa: PLC0415 - heavy
+    from pipeline.words.diagnosis import list_lines  # noqa: PLC0415 - heavy
 
     stored = mapping_in(summary, "diagnosis")
     if not stored:

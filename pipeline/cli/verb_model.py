@@ -43,11 +43,10 @@ from pipeline.cli.model_runs import (
 from pipeline.core import INPUT_WORDS
 
 if TYPE_CHECKING:
-    from pipeline.datasets.stored_fits import ModelFit
+    from pipeline.datasets import ModelFit
     from pipeline.estimation.across_runs import Coverage
     from pipeline.estimation.problem import Transfer
-    from pipeline.models import Model
-    from pipeline.models.model_file import ModelFile
+    from pipeline.models import Model, ModelFile
     from pipeline.run import MotionRun
 
 
@@ -106,13 +105,18 @@ def new(
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models import write_model  # noqa: PLC0415
-    from pipeline.models.catalogue import find_effect, read_code  # noqa: PLC0415 - heavy
-    from pipeline.models.literature import find_model  # noqa: PLC0415
-    from pipeline.models.model_file import ModelFile  # noqa: PLC0415
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        ModelFile,
+        find_effect,
+        find_model,
+        read_code,
+        write_model,
+    )
     from pipeline.run import MotionError  # noqa: PLC0415
-    from pipeline.sources import resolve_vehicle  # noqa: PLC0415
-    from pipeline.sources.configuration import VehicleSection  # noqa: PLC0415
+    from pipeline.sources import (  # noqa: PLC0415 - heavy
+        VehicleSection,
+        resolve_vehicle,
+    )
 
     if model.exists() and not force:
         raise MotionError(
@@ -141,8 +145,8 @@ def show(model: Path, /, *, trust_code: TrustCode = False, json: bool = False) -
     """
     from pipeline.estimation.estimates import list_parameters  # noqa: PLC0415 - heavy
     from pipeline.export import export_model  # noqa: PLC0415
-    from pipeline.models.learned_term import describe_learned, find_learned  # noqa: PLC0415
-    from pipeline.words.models import format_parameters  # noqa: PLC0415 - heavy
+    from pipeline.models import describe_learned, find_learned  # noqa: PLC0415
+    from pipeline.words import format_parameters  # noqa: PLC0415 - heavy
 
     file = open_model(model, trust_code=trust_code)
     if json:
@@ -176,7 +180,7 @@ def add(  # noqa: D417 - the shared options document themselves
         effects: ids of effects, as `slip effects` lists them; or learned_term, a regression on the residual.
         anyway: add the effects even if the data do not support them.
     """
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
 
     file = open_to_change(model, trust_code=spoken.trust_code, names=effects)
     changed = file.model
@@ -310,7 +314,7 @@ def speed(  # noqa: D417 - the shared options document themselves
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.tolerance import limit_speeds, limits_as_json  # noqa: PLC0415
-    from pipeline.words.models import format_speed_limits  # noqa: PLC0415
+    from pipeline.words import format_speed_limits  # noqa: PLC0415
 
     tolerance_m, ahead_s = read_metres(within), read_seconds(ahead, "--ahead")
     opened = open_model(model, trust_code=spoken.trust_code)
@@ -388,7 +392,7 @@ def _change(
     Raises:
         MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
-    from pipeline.datasets.stored_fits import fit_to_runs  # noqa: PLC0415 - heavy
+    from pipeline.datasets import fit_to_runs  # noqa: PLC0415 - heavy
     from pipeline.estimation.problem import carry_over  # noqa: PLC0415
     from pipeline.models import format_model, write_model  # noqa: PLC0415
 
@@ -437,7 +441,7 @@ def _change(
 
 def _require_help(path: str, fit: ModelFit, refusals: Mapping[str, str]) -> None:
     from pipeline.run import MotionError  # noqa: PLC0415
-    from pipeline.words.models import format_refusals  # noqa: PLC0415 - heavy
+    from pipeline.words import format_refusals  # noqa: PLC0415 - heavy
 
     added = set(fit.after.whole.effects) - set(fit.before.whole.effects)
     hint = "Add the others without it" if len(refusals) < len(added) else "Choose another effect"
@@ -473,7 +477,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     from pipeline.estimation.estimates import parameters_as_json  # noqa: PLC0415 - heavy
-    from pipeline.words.models import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+    from pipeline.words import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
         describe_step,
         format_ladder,
         format_parameters,
@@ -499,7 +503,7 @@ def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
 
 
 def _format_transfers(rows: Sequence[tuple[str, Transfer]]) -> list[str]:
-    from pipeline.words.models import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
+    from pipeline.words import format_heads, format_measured_errors  # noqa: PLC0415 - heavy
 
     lines = list(format_heads("held-out error of"))
     for name, item in rows:
@@ -516,7 +520,7 @@ def _list_effects(ids: Sequence[str]) -> str:
 
 def _list_idle(model: Model) -> list[str]:
     """Effects that do not act, since the model lacks what they act beside."""
-    from pipeline.models.catalogue import explain_idle  # noqa: PLC0415 - heavy
+    from pipeline.models import explain_idle  # noqa: PLC0415 - heavy
 
     return [f"  ! {effect.id} {why}" for effect in model if (why := explain_idle(effect, model.ids))]
 

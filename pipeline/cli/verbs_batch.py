@@ -39,9 +39,8 @@ from pipeline.core import SlipError, measure_memory, slip_command
 if TYPE_CHECKING:
     from pipeline.batch.notices import Looked, Notice
     from pipeline.batch.season import Line, Outcome
-    from pipeline.datasets.check import Limits
-    from pipeline.datasets.check_sides import Baseline
-    from pipeline.models.model_file import ModelFile
+    from pipeline.datasets import Baseline, Limits
+    from pipeline.models import ModelFile
 
 _MEMORY_SHARE = 0.8
 _EXPLAINED = ("refused", "lossy", "failed", "quarantined", "growing", "skipped")
@@ -90,7 +89,7 @@ class Afterwards:
         if not self.check:
             return {}, None
         from pipeline.batch.notices import open_reference  # noqa: PLC0415 - heavy
-        from pipeline.datasets.check import read_limits  # noqa: PLC0415 - heavy
+        from pipeline.datasets import read_limits  # noqa: PLC0415 - heavy
 
         opened = {str(path): open_reference(path) for path in self.check}
         return opened, None if self.limits is None else read_limits(self.limits)

@@ -15,8 +15,7 @@ from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part
 if TYPE_CHECKING:
     import polars as pl
 
-    from pipeline.datasets.compared_runs import Question
-    from pipeline.datasets.pairs import Answer
+    from pipeline.datasets import Answer, Question
     from pipeline.store import Store
 
 
@@ -62,11 +61,13 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.datasets.compare import compare_results  # noqa: PLC0415 - heavy
-    from pipeline.datasets.compared_runs import Question  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        Question,
+        compare_results,
+    )
     from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.words.comparison import summarize_answer  # noqa: PLC0415 - heavy
+    from pipeline.words import summarize_answer  # noqa: PLC0415 - heavy
 
     # Alone or before datasets, a folder is that of the results.
     is_folder = len(datasets) == 1 or (datasets and Path(datasets[0]).is_dir())
@@ -86,7 +87,7 @@ def compare(  # noqa: D417 - arguments document themselves
 def _compare_causes(
     store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
 ) -> int:
-    from pipeline.datasets.causes import find_causes, summarize_causes  # noqa: PLC0415 - heavy
+    from pipeline.datasets import find_causes, summarize_causes  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
 
     causes = find_causes(store, question)
@@ -116,13 +117,12 @@ _MOST_PAIRS = 10
 
 
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
-    from pipeline.datasets import MEASURES  # noqa: PLC0415 - heavy
-    from pipeline.datasets.pairs import compare_orders  # noqa: PLC0415 - heavy
-    from pipeline.words.comparison import (  # noqa: PLC0415 - heavy
-        list_lines,
-        list_shown_notes,
-        title_line,
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        MEASURES,
+        compare_orders,
     )
+    from pipeline.words import list_shown_notes, title_line  # noqa: PLC0415 - heavy
+    from pipeline.words.comparison import list_lines  # noqa: PLC0415 - heavy
 
     lines: list[str] = []
     title = ""
@@ -180,7 +180,7 @@ def _format_ends(row: Mapping[str, object]) -> str:
 
 def _format_pairs(answer: Answer, name: str) -> list[str]:
     """One line a pair, the surest first."""
-    from pipeline.words.comparison import list_pairs  # noqa: PLC0415 - heavy
+    from pipeline.words import list_pairs  # noqa: PLC0415 - heavy
 
     rows = [
         (
@@ -254,8 +254,11 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.deployments import ZONES, draw_up_map  # noqa: PLC0415 - heavy
-    from pipeline.datasets.features import read_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        ZONES,
+        draw_up_map,
+        read_features,
+    )
     from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -302,8 +305,12 @@ def draw(  # noqa: D417 - arguments document themselves
 
 def _draw_terrain(results: Path, cell: float | None, fed: str | None, *, json: bool, quiet: bool) -> int:
     """Write the terrain map of slip by position."""
-    from pipeline.datasets.terrain import CELL_M  # noqa: PLC0415 - heavy
-    from pipeline.datasets.terrain_map import describe_terrain, draw_up_terrain, list_lines  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        CELL_M,
+        describe_terrain,
+        draw_up_terrain,
+        list_lines,
+    )
     from pipeline.report.fleet_pages import write_terrain  # noqa: PLC0415 - heavy
 
     store = open_results(results).open_store()
@@ -331,7 +338,7 @@ def add(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.deployments import add_deployment, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.datasets import add_deployment, write_deployments  # noqa: PLC0415 - heavy
 
     table = add_deployment(file, entry)
     write_deployments(table, file)
@@ -361,7 +368,7 @@ def merge(  # noqa: D417 - arguments document themselves
     """
     if _are_features(first, second):
         return _merge_features(first, second, file or Path("features.parquet"), json=json, quiet=quiet)
-    from pipeline.datasets.deployments import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
+    from pipeline.datasets import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
 
     file = file or _OWN
     table = merge_deployments(first, second)
@@ -379,7 +386,7 @@ def _are_features(*paths: Path) -> bool:
 
 
 def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
-    from pipeline.datasets.features import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
     write_features(merged, path)
@@ -410,7 +417,7 @@ def share(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.features import gather_features, write_features  # noqa: PLC0415 - heavy
+    from pipeline.datasets import gather_features, write_features  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     features, notes = gather_features(Store(results))

@@ -29,10 +29,9 @@ from pipeline.core import SlipError, finite_or_none
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.datasets.forecast import Forecast
+    from pipeline.datasets import Forecast
     from pipeline.estimation import Recording
-    from pipeline.plan.plan import Plan
-    from pipeline.plan.plan_files import Needed
+    from pipeline.plan import Needed, Plan
     from pipeline.results import RunDiagnosis
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
@@ -99,10 +98,19 @@ def plan(  # noqa: D417 - the runs document themselves
     names = list(runs or [])
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.plan import parse_area, parse_time  # noqa: PLC0415 - heavy
-    from pipeline.plan.next_drive import ALL, UNDECIDED, Wish, expect, plan_drive, study  # noqa: PLC0415 - heavy
-    from pipeline.plan.plan_files import compare_protocols, parse_protocols  # noqa: PLC0415 - heavy
+    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.plan import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+        ALL,
+        UNDECIDED,
+        Wish,
+        compare_protocols,
+        expect,
+        parse_area,
+        parse_protocols,
+        parse_time,
+        plan_drive,
+        study,
+    )
     from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
 
     seconds = parse_time(time)
@@ -208,7 +216,7 @@ def _gather(
 ) -> _Gathered:
     """Runs of one vehicle, each once, after those that are known already."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan.next_drive import read_command  # noqa: PLC0415 - heavy
+    from pipeline.plan import read_command  # noqa: PLC0415 - heavy
 
     recordings = [] if known is None else [*known.recordings]
     manifests = [] if known is None else [*known.manifests]
@@ -248,7 +256,7 @@ def _find_vehicle(name: str | None) -> Vehicle:
 def _check(path: Path, names: list[str], options: Options, said: str, *, json: bool, quiet: bool) -> int:
     """Compare the plan's predictions with the joint diagnosis of the earlier runs and the drive."""
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
-    from pipeline.plan.plan_files import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
+    from pipeline.plan import check_plan, read_promises, require_played  # noqa: PLC0415 - heavy
 
     promised = read_promises(path)
     if not names:
@@ -286,7 +294,7 @@ def format_plan(
     made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path], said: str = ""
 ) -> list[str]:
     """The plan on one screen; said: flags that the next command needs again."""
-    from pipeline.plan.plan import SAFETY  # noqa: PLC0415 - heavy
+    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
 
     if not made.manoeuvres and not made.impossible:
         what = "" if diagnosis is None else ": all effects are decided, and more driving narrows no interval"

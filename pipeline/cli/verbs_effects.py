@@ -31,16 +31,13 @@ from pipeline.cli.conventions import (
     spell_flags,
     summarize_error,
 )
-from pipeline.core import INPUTS, SlipError
-from pipeline.core.untrusted import resolve_inside
+from pipeline.core import INPUTS, SlipError, resolve_inside
 
 if TYPE_CHECKING:
     from pipeline.estimation import Diagnosis, Recording
-    from pipeline.models import Model, ModelFile
-    from pipeline.models.effect import Effect
+    from pipeline.models import Effect, Model, ModelFile
     from pipeline.results import RunDiagnosis
-    from pipeline.sources import Vehicle
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.sources import Owner, Vehicle
     from pipeline.store import Manifest
 
 
@@ -81,7 +78,7 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
     from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models import check_target  # noqa: PLC0415 - heavy
-    from pipeline.words.diagnosis import describe  # noqa: PLC0415 - heavy
+    from pipeline.words import describe  # noqa: PLC0415 - heavy
 
     if apply is not None:
         check_target(apply)
@@ -157,7 +154,7 @@ def _gather(
     ``at_work`` receives the name of the current log, ``opened`` the data read of each run.
     """
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
-    from pipeline.store.stored_runs import read_choices  # noqa: PLC0415 - heavy
+    from pipeline.store import read_choices  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     errors: list[dict[str, str]] = []
@@ -205,7 +202,7 @@ def _answer(
 ) -> _Answer:
     """The result of a search, or with ``keeps`` the stored result of an earlier one."""
     from pipeline.estimation.stored_diagnosis import find_diagnosis  # noqa: PLC0415 - heavy
-    from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
+    from pipeline.results import read_model  # noqa: PLC0415 - heavy
 
     if keeps and (stored := find_diagnosis(results, opened[0].manifest)) is not None:
         return _Answer([stored], opened, read_model(stored))
@@ -228,7 +225,7 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
 
 
 def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
-    from pipeline.words.objects import diagnosis_as_json  # noqa: PLC0415 - heavy
+    from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
 
     return [
         {
@@ -243,7 +240,7 @@ def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
 def _agree(
     known: ModelFile | None, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None
 ) -> Vehicle:
-    from pipeline.sources.one_vehicle import agree_on_vehicle  # noqa: PLC0415 - heavy
+    from pipeline.sources import agree_on_vehicle  # noqa: PLC0415 - heavy
 
     if known is None:
         return vehicle
@@ -276,7 +273,7 @@ def _judge(
 
 def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequence[str], quiet: bool) -> int:
     """Return the exit code, and print a note if nothing else explains why it is not 0."""
-    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
+    from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
 
     if lossy and not quiet:
         print_note(f"logs with losses: {', '.join(lossy)} (slip inspect {lossy[0]} lists them)")
@@ -287,7 +284,7 @@ def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequenc
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[str, str]]:
     """Write the proposed model; the error of there being none, as a JSON object."""
     from pipeline.models import write_model  # noqa: PLC0415 - heavy
-    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
+    from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
 
     if not answers:  # the errors were said
         return []
@@ -319,7 +316,8 @@ def effects(  # noqa: D417 - the arguments document themselves
         json: print one JSON object.
         quiet: print nothing but errors.
     """
-    from pipeline.models.catalogue import find_effect, format_effect, list_effects, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.models import find_effect, list_effects, list_pages  # noqa: PLC0415 - heavy
+    from pipeline.models.catalogue import format_effect  # noqa: PLC0415 - heavy
 
     chosen = list_effects() if effect is None else (find_effect(effect),)
     pages = list_pages(chosen) if effect is None else [format_effect(chosen[0])]
@@ -385,8 +383,10 @@ def export(  # noqa: D417 - the results folder documents itself
     from pipeline.report import viewer_files  # noqa: PLC0415
     from pipeline.report.export_source import ExportSource  # noqa: PLC0415
     from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
+    from pipeline.store import (  # noqa: PLC0415 - heavy
+        Store,
+        find_run,
+    )
 
     manifest = find_run(run, Store(results))
     known = _open_model(model, trust_code=trust_code)
@@ -411,7 +411,7 @@ def export(  # noqa: D417 - the results folder documents itself
 def _find_named(manifest: Manifest) -> tuple[Model | None, str | None]:
     """The model of the run's diagnosis, and its input; None if there is none."""
     from pipeline.estimation.stored_diagnosis import read_stored_diagnosis  # noqa: PLC0415 - heavy
-    from pipeline.results.reading import read_model  # noqa: PLC0415 - heavy
+    from pipeline.results import read_model  # noqa: PLC0415 - heavy
 
     diagnosis = read_stored_diagnosis(manifest)
     file = None if diagnosis is None else read_model(diagnosis)

@@ -34,12 +34,10 @@ from pipeline.core import TREND_THRESHOLD, SlipError, format_interval, suffix_un
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
-    from pipeline.datasets.check import Check
-    from pipeline.datasets.check_sides import Baseline
-    from pipeline.datasets.trend import Trend
-    from pipeline.models.model_file import ModelFile
-    from pipeline.models.parameter import Parameter as ModelParameter
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.datasets import Baseline, Check, Trend
+    from pipeline.models import ModelFile
+    from pipeline.models import Parameter as ModelParameter
+    from pipeline.sources import Owner
     from pipeline.store import Manifest
 
 
@@ -77,11 +75,13 @@ def check(  # noqa: D417 - the arguments document themselves
     """
     _require_target(to, file, json=json)
     _require_runs(after)
-    from pipeline.datasets.check import check_as_json, check_runs, keep_baseline, read_limits  # noqa: PLC0415 - heavy
+    from pipeline.datasets import check_as_json, check_runs, keep_baseline, read_limits  # noqa: PLC0415 - heavy
     from pipeline.models import write_text  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.words.check import list_lines  # noqa: PLC0415 - heavy
-    from pipeline.words.diagnosis import format_lines  # noqa: PLC0415 - heavy
+    from pipeline.words import (  # noqa: PLC0415 - heavy
+        format_lines,
+        list_lines,
+    )
 
     bounds = None if limits is None else read_limits(limits)
     options = build_options(Choices(results=results))
@@ -152,7 +152,7 @@ def _require_runs(after: str) -> None:
 
 def _open_known(name: str, *, trust_code: bool) -> ModelFile | Baseline | None:
     """Open a name as a model file or a baseline; None for a log, a folder or a run."""
-    from pipeline.datasets.check_sides import read_baseline  # noqa: PLC0415 - heavy
+    from pipeline.datasets import read_baseline  # noqa: PLC0415 - heavy
 
     path = Path(name)
     if path.suffix == ".toml":
@@ -177,7 +177,7 @@ def _open_runs(
 
 
 def _render(checked: Check, to: Literal["markdown", "junit"]) -> str:
-    from pipeline.words.check import format_junit, format_markdown  # noqa: PLC0415 - heavy
+    from pipeline.words import format_junit, format_markdown  # noqa: PLC0415 - heavy
 
     return {"markdown": format_markdown, "junit": format_junit}[to](checked)
 
@@ -217,7 +217,7 @@ def fit(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.prediction import fit_results, summarize_fleet  # noqa: PLC0415 - heavy
+    from pipeline.datasets import fit_results, summarize_fleet  # noqa: PLC0415 - heavy
     from pipeline.report.fleet_pages import write_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -237,7 +237,7 @@ def show(  # noqa: D417 - the results folder documents itself
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.prediction import read_fleet  # noqa: PLC0415 - heavy
+    from pipeline.datasets import read_fleet  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
     content = read_fleet(Store(results))
@@ -311,7 +311,7 @@ def predict(
     """
     from pipeline.datasets import prediction as predictions  # noqa: PLC0415 - heavy
     from pipeline.models import write_model  # noqa: PLC0415
-    from pipeline.plan.next_drive import forecast_deployment  # noqa: PLC0415 - heavy
+    from pipeline.plan import forecast_deployment  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415
 
     store = Store(results)
@@ -327,7 +327,7 @@ def predict(
 
 
 def _format_forecast(content: Mapping[str, object]) -> list[str]:
-    from pipeline.models.catalogue import find_effect  # noqa: PLC0415 - heavy
+    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
 
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
     there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
@@ -395,7 +395,7 @@ def trend(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets.trend import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
+    from pipeline.datasets import check_limits, follow_trend, summarize_trend  # noqa: PLC0415 - heavy
     from pipeline.report.trend_page import write_trend  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 
@@ -434,7 +434,7 @@ def _read_limit(text: str) -> tuple[str, float]:
 
 
 def _format_trend(followed: Trend, page: Path) -> list[str]:
-    from pipeline.datasets.trend import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
+    from pipeline.datasets import format_power, format_quiet, name_quantity  # noqa: PLC0415 - heavy
 
     quiet = format_quiet(followed.series, followed.parameters)
     lines = [f"!! {alert.text}" for alert in followed.alerts] or [quiet]

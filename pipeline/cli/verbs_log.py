@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from pipeline.live.watch import Watch
     from pipeline.recording import Recording
     from pipeline.recording.inspection import Inspection, TopicHealth
-    from pipeline.stages.pose_choice import PoseRating
+    from pipeline.stages import PoseRating
 
     Content = Mapping[str, object]
 
@@ -351,7 +351,7 @@ def stage(  # noqa: D417 - the shared choices document themselves
         quiet: print nothing.
     """
     from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - heavy
-    from pipeline.store.stored_runs import find_log  # noqa: PLC0415 - heavy
+    from pipeline.store import find_log  # noqa: PLC0415 - heavy
 
     options = replace(build_options(choices), force=force, through=name)
     path = find_log(log, options.out)
@@ -484,7 +484,7 @@ def _show(seen: Content, page: Path | None, *, json: bool, is_screen: bool) -> N
 
 def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
     from pipeline.report import render_template  # noqa: PLC0415 - heavy
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+    from pipeline.store import replace_file  # noqa: PLC0415 - heavy
 
     text = render_template("report/templates/watch.html", lines=lines, is_live=is_live)
     hint = "Check the folder and its permissions."

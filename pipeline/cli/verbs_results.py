@@ -30,8 +30,7 @@ if TYPE_CHECKING:
     import polars as pl
 
     from pipeline.batch.batch_check import Status, Verification
-    from pipeline.store import Manifest
-    from pipeline.store.names import Sample
+    from pipeline.store import Manifest, Sample
 
 _WIDE = 200
 _ROWS_AT_ONCE = 1 << 16
@@ -102,7 +101,7 @@ def _print_table(answer: pl.DataFrame) -> None:
 def _print_csv(answer: pl.DataFrame) -> None:
     import polars as pl  # noqa: PLC0415 - heavy
 
-    from pipeline.core.untrusted import format_csv  # noqa: PLC0415 - heavy
+    from pipeline.core import format_csv  # noqa: PLC0415 - heavy
 
     try:
         _write(format_csv(answer.clear()))
@@ -254,7 +253,7 @@ def parse_sample(text: str | None, seed: str | None) -> Sample | None:
     Raises:
         SlipError: ``bad_sample``.
     """
-    from pipeline.store.names import Sample  # noqa: PLC0415 - only where it is asked for
+    from pipeline.store import Sample  # noqa: PLC0415 - only where it is asked for
 
     if text is None:
         if seed is not None:
@@ -337,8 +336,10 @@ def explain(  # noqa: D417 - arguments document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
+    from pipeline.store import (  # noqa: PLC0415 - heavy
+        Store,
+        find_run,
+    )
 
     manifest = find_run(run, Store(results))
     about = _list_column(column) if column else {}

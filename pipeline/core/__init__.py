@@ -1,486 +1,135 @@
-"""Foundations of all packages: rigid motions, time grids, segments, and, here, what every file may need.
+"""Foundations of all rooms: errors, texts, kinds of arrays, rigid motions, time grids, processes.
 
-Here are errors, version, formatting of numbers and durations, starting Python processes, and the memory of
-processes and of the machine. An error has a stable code for scripts, states what is wrong and where, and ends
-with what to do about it. Each package derives a class of its own.
+An error has a stable code for scripts, states what is wrong and where, and ends with what to do about it.
+Each room derives a class of its own.
 """
 
-from __future__ import annotations
-
-import math
-import os
-import signal
-import subprocess
-import sys
-import threading
-import time
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
-from pathlib import Path, PurePosixPath
-from typing import Any, Literal, get_args
-
-_READABLE = 300
-"""Maximum number of characters of quoted text in a sentence: four lines of a screen."""
-_LONGEST = 1000
-"""Maximum number of characters of an error, which may quote a text of any size from a file."""
-
-
-class SlipError(Exception):
-    """An error that the user can correct.
-
-    Args:
-        code: stable identifier in snake_case, for example ``log_not_found``.
-        what: what is wrong, one sentence without a full stop.
-        where: the file, topic, key or line it concerns; empty when there is none.
-        hint: what to do about it.
-    """
-
-    def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
-        super().__init__(what)
-        self.code = code
-        # Errors quote files, whose texts may have any length.
-        self.what = shorten(what, _LONGEST)
-        self.where = where
-        self.hint = hint
-
-    def __str__(self) -> str:
-        """One line: where, what, what to do."""
-        origin = f"{self.where}: " if self.where else ""
-        return f"{origin}{self.what}. {self.hint.rstrip('.')}."
-
-    def _render_traceback_(self) -> list[str]:
-        """The same line in place of a traceback in a notebook."""
-        return [f"slip: {' '.join(str(self).split())}"]
-
-    def __reduce__(self) -> tuple[object, ...]:
-        """Keep every part when the error crosses a process boundary."""
-        return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
-
-
-def shorten(text: str, most: int = _READABLE) -> str:
-    """A text, truncated if it is long."""
-    return text if len(text) <= most else f"{text[:most]}..."
-
-
-def make_plain(text: str) -> str:
-    """Replace unprintable characters, so that the text fits on one line, or into XML."""
-    return "".join(c if c.isprintable() else " " for c in text)
-
-
-def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
-    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty.
-
-    Args:
-        name: the unknown name.
-        known: the names that there are.
-        end: common end of all names, which does not make them alike.
-    """
-    import difflib  # noqa: PLC0415 - only needed once something is already wrong
-
-    near = difflib.get_close_matches(name.removesuffix(end), [one.removesuffix(end) for one in known], n=3)
-    return f"Did you mean {' or '.join(f'{one}{end}' for one in near)}? " if near else ""
-
-
-def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
-    return kind(code, what, where=where, hint=hint)
-
-
-@contextmanager
-def naming_os_errors(
-    make: type[SlipError], code: str, what: str, *, where: object, hint: str
-) -> Iterator[None]:
-    """Context manager that raises errors of the operating system as `SlipError` with their reason.
-
-    Raises:
-        SlipError: of the class `make`.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
-
-
-_MINUTE, _HOUR = 60.0, 3600.0  # seconds
-_DAYS = 3
-"""Days from which a duration is told in days: an experiment of 48 h is one of hours."""
-_LEAST_PART = 0.001
-"""Part of a whole below which its digits say nothing: intervals of budgets are wider."""
-_NEARLY_ALL = 0.95
-"""Share of the recording below which the compared duration is shown as well."""
-
-INPUTS = ("command", "measured")
-INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
-"""Text for each input of the ideal model."""
-
-TREND_THRESHOLD = 0.1
-"""Relative change of slip that raises an alert of a trend unless another is given."""
-
-FigureFormat = Literal["svg", "pdf", "png"]
-FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)
-
-
-def suffix_unit(unit: object) -> str:
-    """A unit as the suffix of a number; empty for a plain number, or one of unknown unit."""
-    return "" if unit in {None, "", "1"} else f" {unit}"
-
-
-def mark_finding(severity: object) -> str:
-    """Mark in front of a finding: `!!` forbids conclusions, `!` is a warning."""
-    return {"error": "!! ", "warning": "!  "}.get(str(severity), "   ")
-
-
-def enumerate_texts(texts: Sequence[str]) -> str:
-    """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
-    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
-
-
-def format_digits(value: float, digits: int = 2) -> str:
-    """A number of so many significant digits, at least those before the point; a whole number for 0."""
-    leading = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
-    places = max(digits - 1 - leading, 0) if digits else 0
-    text = f"{value:z.{places}f}"
-    return text.rstrip("0").rstrip(".") if places else text
-
-
-_LEAST_UNITS = 3.55
-"""Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
-moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
-lost."""
-_UNEVEN = 0.1
-"""Least half of an interval over the other half for the digits to follow it: one may be cut at a bound."""
-
-
-def count_places(half: float) -> int:
-    """Places behind the point that the half of an interval supports, negative for tens and hundreds."""
-    return -math.floor(math.log10(half / _LEAST_UNITS))
-
-
-def split_interval(value: float, low: float, high: float) -> tuple[str, str, str]:
-    """A value and the ends of its interval with the digits that the interval supports.
-
-    The last digit is that of the narrower half, so that both ends differ from the value as printed; a value
-    has one digit at least.
-    """
-    halves = value - low, high - value
-    half = max(min(halves), _UNEVEN * max(halves))
-    if not 0.0 < half < math.inf:
-        return f"{value:.3g}", f"{low:.3g}", f"{high:.3g}"
-    # Whole numbers at the coarsest: in tens, an end near zero would be zero.
-    places = max(count_places(half), 0, -math.floor(math.log10(abs(value))) if value else 0)
-    value_text, low_text, high_text = (f"{one:z.{places}f}" for one in (value, low, high))
-    return value_text, low_text, high_text
-
-
-def format_interval(value: float, low: float, high: float, unit: object = None) -> str:
-    """A value with its unit and its interval: `14.401 rad/s [14.378, 14.424]`."""
-    text, *ends = split_interval(value, low, high)
-    return f"{text}{suffix_unit(unit)} [{', '.join(ends)}]"
-
-
-def format_share(share: float, digits: int = 2) -> str:
-    """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
-
-    Args:
-        share: 1 is the whole.
-        digits: see `format_digits`.
-    """
-    return f"{format_digits(100.0 * share, digits)} %"
-
-
-def format_part(share: float) -> str:
-    """A part of a whole in percent: `56 %`, `0.4 %`, `-2 %`, and `< 0.1 %` of either sign below that."""
-    return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
-
-
-def format_length(metres: float) -> str:
-    """A length as text: `1.06 m`, or below one metre `5.7 cm`."""
-    return f"{format_digits(metres, 3)} m" if metres >= 1.0 else f"{format_digits(100.0 * metres)} cm"
-
-
-def format_angle(radians: float) -> str:
-    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`."""
-    text = format_digits(math.degrees(radians))
-    return f"{text} degree{'s' * (text != '1')}"
-
-
-def format_errors(metres: float, radians: float) -> str:
-    """Errors of position and heading as text: `1.06 m and 55 degrees`; one that is NaN is left out."""
-    sizes = [format_length(metres)] if math.isfinite(metres) else []
-    sizes += [format_angle(radians)] if math.isfinite(radians) else []
-    return " and ".join(sizes) or "by an unknown amount"
-
-
-def format_duration(seconds: float) -> str:
-    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
-    if seconds < _MINUTE:
-        return f"{round(seconds, 1):g} s"
-    whole = round(seconds)
-    if whole < _HOUR:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    if whole < _DAYS * 24 * _HOUR:
-        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
-    return f"{whole // 86400} days {whole % 86400 // 3600} h"
-
-
-def format_recorded(recorded_s: float, compared_s: object = None) -> str:
-    """Duration of a log, and of its part with slip if that is clearly less."""
-    text = format_duration(recorded_s)
-    if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
-        text += f", {format_duration(compared_s)} of it compared"
-    return text
-
-
-NORMAL_95 = 1.959964
-"""Half of a normal distribution's 95 % interval, in standard deviations."""
-
-CONFIDENCE = 0.95
-"""Coverage probability of intervals: the convention of the published comparisons."""
-
-FEWEST_OF_SPREAD = 3
-"""Fewest values, runs or stretches for a spread: the difference of two does not determine one."""
-
-FOLDS = 5
-"""Number of folds of a cross-validation: each is fitted to four fifths of the run."""
-
-TIMES_PER_BLOCK = 5.0
-"""Length of a block in integrated autocorrelation times: ten time constants of an exponential correlation, so
-that the correlation of neighbouring blocks is small."""
-
-JSON_DIGITS = 6
-"""Significant digits of estimates in JSON, more than any estimate has."""
-
-
-def round_digits(value: float, digits: int = JSON_DIGITS) -> float:
-    """A number of that many significant digits."""
-    return float(f"{value:.{digits}g}")
-
-
-def finite_or_none(value: float, digits: int | None = None) -> float | None:
-    """A number, rounded to ``digits`` significant digits if given; None if it is not finite."""
-    if not math.isfinite(value):
-        return None
-    return value if digits is None else round_digits(value, digits)
-
-
-def pick(item: object, *names: str) -> dict[str, Any]:
-    """Selected fields of an object by name."""
-    return {name: getattr(item, name) for name in names}
-
-
-def pick_finite(item: object, *names: str, digits: int | None = None) -> dict[str, float | None]:
-    """Selected numbers of an object by name, as `finite_or_none`."""
-    return {name: finite_or_none(getattr(item, name), digits) for name in names}
-
-
-def silence_warnings() -> None:
-    """Hide warnings in this process unless requested (``python -W``, ``PYTHONWARNINGS``).
-
-    Users are informed by findings, losses and errors. Filters are unchanged: warnings that are errors, as in
-    the tests, remain errors.
-    """
-    if not sys.warnoptions:
-        warnings.showwarning = _ignore
-
-
-def _ignore(*_: object, **__: object) -> None:
-    return None
-
-
-PACKAGE = "slip-pipeline"
-
-
-def read_version() -> str:
-    """Version of the installed package; in a checkout that is not installed, the declared one."""
-    # Every call of the program imports this module, and few need the version.
-    import importlib.metadata  # noqa: PLC0415
-    import tomllib  # noqa: PLC0415
-
-    try:
-        return importlib.metadata.version(PACKAGE)
-    except importlib.metadata.PackageNotFoundError:
-        declared = Path(__file__).parents[2] / "pyproject.toml"
-        content = tomllib.loads(declared.read_text(encoding="utf-8"))
-        return str(content["project"]["version"])
-
-
-# Starting Python in a separate process, without imports from the current folder.
-#
-# ``python -c`` and ``python -m`` search the current folder before the standard library: a `tempfile.py` in a
-# folder with untrusted logs would run. ``-P`` excludes that folder. ``-I`` would also exclude PYTHONPATH and
-# the site packages of the user, which are trusted and may contain slip itself.
-
-THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
-"""Environment variables with the number of threads of numerical libraries."""
-
-_ORPHAN_PERIOD_S = 0.5
-"""Period of checking for the parent process [s]: an orphan ends within it; a check takes microseconds."""
-
-
-def python_command(*words: str) -> list[str]:
-    """Command line of this interpreter, by its absolute path, without the current folder in its import path.
-
-    Args:
-        words: arguments, such as ``-m pipeline batch``.
-    """
-    return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
-
-
-def slip_command(*words: str) -> list[str]:
-    """Command line of a verb in a process of its own.
-
-    Args:
-        words: the verb and its arguments.
-    """
-    return python_command("-m", "pipeline", *words)
-
-
-def keep_current_folder_out() -> None:
-    """Exclude the current folder from the import path of Python processes started by libraries."""
-    os.environ["PYTHONSAFEPATH"] = "1"
-
-
-def end_with(parent: int) -> None:
-    """End this process when the one that started it is killed.
-
-    Args:
-        parent: id of that process.
-    """
-    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
-
-
-def _die_with(parent: int) -> None:
-    while os.getppid() == parent:
-        time.sleep(_ORPHAN_PERIOD_S)
-    os._exit(1)
-
-
-_PERIOD_S = 0.05
-"""Polling period of memory [s]: a process takes tens of megabytes in it, and reading takes microseconds."""
-_PROC = Path("/proc/self/task")
-_SLOW_PERIOD_S = 1.0
-"""Polling period where another program must be called for the list of processes [s]."""
-
-
-class MemoryWatchdog:
-    """Kills child processes that exceed a memory limit.
-
-    A child that has not yet started its program shares the memory of this process: only processes known to
-    run are watched.
-
-    Args:
-        limit_bytes: memory limit of each process.
-    """
-
-    def __init__(self, limit_bytes: int) -> None:
-        self._limit = limit_bytes
-        self._watched: frozenset[int] = frozenset()
-        self._killed: dict[int, int] = {}
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="memory", daemon=True)
-
-    def start(self) -> None:
-        """Start watching in a separate thread."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop watching."""
-        self._stop.set()
-        self._thread.join()
-
-    def watch(self, pid: int) -> None:
-        """Watch a child process, which runs its own program."""
-        self._watched |= {pid}
-
-    def held_by(self, pid: int) -> int | None:
-        """Memory of a process when it was killed for it [bytes]; None if it was not."""
-        return self._killed.get(pid)
-
-    def _watch(self) -> None:
-        while not self._stop.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            for pid in self._watched.intersection(list_children()):
-                held = read_memory(pid)
-                if held > self._limit and pid not in self._killed:
-                    self._killed[pid] = held
-                    with suppress(ProcessLookupError):
-                        os.kill(pid, signal.SIGKILL)
-
-
-@contextmanager
-def limit_memory(limit_bytes: int, give_up: Callable[[int], None]) -> Iterator[None]:
-    """Limit the memory of this process itself.
-
-    Args:
-        limit_bytes: memory limit.
-        give_up: called in a separate thread with the memory in use if it exceeds the limit; ends the process.
-    """
-    done = threading.Event()
-
-    def watch() -> None:
-        while not done.wait(_PERIOD_S if _PROC.exists() else _SLOW_PERIOD_S):
-            held = read_memory(os.getpid())
-            if held > limit_bytes:
-                give_up(held)
-
-    watcher = threading.Thread(target=watch, name="own memory", daemon=True)
-    watcher.start()
-    try:
-        yield
-    finally:
-        done.set()
-        watcher.join()
-
-
-def list_children() -> list[int]:
-    """Running child processes of this process."""
-    if not _PROC.exists():
-        asked = _ask(["/usr/bin/pgrep", "-P", str(os.getpid())])
-        return [int(word) for word in asked.split()]
-    children: list[int] = []
-    for path in _PROC.glob("*/children"):
-        # A thread may end between listing the folder and reading the file.
-        with suppress(OSError):
-            children += [int(word) for word in path.read_bytes().split()]
-    return children
-
-
-def read_memory(pid: int) -> int:
-    """Memory of a process [bytes], 0 if it has ended."""
-    try:
-        pages = int(Path(f"/proc/{pid}/statm").read_bytes().split()[1])
-    except FileNotFoundError:
-        return 0 if Path("/proc/self").exists() else _kilobytes(pid) * 1024
-    except (OSError, IndexError):
-        return 0
-    return pages * os.sysconf("SC_PAGE_SIZE")
-
-
-def _ask(command: list[str]) -> str:
-    asked = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603 - our own words
-    return asked.stdout
-
-
-def _kilobytes(pid: int) -> int:
-    return int(_ask(["/bin/ps", "-o", "rss=", "-p", str(pid)]).strip() or 0)
-
-
-def measure_memory(own: Path = Path("/proc/self/cgroup"), groups: Path = Path("/sys/fs/cgroup")) -> int:
-    """Memory available to this process [bytes]: of the machine, or of its control group if that is less.
-
-    Args:
-        own: file with the control group of this process.
-        groups: folder of the control groups (version 2).
-    """
-    installed = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    return min(installed, *_list_limits(own, groups)) if own.exists() else installed
-
-
-def _list_limits(own: Path, groups: Path) -> Iterator[int]:
-    for line in own.read_text(encoding="utf-8").splitlines():
-        if line.startswith("0::"):
-            inside = PurePosixPath(line[3:].lstrip("/"))
-            for group in (inside, *inside.parents):
-                # "max" means no limit; the root has no such file.
-                with suppress(OSError, ValueError):
-                    yield int((groups / group / "memory.max").read_text(encoding="utf-8"))
-    yield sys.maxsize
+from typing import TYPE_CHECKING
+
+from pipeline.door import open_door
+
+if TYPE_CHECKING:
+    from pipeline.core.arrays import (
+        PAUSE_NS,
+        PERIODS,
+        ROUNDING_S,
+        SILENT_S,
+        STRETCH_S,
+        Complex,
+        Flags,
+        Floats,
+        Ints,
+        fit_robustly,
+        group_rows,
+        guarded_spread,
+        interpolate_linearly,
+        jackknife_deviation,
+        join_parts,
+        nearest_indices,
+        number_stretches,
+        robust_spread,
+        robust_spreads,
+        solve_banded,
+        spread_equal,
+        student_quantile,
+        turn_units,
+    )
+    from pipeline.core.compute import (
+        Budget,
+        Newest,
+        map_in_order,
+        return_freed_memory,
+        usable_threads,
+        usual_budget,
+    )
+    from pipeline.core.levels import (
+        CONFIDENCE,
+        FEWEST_OF_SPREAD,
+        FOLDS,
+        JSON_DIGITS,
+        NORMAL_95,
+        TIMES_PER_BLOCK,
+        finite_or_none,
+        pick,
+        pick_finite,
+        round_digits,
+    )
+    from pipeline.core.machine_code import LANES, compiled, count_loops, deal_lanes, list_caches
+    from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory
+    from pipeline.core.processes import (
+        PACKAGE,
+        THREAD_VARIABLES,
+        end_with,
+        keep_current_folder_out,
+        python_command,
+        read_version,
+        silence_warnings,
+        slip_command,
+    )
+    from pipeline.core.rigid import (
+        GRAVITY_MPS2,
+        LONGEST_WAIT_S,
+        euler_from_quaternions,
+        find_held,
+        find_runs,
+        interpolate_poses,
+        invert_quaternions,
+        measure_increments,
+        multiply_quaternions,
+        quaternions_from_euler,
+        quaternions_from_vectors,
+        quaternions_from_yaw,
+        rotate,
+        rotation_vectors,
+    )
+    from pipeline.core.student import LOG_PEAK, find_scale, list_likelihoods, weigh
+    from pipeline.core.text import (
+        FIGURES,
+        INPUT_WORDS,
+        INPUTS,
+        TREND_THRESHOLD,
+        FigureFormat,
+        SlipError,
+        count_places,
+        enumerate_texts,
+        format_angle,
+        format_digits,
+        format_duration,
+        format_errors,
+        format_interval,
+        format_length,
+        format_part,
+        format_recorded,
+        format_share,
+        guess_names,
+        make_plain,
+        mark_finding,
+        naming_os_errors,
+        shorten,
+        split_interval,
+        suffix_unit,
+    )
+    from pipeline.core.untrusted import (
+        MOST_BYTES,
+        TOO_LARGE,
+        PathError,
+        TomlError,
+        format_csv,
+        mapping_in,
+        may_lead_out,
+        number_in,
+        numbers_in,
+        objects_in,
+        parse_toml,
+        read_bounded,
+        read_bounded_text,
+        read_object,
+        require_finite,
+        resolve_inside,
+        too_large,
+        unquote_formulas,
+        walk_files,
+        walk_tree,
+    )
+else:
+    __getattr__ = open_door(__name__, __file__)

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from pipeline.core import SlipError, shorten
+from pipeline.core.text import SlipError, shorten
 
 if TYPE_CHECKING:
     import polars as pl

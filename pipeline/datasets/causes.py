@@ -16,8 +16,7 @@ from itertools import combinations
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, finite_or_none, format_share, pick, pick_finite
-from pipeline.core.arrays import Floats
+from pipeline.core import FEWEST_OF_SPREAD, Floats, finite_or_none, format_share, pick, pick_finite
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
     Question,
@@ -31,10 +30,9 @@ from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
 from pipeline.datasets.prediction import fit_results
 from pipeline.datasets.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
 from pipeline.estimation.apportion import jackknife_ratio
-from pipeline.models.catalogue import list_effects, name_effect
-from pipeline.results.reading import CAUSE_NAMES
-from pipeline.store import Store
-from pipeline.store.stored_runs import NoRunsError, lack_runs
+from pipeline.models import list_effects, name_effect
+from pipeline.results import CAUSE_NAMES
+from pipeline.store import NoRunsError, Store, lack_runs
 
 _LEAST_SHOWN = 0.05
 """Minimum share of a difference for a cause to be reported; twice that share could omit a tenth of it."""

@@ -22,7 +22,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import ndtr
 
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import Flags, Floats
 from pipeline.datasets.levels import weigh_run_spreads
 
 CHANCE = 0.02

@@ -12,9 +12,18 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import NORMAL_95, finite_or_none, format_interval, format_share, guess_names, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
-from pipeline.datasets import ComparisonError
+from pipeline.core import (
+    NORMAL_95,
+    TomlError,
+    finite_or_none,
+    format_interval,
+    format_share,
+    guess_names,
+    parse_toml,
+    read_bounded_text,
+    require_finite,
+    shorten,
+)
 from pipeline.datasets.changes import AFTER, BEFORE, Change, RunNumbers, compare_sides
 from pipeline.datasets.check_readings import (
     COMMANDED,
@@ -29,12 +38,12 @@ from pipeline.datasets.check_readings import (
     RunReading,
 )
 from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
+from pipeline.datasets.pooling import ComparisonError
 from pipeline.models import write_text
 
 if TYPE_CHECKING:
-    from pipeline.models.model_file import ModelFile
-    from pipeline.models.parameter import Parameter
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.models import ModelFile, Parameter
+    from pipeline.sources import Owner
     from pipeline.store import Manifest, Store
 
 Outcome = Literal["kept", "broken", "undetermined"]

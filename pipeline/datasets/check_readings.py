@@ -10,20 +10,27 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
-from pipeline.core.arrays import STRETCH_S, Floats, Ints, group_rows, jackknife_deviation, student_quantile
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    NORMAL_95,
+    STRETCH_S,
+    Floats,
+    Ints,
+    group_rows,
+    jackknife_deviation,
+    student_quantile,
+)
 from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
-from pipeline.models.effect import Effect, Late, Parameter
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models import Effect, Late, Parameter, is_of_one_run
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
     from pipeline.estimation.comparison import Input
-    from pipeline.models.model import Model
+    from pipeline.models import Model
 
 
 POSITION_ERROR = "error.position"

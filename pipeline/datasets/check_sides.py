@@ -15,10 +15,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import INPUTS, NORMAL_95, SlipError, finite_or_none, shorten
-from pipeline.core.arrays import Floats
-from pipeline.core.untrusted import read_bounded
-from pipeline.datasets import ComparisonError
+from pipeline.core import INPUTS, NORMAL_95, Floats, SlipError, finite_or_none, read_bounded, shorten
 from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.datasets.check_readings import (
     COMMANDED,
@@ -30,24 +27,28 @@ from pipeline.datasets.check_readings import (
     read_run,
 )
 from pipeline.datasets.compared_runs import find_run_refusal
+from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
-from pipeline.models import format_model
-from pipeline.models.catalogue import list_effects
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.model import Model
-from pipeline.models.model_file import ModelFile, parse_model
-from pipeline.models.parameter import is_of_one_run
+from pipeline.models import (
+    FormulaEffect,
+    Model,
+    ModelFile,
+    format_model,
+    is_of_one_run,
+    list_effects,
+    parse_model,
+)
 from pipeline.recording.log_setup import UNKNOWN
-from pipeline.results.reading import read_model
+from pipeline.results import read_model
 from pipeline.run import load_motion_run
-from pipeline.sources.one_vehicle import agree_on_vehicle, load_vehicle
+from pipeline.sources import agree_on_vehicle, load_vehicle
 
 if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
+    from pipeline.models import Effect
     from pipeline.run import MotionRun
-    from pipeline.sources.one_vehicle import Owner
+    from pipeline.sources import Owner
     from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1

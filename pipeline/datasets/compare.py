@@ -7,14 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD
-from pipeline.core.arrays import Ints
-from pipeline.datasets import (
-    OVER_RUNS,
-    THIS_RUN,
-    pool_runs,
-    spread_windows,
-)
+from pipeline.core import FEWEST_OF_SPREAD, Ints
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -45,11 +38,11 @@ from pipeline.datasets.pairs import (
     tabulate_pairs,
 )
 from pipeline.datasets.pooled_tests import bound_levels
+from pipeline.datasets.pooling import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
 from pipeline.datasets.published_chain import follow_published, read_limits
 from pipeline.datasets.rank_tests import connect_groups
-from pipeline.stages.inputs import WINDOW_S
-from pipeline.store import Store
-from pipeline.store.stored_runs import ANALYZE_FIRST, lack_runs
+from pipeline.stages import WINDOW_S
+from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 
 _FEWEST = 2
 

@@ -7,7 +7,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import guess_names
-from pipeline.datasets import (
+from pipeline.datasets.pooling import (
     ComparisonError,
     add_measures,
     find_unrelated,
@@ -16,14 +16,11 @@ from pipeline.datasets import (
     measure_difficulty,
 )
 from pipeline.estimation.stored_diagnosis import DIAGNOSED
-from pipeline.models.catalogue import list_effects
-from pipeline.results.reading import find_refusal, read_findings
-from pipeline.run.signals import GROUND_UNOBSERVABLE
-from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
-from pipeline.store import Manifest, Store, StoreError
-from pipeline.store.names import date_runs
-from pipeline.store.parquet_tables import scan_table
-from pipeline.store.stored_runs import DIAGNOSIS
+from pipeline.models import list_effects
+from pipeline.results import find_refusal, read_findings
+from pipeline.run import GROUND_UNOBSERVABLE
+from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
+from pipeline.store import DIAGNOSIS, Manifest, Store, StoreError, date_runs, scan_table
 from schemas import contract_of
 
 _DATES = ("day", "month", "year")

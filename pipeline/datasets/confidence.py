@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from pipeline.core import CONFIDENCE, TIMES_PER_BLOCK
-from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
+from pipeline.core import CONFIDENCE, TIMES_PER_BLOCK, Flags, Floats, Ints, student_quantile
 from pipeline.datasets.rank_tests import (
     DRAWS,
     PermutationTest,

@@ -8,10 +8,9 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import naming_os_errors
-from pipeline.core.untrusted import format_csv, read_bounded_text, unquote_formulas
-from pipeline.datasets import MEASURES, ComparisonError, Measure, pool_runs
+from pipeline.core import format_csv, naming_os_errors, read_bounded_text, unquote_formulas
 from pipeline.datasets.compared_runs import choose_input, find_material, measure_runs, read_digest
+from pipeline.datasets.pooling import MEASURES, ComparisonError, Measure, pool_runs
 from pipeline.store import Store
 from schemas import Deployments
 
@@ -274,7 +273,7 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``, the file cannot be written.
     """
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
+    from pipeline.store import replace_file  # noqa: PLC0415 - heavy
 
     plain = frame.with_columns(pl.col(pl.Float64).round_sig_figs(_DIGITS))
     what, hint = "the table cannot be written", "Choose another file"

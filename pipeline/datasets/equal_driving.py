@@ -14,7 +14,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD
-from pipeline.run.signals import STILL_MPS
+from pipeline.run import STILL_MPS
 
 SPEED_EDGES = (0.5, 1.0, 1.5, 2.0, 3.0, 6.0, 12.0, 24.0)
 """Edges of the classes of commanded speed [m/s]: half a metre per second where field robots drive, twice the

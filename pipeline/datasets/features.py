@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import polars as pl
 
 from pipeline.core import make_plain, naming_os_errors, read_version
-from pipeline.datasets import ComparisonError
 from pipeline.datasets.compared_runs import find_material, measure_runs, read_digest
-from pipeline.store import Store
-from pipeline.store.stored_runs import ANALYZE_FIRST, lack_runs
+from pipeline.datasets.pooling import ComparisonError
+from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 from schemas import Features, contract_of
 
 if TYPE_CHECKING:
@@ -72,8 +71,10 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``.
     """
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - heavy
-    from pipeline.store.parquet_tables import encode_parquet  # noqa: PLC0415
+    from pipeline.store import (  # noqa: PLC0415 - heavy
+        encode_parquet,
+        replace_file,
+    )
 
     what, hint = "the file cannot be written", "Choose another file."
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
@@ -121,7 +122,7 @@ def read_features(path: Path) -> pl.DataFrame:
 
 def _check_schema(file: pq.ParquetFile, where: str) -> list[str]:
     """Return the names of the columns if the end of the file is that of features of this version."""
-    from pipeline.store.parquet_tables import list_complaints  # noqa: PLC0415 - heavy
+    from pipeline.store import list_complaints  # noqa: PLC0415 - heavy
 
     about, contract = file.metadata.metadata or {}, contract_of("features")
     if about.get(b"contract") != b"features":

@@ -8,14 +8,21 @@ from typing import Literal, cast
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, format_interval
-from pipeline.core.arrays import Floats
-from pipeline.datasets import UNKNOWN, ComparisonError
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Floats, format_interval
 from pipeline.datasets.joint_levels import RunEvidence, draw_joint_run
 from pipeline.datasets.levels import LevelFit, draw_run, find_outlier, split_levels
-from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Effect, Late, Place
-from pipeline.models.parameter import USUAL_SPREAD, Level, Parameter, is_of_one_run, stands_at_bound
+from pipeline.datasets.pooling import UNKNOWN, ComparisonError
+from pipeline.models import (
+    USUAL_SPREAD,
+    Effect,
+    Late,
+    Level,
+    Parameter,
+    Place,
+    find_effect,
+    is_of_one_run,
+    stands_at_bound,
+)
 
 # Parameters of a fleet by level: vehicle, terrain or run.
 #

@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
-from pipeline.core.arrays import Flags, Floats, Ints, student_quantile
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Flags, Floats, Ints, student_quantile
 from pipeline.datasets.levels import (
     Sample,
     draw_spreads,

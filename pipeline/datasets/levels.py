@@ -18,8 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
-from pipeline.core.arrays import Floats, Ints, student_quantile
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Floats, Ints, student_quantile
 from pipeline.datasets.confidence import Interval
 from pipeline.datasets.rank_tests import StatisticsError, check_values
 

@@ -10,10 +10,7 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import CONFIDENCE, pick
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.untrusted import number_in
-from pipeline.datasets import MEASURES
+from pipeline.core import CONFIDENCE, Floats, Ints, number_in, pick
 from pipeline.datasets.confidence import (
     Blocks,
     Comparison,
@@ -25,6 +22,7 @@ from pipeline.datasets.confidence import (
 )
 from pipeline.datasets.equal_driving import Overlap
 from pipeline.datasets.pooled_tests import compare_means, exponentiate, pool_spread, take_logarithms
+from pipeline.datasets.pooling import MEASURES
 from pipeline.datasets.rank_tests import (
     DRAWS,
     FEWER_DRAWS,

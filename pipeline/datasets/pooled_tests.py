@@ -13,8 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD
-from pipeline.core.arrays import Floats, student_quantile
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Floats, student_quantile
 from pipeline.datasets.confidence import Interval
 from pipeline.datasets.rank_tests import (
     DRAWS,

@@ -14,31 +14,28 @@ import polars as pl
 from pipeline.core import (
     CONFIDENCE,
     FEWEST_OF_SPREAD,
+    STRETCH_S,
+    Complex,
+    Flags,
+    Floats,
     SlipError,
     enumerate_texts,
     finite_or_none,
     guess_names,
     pick,
+    read_bounded,
 )
-from pipeline.core.arrays import STRETCH_S, Complex, Flags, Floats
-from pipeline.core.untrusted import read_bounded
-from pipeline.datasets import UNKNOWN, ComparisonError
 from pipeline.datasets.compared_runs import ComparedRuns, find_material, read_digest
 from pipeline.datasets.confidence import Interval
 from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.datasets.levels import draw_run
+from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.problem import predict_at_from, predict_from
-from pipeline.models.catalogue import find_effect
-from pipeline.models.effect import Effect
-from pipeline.models.model import Model, Timing
-from pipeline.models.model_file import ModelFile
+from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
 from pipeline.run import TABLE_COLUMNS, MotionError, load_motion_run
-from pipeline.sources import Vehicle
-from pipeline.sources.one_vehicle import load_vehicle
-from pipeline.store import Manifest, Store
-from pipeline.store.names import no_results, read_day
-from pipeline.store.stored_runs import lack_runs, read_length_scale
+from pipeline.sources import Vehicle, load_vehicle
+from pipeline.store import Manifest, Store, lack_runs, no_results, read_day, read_length_scale
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)
@@ -222,8 +219,10 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
     """Ends of an interval, cut to the bounds of the parameter."""
-    from pipeline.models import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.models.parameter import cut_interval  # noqa: PLC0415 - heavy
+    from pipeline.models import (  # noqa: PLC0415 - heavy
+        cut_interval,
+        find_effect,
+    )
 
     if interval is None:
         return {"low": None, "high": None}

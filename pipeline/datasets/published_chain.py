@@ -15,10 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 import polars as pl
 
-from pipeline.core import arrays
-from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints
-from pipeline.stages.inputs import WINDOW_S
-from pipeline.stages.slip_stage import PUBLISHED_SAMPLES
+from pipeline.core import ROUNDING_S, Flags, Floats, Ints, arrays
+from pipeline.stages import PUBLISHED_SAMPLES, WINDOW_S
 
 _STIFFNESS = 0.8
 """Lambda of the published smoothing spline; it halves the amplitude of a motion of 0.36 Hz."""

@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import kendalltau, mannwhitneyu
 
-from pipeline.core import CONFIDENCE, SlipError
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import CONFIDENCE, Flags, Floats, SlipError
 
 # Medians, intervals, permutation tests and effect sizes: functions of arrays, usable alone.
 #

@@ -6,8 +6,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from pipeline.datasets import ComparisonError
 from pipeline.datasets.compared_runs import find_run_refusal
+from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.comparison import InputChoice, choose_input
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
@@ -25,13 +25,9 @@ from pipeline.estimation.rivals import (
     list_learners,
     time_fit,
 )
-from pipeline.models.effect import Effect
-from pipeline.models.learned_term import drop_learned, find_learned
-from pipeline.models.literature import list_models
-from pipeline.models.model_file import ModelFile
+from pipeline.models import Effect, ModelFile, drop_learned, find_learned, list_models
 from pipeline.run import MotionError, MotionRun, load_motion_run
-from pipeline.sources import Vehicle
-from pipeline.sources.one_vehicle import Owner, agree_on_vehicle, load_vehicle
+from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
 from pipeline.store import Manifest
 
 

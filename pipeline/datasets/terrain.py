@@ -14,9 +14,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import CONFIDENCE, format_share
-from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, student_quantile
-from pipeline.run.signals import MOVING_MPS
+from pipeline.core import CONFIDENCE, Flags, Floats, Ints, format_share, jackknife_deviation, student_quantile
+from pipeline.run import MOVING_MPS
 
 CELL_M = 2.0
 """Default side of a cell [m]: slip comes from velocities over 0.75 s, in which a vehicle at 2 m/s moves

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError, finite_or_none, format_share
-from pipeline.core.arrays import Floats, interpolate_linearly
-from pipeline.datasets import ComparisonError
+from pipeline.core import Floats, SlipError, finite_or_none, format_share, interpolate_linearly
 from pipeline.datasets.compared_runs import find_material, measure_runs
+from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.terrain import (
     CELL_M,
     LARGEST_CELL_M,
@@ -29,10 +28,9 @@ from pipeline.datasets.terrain import (
     sum_cells,
 )
 from pipeline.logs import LogIndex, TopicColumns, Wanted, open_log, read_topics
-from pipeline.sources.message_types import find_type
-from pipeline.stages.reading import FEWEST_MESSAGES, read_fixes
-from pipeline.stages.satellite import from_local_plane, to_local_plane
-from pipeline.store.stored_runs import find_recorded_log, lack_runs
+from pipeline.sources import find_type
+from pipeline.stages import FEWEST_MESSAGES, from_local_plane, read_fixes, to_local_plane
+from pipeline.store import find_recorded_log, lack_runs
 
 if TYPE_CHECKING:
     from pipeline.store import Manifest, Store

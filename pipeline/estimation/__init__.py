@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 import msgspec
 from threadpoolctl import threadpool_limits
 
-from pipeline.core.compute import Budget, usual_budget
+from pipeline.core import Budget, usual_budget
 from pipeline.estimation import conclude
 from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
 from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
@@ -39,10 +39,8 @@ from pipeline.estimation.problem import (
 from pipeline.estimation.state import Free, State
 from pipeline.estimation.together import Member, judge_together
 from pipeline.estimation.unexplained import search_formula
-from pipeline.models import Effect, Model
-from pipeline.models.effect import Place
-from pipeline.results import Finding, Named, RunDiagnosis, Value
-from pipeline.results.reading import read_findings
+from pipeline.models import Effect, Model, Place
+from pipeline.results import Finding, Named, RunDiagnosis, Value, read_findings
 from pipeline.run import MotionRun, load_run
 from pipeline.sources import Vehicle
 

@@ -23,8 +23,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import CONFIDENCE, format_share
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core import CONFIDENCE, Floats, Ints, format_share
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import PartFit, invert
@@ -33,8 +32,7 @@ from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Prior, State
-from pipeline.models.learned_term import LEAST_WAY_M, Bands
-from pipeline.models.model import Model
+from pipeline.models import LEAST_WAY_M, Bands, Model
 
 if TYPE_CHECKING:
     from pipeline.estimation.noise import Noise

@@ -21,20 +21,17 @@ from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
 from pipeline.estimation.learned_step import explain_no_help
 from pipeline.estimation.model_fit import Fitted
-from pipeline.models import Model
-from pipeline.models.catalogue import explain_idle
-from pipeline.models.learned_term import LEARNED
-from pipeline.results.reading import CHANCE, format_rises, list_rises
+from pipeline.models import LEARNED, Model, explain_idle
+from pipeline.results import CHANCE, format_rises, list_rises
 from pipeline.run import MotionError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
 
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.candidates import Candidate
     from pipeline.estimation.problem import Problem
-    from pipeline.models.effect import Effect, Parameter
-    from pipeline.models.parameter import Conditions
+    from pipeline.models import Conditions, Effect, Parameter
 
 Interval = tuple[float, float]
 

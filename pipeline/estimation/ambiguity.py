@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec.structs import replace
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core import Floats, Ints
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.decision import LEAST_T, STABLE_T, Search, SearchResult
 from pipeline.estimation.estimates import list_first_run
 from pipeline.estimation.fit import PartFit, whiten_columns
 from pipeline.estimation.intervals import estimate_part
-from pipeline.models.catalogue import find_late_effect, list_effects
-from pipeline.models.effect import Effect, Late, find_late
-from pipeline.models.parameter import LEAST_DELAY_S
-from pipeline.models.parameter import Search as HowSearched
+from pipeline.models import LEAST_DELAY_S, Effect, Late, find_late, find_late_effect, list_effects
+from pipeline.models import Search as HowSearched
 from pipeline.results import Delays, Detectable, Undecided, Unobservable, Value
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle

@@ -16,14 +16,19 @@ from itertools import pairwise, permutations
 
 import numpy as np
 
-from pipeline.core import FEWEST_OF_SPREAD
-from pipeline.core.arrays import Floats, Ints, jackknife_deviation, nearest_indices, student_quantile
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    Floats,
+    Ints,
+    jackknife_deviation,
+    nearest_indices,
+    student_quantile,
+)
 from pipeline.estimation.folds import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
-from pipeline.results import Moments, Share, SlipBudget, Span
-from pipeline.results.reading import ABOVE_FLOOR
-from pipeline.run.windows import HORIZON_S
+from pipeline.results import ABOVE_FLOOR, Moments, Share, SlipBudget, Span
+from pipeline.run import HORIZON_S
 
 Subset = frozenset[str]
 

@@ -12,15 +12,15 @@ import numpy as np
 
 from pipeline.estimation.fit import invert, whiten_columns
 from pipeline.estimation.state import stack_columns
-from pipeline.models.effect import Effect, Parameter, Search
+from pipeline.models import Effect, Parameter, Search
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
 
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.fit import PartFit
     from pipeline.estimation.state import State
-    from pipeline.models.parameter import Largest
+    from pipeline.models import Largest
 
 PRICE = 25.0
 """Fall of chi-square that each number of a model must bring: five standard errors."""

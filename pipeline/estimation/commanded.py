@@ -16,10 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline import results
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, SlipError
-from pipeline.core.arrays import (
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    NORMAL_95,
     Floats,
     Ints,
+    SlipError,
     group_rows,
     jackknife_deviation,
     number_stretches,
@@ -27,7 +29,7 @@ from pipeline.core.arrays import (
 )
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.window_residuals import locate_windows
-from pipeline.models.model import Timing
+from pipeline.models import Timing
 from pipeline.run import MotionRun
 from pipeline.sources import Vehicle
 

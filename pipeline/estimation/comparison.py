@@ -9,22 +9,39 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.core.arrays import SILENT_S, Complex, Floats, Ints, join_parts, turn_units
-from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Effect, Late, Place, ReportEffect, find_late
-from pipeline.models.model import Forward, Timing, replace_context
-from pipeline.run import MotionError, MotionRun
-from pipeline.run.heading import Grid, HeadingSource, choose_heading, find_silences, has_excluded, lay_grid
-from pipeline.run.signals import Resets, RunContext, Signal, Velocity
-from pipeline.run.windows import (
+from pipeline.core import SILENT_S, Complex, Floats, Ints, join_parts, turn_units
+from pipeline.models import (
+    Effect,
+    Forward,
+    Late,
+    Place,
+    ReportEffect,
+    Timing,
+    find_late,
+    is_own,
+    replace_context,
+)
+from pipeline.run import (
     WINDOW_S,
+    Grid,
+    HeadingSource,
+    MotionError,
+    MotionRun,
+    Resets,
+    RunContext,
+    Signal,
+    Velocity,
     Windows,
+    choose_heading,
     find_gaps,
     find_lead,
+    find_silences,
     gather_nodes,
+    has_excluded,
     join_horizons,
     join_steps,
     join_windows,
+    lay_grid,
 )
 from pipeline.sources import Vehicle
 

@@ -36,9 +36,7 @@ from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, list_order, note_fit
 from pipeline.estimation.learned_step import learn_beyond, summarize_learned
 from pipeline.estimation.plausibility import measure_moves
-from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
-from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Late
+from pipeline.models import Effect, Late, Model, ModelFile, find_effect, find_late_effect, format_model
 from pipeline.results import (
     Delays,
     Detectable,
@@ -63,7 +61,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.decision import Judged, Search, SearchResult
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.problem import Problem
-    from pipeline.models.formula import FormulaEffect
+    from pipeline.models import FormulaEffect
 
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})
 

@@ -16,13 +16,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import enumerate_texts, format_errors, suffix_unit
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import Flags, Floats, enumerate_texts, format_errors, suffix_unit
 from pipeline.estimation.decision import LEAST_T, list_costs
 from pipeline.estimation.folds import find_in_test, refit, refit_fold, score
-from pipeline.models.catalogue import name_term
-from pipeline.results import Finding
-from pipeline.results.reading import CHANGE, ERRORS_OVER_2S
+from pipeline.models import name_term
+from pipeline.results import CHANGE, ERRORS_OVER_2S, Finding
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence

@@ -10,11 +10,8 @@ from typing import TYPE_CHECKING, cast
 from pipeline.core import SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.problem import Problem
-from pipeline.models.catalogue import list_effects
-from pipeline.models.effect import Effect, Excitation, Place
-from pipeline.models.parameter import Conditions, Largest
-from pipeline.run import MotionError, MotionRun
-from pipeline.run.signals import GROUND_UNOBSERVABLE
+from pipeline.models import Conditions, Effect, Excitation, Largest, Place, list_effects
+from pipeline.run import GROUND_UNOBSERVABLE, MotionError, MotionRun
 
 if TYPE_CHECKING:
     from pipeline.estimation.candidates import Candidate

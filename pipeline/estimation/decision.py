@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import format_share
-from pipeline.core.compute import Budget
+from pipeline.core import Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
 from pipeline.estimation.fit import PartFit, fit_part
 from pipeline.estimation.noise import huber_cost
@@ -25,12 +24,11 @@ from pipeline.estimation.plausibility import is_nameable, is_too_small
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterable, Sequence
 
-    from pipeline.core.arrays import Floats, Ints
+    from pipeline.core import Floats, Ints
     from pipeline.estimation.noise import Noise
     from pipeline.estimation.parts import HorizonError, Part
     from pipeline.estimation.state import State
-    from pipeline.models.effect import Effect
-    from pipeline.models.parameter import Conditions
+    from pipeline.models import Conditions, Effect
 
 LEAST_T = 5.0
 """Standard errors that an effect must be from none: the largest t of some 30 candidates on logs without any

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from msgspec.structs import replace
 
-from pipeline.core import round_digits
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core import Floats, Ints, round_digits
 from pipeline.estimation.intervals import narrow_part
-from pipeline.models.catalogue import find_effect
-from pipeline.results import DataNeed, Evidence, Growth, Narrowing
-from pipeline.results.reading import INTERVAL_SHARE
+from pipeline.models import find_effect
+from pipeline.results import INTERVAL_SHARE, DataNeed, Evidence, Growth, Narrowing
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

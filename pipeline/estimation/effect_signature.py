@@ -5,15 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Flags, Floats, Ints, robust_spread
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import State
 from pipeline.estimation.window_residuals import CLIP, average_windows, locate_windows, number_stretches
-from pipeline.models.effect import Place
-from pipeline.models.model import Timing
-from pipeline.run.windows import WINDOW_S
+from pipeline.models import Place, Timing
+from pipeline.run import WINDOW_S
 
 # The signature of an effect: the residual against the variable that it acts on, with the effect's curve.
 #

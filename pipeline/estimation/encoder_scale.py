@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from pipeline.core import format_share
-from pipeline.models.catalogue import find_effect
+from pipeline.models import find_effect
 from pipeline.results import Finding, Named, RunDiagnosis, Value
 from pipeline.run import MotionRun
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import Flags, Floats
 from pipeline.estimation.window_residuals import WindowResiduals
 from pipeline.results import Region
-from pipeline.run.windows import NODE_S
+from pipeline.run import NODE_S
 
 CHANNELS = ("x", "y", "w")
 _LEAST_SHARE = 0.2

@@ -17,22 +17,32 @@ from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.state import State, combine_columns
 from pipeline.estimation.window_residuals import count_seconds
-from pipeline.models.catalogue import find_effect, list_effects
-from pipeline.models.effect import Effect, Late
-from pipeline.models.model import Model
-from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import (
+from pipeline.models import (
+    Effect,
+    Late,
+    Model,
+    ModelFile,
     Parameter,
     cut_interval,
+    find_effect,
     is_of_one_run,
+    list_effects,
     stands_at_bound,
 )
-from pipeline.results import EstimatedNumber, Finding, Interval, Named, RunDiagnosis, Value
-from pipeline.results.reading import BREVITY, SEARCH_CUT
+from pipeline.results import (
+    BREVITY,
+    SEARCH_CUT,
+    EstimatedNumber,
+    Finding,
+    Interval,
+    Named,
+    RunDiagnosis,
+    Value,
+)
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:
-    from pipeline.core.compute import Budget
+    from pipeline.core import Budget
     from pipeline.estimation.context import Context
 
 _PASSES = 2

@@ -20,7 +20,7 @@ from pipeline.estimation.state import combine_columns, flatten, pick_columns
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.arrays import Flags, Floats, Ints
+    from pipeline.core import Flags, Floats, Ints
     from pipeline.estimation.noise import Noise
     from pipeline.estimation.parts import HorizonError, Part
     from pipeline.estimation.state import Free, State

@@ -9,11 +9,11 @@ import numpy as np
 
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.window_residuals import average_lags, make_features, regress_robustly
-from pipeline.models.model import Timing
-from pipeline.run.windows import HORIZON_S, WINDOW_S
+from pipeline.models import Timing
+from pipeline.run import HORIZON_S, WINDOW_S
 
 if TYPE_CHECKING:
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.parts import Part
     from pipeline.estimation.problem import Problem

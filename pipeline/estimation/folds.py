@@ -7,10 +7,19 @@ from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
-from pipeline.core import FOLDS, JSON_DIGITS, finite_or_none, pick_finite
-from pipeline.core.arrays import Flags, Floats, Ints, nearest_indices, robust_spreads
+from pipeline.core import (
+    FOLDS,
+    JSON_DIGITS,
+    Flags,
+    Floats,
+    Ints,
+    finite_or_none,
+    nearest_indices,
+    pick_finite,
+    robust_spreads,
+)
 from pipeline.estimation.fit import PartFit, invert
-from pipeline.models.learned_term import LEARNED
+from pipeline.models import LEARNED
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -20,7 +29,7 @@ if TYPE_CHECKING:
     from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import State
     from pipeline.estimation.window_residuals import WindowResiduals
-    from pipeline.models.effect import Effect
+    from pipeline.models import Effect
 
     Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
 

@@ -11,10 +11,10 @@ import numpy as np
 from pipeline.core import NORMAL_95
 from pipeline.estimation.fit import invert, join_covariance, measure_cost, whiten_columns
 from pipeline.estimation.parts import CLOCK_STEP_S
-from pipeline.models.parameter import cut_interval, stands_at_bound
+from pipeline.models import cut_interval, stands_at_bound
 
 if TYPE_CHECKING:
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.fit import PartFit
     from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import Free

@@ -10,17 +10,15 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.core import JSON_DIGITS, finite_or_none, pick
-from pipeline.core.arrays import Floats
+from pipeline.core import JSON_DIGITS, Floats, finite_or_none, pick
 from pipeline.estimation.floor import estimate_floor
 from pipeline.estimation.folds import Errors, HeldOut, errors_as_json, hold_out, measure_errors
 from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
-from pipeline.models.model import Model, Timing
-from pipeline.models.model_file import ModelFile
-from pipeline.results.reading import CHANCE, ERRORS_OVER_2S, as_written, list_rises
+from pipeline.models import Model, ModelFile, Timing
+from pipeline.results import CHANCE, ERRORS_OVER_2S, as_written, list_rises
 
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""

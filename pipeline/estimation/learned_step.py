@@ -15,8 +15,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import FOLDS, format_share
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spreads
+from pipeline.core import FOLDS, Flags, Floats, Ints, format_share, robust_spreads
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.folds import (
     Errors,
@@ -31,20 +30,29 @@ from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
 from pipeline.estimation.state import State
 from pipeline.estimation.window_residuals import CLIP
-from pipeline.models.effect import Effect, Late
-from pipeline.models.learned_term import (
+from pipeline.models import (
     INPUTS,
     Bands,
+    Effect,
     InputProbe,
+    Late,
     LearnedInput,
+    Model,
     ResidualTerm,
     drop_learned,
     find_learned,
     learned_as_table,
 )
-from pipeline.models.model import Model
-from pipeline.results import Learned, LearnedShare
-from pipeline.results.reading import ABOVE_FLOOR, CHANCE, ERRORS_OVER_2S, format_rises, list_rises, read_error
+from pipeline.results import (
+    ABOVE_FLOOR,
+    CHANCE,
+    ERRORS_OVER_2S,
+    Learned,
+    LearnedShare,
+    format_rises,
+    list_rises,
+    read_error,
+)
 from pipeline.run import MotionRun
 
 if TYPE_CHECKING:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from pipeline.estimation.candidates import Screen, Unset
 from pipeline.estimation.fit import PartFit, fit_part
-from pipeline.models.model import Model
+from pipeline.models import Model
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.parts import Part
     from pipeline.estimation.problem import Problem
     from pipeline.estimation.state import Free, State

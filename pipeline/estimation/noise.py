@@ -21,12 +21,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.optimize import minimize
 
-from pipeline.core.machine_code import compiled
+from pipeline.core import compiled
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.arrays import Flags, Floats, Ints
+    from pipeline.core import Flags, Floats, Ints
 
 CLIP = 3.0
 """Innovation [standard deviations] above which its cost grows linearly (Huber)."""

@@ -11,22 +11,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core.machine_code import compiled
+from pipeline.core import compiled
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.noise import Steps, learn_noise
 from pipeline.estimation.state import NO_PRIOR, DelayName, Free, Prior, State, make_columns
 from pipeline.estimation.window_residuals import average_windows, locate_windows, number_stretches
-from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Effect, Late, Place
-from pipeline.models.model import Timing
-from pipeline.models.parameter import OVERSHOOT
+from pipeline.models import OVERSHOOT, Effect, Late, Place, Timing, find_late_effect
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.core.arrays import Complex, Flags, Floats, Ints
+    from pipeline.core import Complex, Flags, Floats, Ints
     from pipeline.estimation.noise import Noise
-    from pipeline.run.signals import Velocity
+    from pipeline.run import Velocity
 
 BLOCK_S = 20.0
 """Length of blocks that are held out, and that count as independent [s]: ten times as long as any noise."""

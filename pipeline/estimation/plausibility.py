@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import format_share, suffix_unit
-from pipeline.models.effect import Effect, Parameter
-from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT, Conditions
+from pipeline.models import EXCEEDED_SHARE, OVERSHOOT, Conditions, Effect, Parameter
 from pipeline.results import Moves
 
 if TYPE_CHECKING:

@@ -9,8 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, join_parts, turn_units
-from pipeline.core.compute import Newest
+from pipeline.core import Flags, Floats, Newest, join_parts, turn_units
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.floor import estimate_floor
@@ -19,16 +18,19 @@ from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.parts import BodyPart, Part, WheelPart
 from pipeline.estimation.state import DelayName, State
 from pipeline.estimation.window_residuals import WindowResiduals
-from pipeline.models.effect import Effect
-from pipeline.models.learned_term import drop_learned
-from pipeline.models.model import Model, Timing
-from pipeline.models.parameter import EXCEEDED_SHARE, Largest
-from pipeline.run import MotionError, MotionRun
-from pipeline.run.heading import HeadingSource
-from pipeline.run.signals import find_fastest_wheel, name_inputs, split_wheels
-from pipeline.run.windows import HORIZON_S, WINDOW_S
+from pipeline.models import EXCEEDED_SHARE, Effect, Largest, Model, Timing, drop_learned
+from pipeline.run import (
+    HORIZON_S,
+    WINDOW_S,
+    HeadingSource,
+    MotionError,
+    MotionRun,
+    find_fastest_wheel,
+    name_inputs,
+    split_wheels,
+)
 from pipeline.sources import Vehicle
-from pipeline.stages.pose_topics import SLOW_HZ
+from pipeline.stages import SLOW_HZ
 
 
 @dataclass(frozen=True)

@@ -21,20 +21,26 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from pipeline.core import CONFIDENCE, JSON_DIGITS, SlipError, finite_or_none
-from pipeline.core.arrays import Flags, Floats, Ints, jackknife_deviation, robust_spreads, student_quantile
+from pipeline.core import (
+    CONFIDENCE,
+    JSON_DIGITS,
+    Flags,
+    Floats,
+    Ints,
+    SlipError,
+    finite_or_none,
+    jackknife_deviation,
+    robust_spreads,
+    student_quantile,
+)
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
-from pipeline.models.effect import AddedEffect, Effect, Place
-from pipeline.models.model import Model, Timing
-from pipeline.results.reading import ERRORS_OVER_2S, read_error
-from pipeline.run import MotionError
-from pipeline.run.heading import MeasuredDrive
-from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
-from pipeline.run.windows import WINDOW_S
+from pipeline.models import AddedEffect, Effect, Model, Place, Timing
+from pipeline.results import ERRORS_OVER_2S, read_error
+from pipeline.run import WINDOW_S, MeasuredDrive, MotionError, Rolling, RunContext, Velocity, roll_ideally
 
 if TYPE_CHECKING:
     from pipeline.estimation.folds import HeldOut

@@ -9,9 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.models.effect import Effect, Search
-from pipeline.models.model import Timing
+from pipeline.core import Floats
+from pipeline.models import Effect, Search, Timing
 
 # Derivative columns of many residuals, one after the other in memory: so they are made, picked and summed.
 #

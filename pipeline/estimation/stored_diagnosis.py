@@ -12,23 +12,23 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUTS, SlipError
-from pipeline.core.untrusted import PathError, read_bounded
-from pipeline.results import RunDiagnosis, read_result, to_json
-from pipeline.results.reading import read_model
+from pipeline.core import INPUTS, PathError, SlipError, read_bounded
+from pipeline.results import RunDiagnosis, read_model, read_result, to_json
 from pipeline.run import MotionError, load_run
-from pipeline.sources import Vehicle
-from pipeline.sources.one_vehicle import Owner, agree_on_vehicle, load_vehicle
-from pipeline.stages import Finding, slip_stage
-from pipeline.stages.slip_stage import set_residuals, summarize_inputs
-from pipeline.store import JSON, Generation, Manifest, Store
-from pipeline.store.files import make_folder, replace_file
-from pipeline.store.stored_runs import (
+from pipeline.sources import Owner, Vehicle, agree_on_vehicle, load_vehicle
+from pipeline.stages import Finding, set_residuals, slip_stage, summarize_inputs
+from pipeline.store import (
     DIAGNOSIS,
+    JSON,
     SUMMARY,
+    Generation,
+    Manifest,
+    Store,
     hash_json,
     locate_beside,
+    make_folder,
     read_length_scale,
+    replace_file,
     stored_contexts,
     stored_keys,
 )

@@ -11,8 +11,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from pipeline.models.effect import ANY, Parameter
-from pipeline.models.formula import FormulaEffect, make_parameter
+from pipeline.models import ANY, FormulaEffect, Parameter, make_parameter
 
 TERM = "term_"
 CHANNELS = ("v_x", "v_y", "v_w")

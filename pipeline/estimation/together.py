@@ -10,10 +10,9 @@ import msgspec
 from pipeline.core import SlipError, format_share
 from pipeline.estimation.conclude import refuse
 from pipeline.estimation.diagnosis import Diagnosis
-from pipeline.results import Finding, RunDiagnosis
-from pipeline.results.reading import find_refusal
+from pipeline.results import Finding, RunDiagnosis, find_refusal
 from pipeline.run import MotionRun, load_run
-from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
+from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence

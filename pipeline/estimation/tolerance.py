@@ -22,20 +22,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import CONFIDENCE, JSON_DIGITS, finite_or_none, pick_finite
-from pipeline.core.arrays import STRETCH_S, Floats, Ints
+from pipeline.core import CONFIDENCE, JSON_DIGITS, STRETCH_S, Floats, Ints, finite_or_none, pick_finite
 from pipeline.estimation.folds import find_in_test, number_predictions, refit_fold
 from pipeline.estimation.model_fit import fit_model
 from pipeline.estimation.problem import Problem, fit_as_it_is
-from pipeline.models.learned_term import drop_learned
-from pipeline.run import MotionError
-from pipeline.run.signals import STILL_MPS
-from pipeline.run.windows import HORIZON_S, NODE_S, WINDOW_S
+from pipeline.models import drop_learned
+from pipeline.run import HORIZON_S, NODE_S, STILL_MPS, WINDOW_S, MotionError
 
 if TYPE_CHECKING:
     from pipeline.estimation.comparison import Comparison, Input
     from pipeline.estimation.model_fit import Fitted
-    from pipeline.models.model_file import ModelFile
+    from pipeline.models import ModelFile
     from pipeline.run import MotionRun
 
 FEWEST_PREDICTIONS = math.ceil(1.0 / (1.0 - CONFIDENCE))

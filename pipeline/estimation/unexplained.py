@@ -21,12 +21,12 @@ from pipeline.run import MotionError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import PartFit
     from pipeline.estimation.ladder import Judgement
     from pipeline.estimation.learned_step import LearnedStep
-    from pipeline.models.formula import FormulaEffect
+    from pipeline.models import FormulaEffect
 
 _SHAPES = 8640
 """Shapes of formulas that one is the best of, for which it pays: for those of the terms alone it displaces
@@ -145,7 +145,7 @@ def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
 
 def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
     """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
-    from pipeline.models.model import Timing  # noqa: PLC0415 - only here
+    from pipeline.models import Timing  # noqa: PLC0415 - only here
 
     velocities = [comparison.predict_velocity((), Timing()) for comparison in comparisons]
     x, y, w = (

@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.core import arrays
-from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints, guarded_spread, robust_spread
+from pipeline.core import STRETCH_S, Flags, Floats, Ints, arrays, guarded_spread, robust_spread
 from pipeline.estimation.state import State
-from pipeline.models.model import Timing
-from pipeline.run.windows import NODE_S, WINDOW_S, average_spans
+from pipeline.models import Timing
+from pipeline.run import NODE_S, WINDOW_S, average_spans
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from pipeline.estimation.comparison import Comparison
-    from pipeline.run.signals import Velocity
+    from pipeline.run import Velocity
 
 CLIP = 6.0
 """Limit at which residuals are clipped [robust standard deviations]: six do not affect normal noise."""

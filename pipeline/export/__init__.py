@@ -20,16 +20,10 @@ from typing import TYPE_CHECKING
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
 
-from pipeline.core import INPUT_WORDS, guess_names, make_plain, suffix_unit
-from pipeline.core.untrusted import read_bounded_text
-from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Effect, Parameter
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.model import Model
-from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import Quantity
+from pipeline.core import INPUT_WORDS, guess_names, make_plain, read_bounded_text, suffix_unit
+from pipeline.models import Effect, FormulaEffect, Model, ModelFile, Parameter, Quantity, is_own
 from pipeline.run import MotionError
-from pipeline.sources.configuration import Vehicle, check_geometry
+from pipeline.sources import Vehicle, check_geometry
 
 if TYPE_CHECKING:
     from ruamel.yaml.nodes import ScalarNode

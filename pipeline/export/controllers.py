@@ -28,9 +28,7 @@ from pipeline.export import (
     start_sheet,
     write_yaml,
 )
-from pipeline.models.effect import Effect, Place
-from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import Quantity
+from pipeline.models import Effect, ModelFile, Place, Quantity
 from pipeline.run import MotionError
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"

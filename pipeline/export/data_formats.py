@@ -10,11 +10,8 @@ from datetime import date, time
 
 from pipeline.core import finite_or_none, pick
 from pipeline.export import Amount, Current, Facts, Target, require_plausible, start_sheet, write_yaml
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import ResidualTerm, learned_as_table
-from pipeline.models.model_file import ModelFile
-from pipeline.models.parameter import Quantity
-from pipeline.run.signals import find_limits, trace_traction
+from pipeline.models import FormulaEffect, ModelFile, Quantity, ResidualTerm, learned_as_table
+from pipeline.run import find_limits, trace_traction
 
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m", "controller_track_multiplier")
 

@@ -17,15 +17,23 @@ from typing import Any, cast
 
 import msgspec
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.export import Target
-from pipeline.models.catalogue import is_own
-from pipeline.models.effect import Effect, Place
-from pipeline.models.expression import Expression
-from pipeline.models.families import Delay, Filtered, Lag, Ramp, Written
-from pipeline.models.formula import FormulaEffect
-from pipeline.models.learned_term import ResidualTerm, find_kind
-from pipeline.models.model import Model
+from pipeline.models import (
+    Delay,
+    Effect,
+    Expression,
+    Filtered,
+    FormulaEffect,
+    Lag,
+    Model,
+    Place,
+    Ramp,
+    ResidualTerm,
+    Written,
+    find_kind,
+    is_own,
+)
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle
 

@@ -6,7 +6,7 @@ from xml.etree import ElementTree as ET
 
 from pipeline.core import make_plain
 from pipeline.export import Current, Facts, Sheet, Target, list_comments, start_sheet
-from pipeline.models.model_file import ModelFile
+from pipeline.models import ModelFile
 
 _DRIVE_PLUGINS = {
     "differential": ("gz-sim-diff-drive-system", "gz::sim::systems::DiffDrive"),

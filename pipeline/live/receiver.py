@@ -31,8 +31,7 @@ from pipeline.logs.live_recording import (
     LiveRecording,
     choose_protocol,
 )
-from pipeline.sources.message_types import MessageType, find_type, plain_type
-from pipeline.sources.topics import STRING_TYPE
+from pipeline.sources import STRING_TYPE, MessageType, find_type, plain_type
 
 if TYPE_CHECKING:
     from websockets.exceptions import WebSocketException

@@ -33,10 +33,16 @@ from pipeline.live import LiveError
 from pipeline.live.receiver import ReceiverOrder, ReceiverState
 from pipeline.logs.index import LISTING, GrowingLog, list_files
 from pipeline.logs.live_recording import lock_folder
-from pipeline.results import Named, RunDiagnosis, Value
-from pipeline.results.reading import ABOVE_FLOOR, INTERVAL_SHARE, find_refusal, measure_excess
-from pipeline.words.effects import describe_clause, describe_separation, suggest_drive
-from pipeline.words.errors import describe_need, format_step
+from pipeline.results import (
+    ABOVE_FLOOR,
+    INTERVAL_SHARE,
+    Named,
+    RunDiagnosis,
+    Value,
+    find_refusal,
+    measure_excess,
+)
+from pipeline.words import describe_clause, describe_need, describe_separation, format_step, suggest_drive
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765

@@ -18,9 +18,7 @@ import msgspec
 
 from pipeline.analysis import Options
 from pipeline.analysis.work import as_recorded, identify
-from pipeline.core import SlipError, make_plain, shorten
-from pipeline.core.compute import return_freed_memory
-from pipeline.core.untrusted import read_object
+from pipeline.core import SlipError, make_plain, read_object, return_freed_memory, shorten
 from pipeline.estimation.stored_diagnosis import add_model
 from pipeline.live import LiveError
 from pipeline.logs import SUFFIXES, LogError, list_files, read_topics
@@ -29,12 +27,8 @@ from pipeline.models import read_model
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import read_drive
-from pipeline.stages import Finding, slip_stage, velocity
-from pipeline.stages.align import align_tables
-from pipeline.stages.extract import extract_tables
-from pipeline.stages.reading import list_wanted
-from pipeline.store import JSON, Store
-from pipeline.store.parquet_tables import check_table
+from pipeline.stages import Finding, align_tables, extract_tables, list_wanted, slip_stage, velocity
+from pipeline.store import JSON, Store, check_table
 
 if TYPE_CHECKING:
     import polars as pl

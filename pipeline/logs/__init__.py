@@ -16,8 +16,10 @@ from typing import Any, Final
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.rigid import (
+from pipeline.core import (
+    Flags,
+    Floats,
+    Ints,
     find_held,
     interpolate_poses,
     invert_quaternions,

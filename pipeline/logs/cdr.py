@@ -15,7 +15,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Flags, Ints
+from pipeline.core import Flags, Ints
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Strings
 from pipeline.logs.records import Buffer, LogError
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure

@@ -13,7 +13,7 @@ from typing import Final, TypeAlias
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Ints
+from pipeline.core import Flags, Ints
 from pipeline.logs.cdr import DIALECTS, MAX_TEXT, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
 from pipeline.logs.columns import (
     STAMPS,

@@ -14,7 +14,7 @@ import zstandard
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Ints
+from pipeline.core import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer, Effort, find_record
 

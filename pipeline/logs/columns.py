@@ -15,7 +15,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Flags, Floats, Ints, group_rows
+from pipeline.core import Flags, Floats, Ints, group_rows
 from pipeline.logs.chunks import MESSAGE_OVERHEAD, Messages
 from pipeline.logs.records import Buffer, LogError
 

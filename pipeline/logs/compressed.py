@@ -11,7 +11,7 @@ import tempfile
 import weakref
 from typing import IO, TYPE_CHECKING, Final
 
-from pipeline.core.compute import Newest
+from pipeline.core import Newest
 from pipeline.logs.catalog import limit_inflated
 from pipeline.logs.records import LogError
 

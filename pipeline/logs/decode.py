@@ -9,7 +9,7 @@ from typing import Final, Generic
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Ints
+from pipeline.core import Ints
 from pipeline.logs.cdr import Cursor, Dialect, MisfitError, Vocabulary
 from pipeline.logs.columns import Column, Ragged, RaggedStrings, Scalar, Strings
 from pipeline.logs.schema import NUMBER_TYPES, SEQUENCE, SIZES, Member, Structure

@@ -10,9 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
-from pipeline.core.arrays import PAUSE_NS
-from pipeline.core.compute import usable_threads
-from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.core import PAUSE_NS, PathError, resolve_inside, usable_threads
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from rosbags.rosbag1.reader import Chunk
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
-    from pipeline.core.arrays import Floats, Ints
+    from pipeline.core import Floats, Ints
     from pipeline.logs.writer import Given
 
     Opened = BagReader | Sqlite3Reader

@@ -17,8 +17,7 @@ from mcap import records
 from mcap.data_stream import ReadDataStream
 from numpy.typing import NDArray
 
-from pipeline.core import SlipError
-from pipeline.core.arrays import Ints
+from pipeline.core import Ints, SlipError
 
 
 class LogError(SlipError):

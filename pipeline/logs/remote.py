@@ -15,7 +15,7 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING, Final, Self, cast
 from urllib.parse import quote_from_bytes, unquote_to_bytes
 
-from pipeline.core.untrusted import MOST_BYTES, too_large
+from pipeline.core import MOST_BYTES, too_large
 from pipeline.logs.records import LogError
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ import numpy as np
 from mcap.records import Channel, Header, Schema
 from numpy.typing import NDArray
 
-from pipeline.core.arrays import Ints
+from pipeline.core import Ints
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover
 from pipeline.logs.chunks import FIRST_PRIVATE

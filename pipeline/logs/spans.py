@@ -12,7 +12,7 @@ from typing import Final, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core.compute import map_in_order
+from pipeline.core import map_in_order
 from pipeline.logs import chunks
 from pipeline.logs import records as rec
 from pipeline.logs.chunks import Messages, locate_messages

@@ -27,10 +27,8 @@ from pipeline.models.parameter import (
     Spread,  # noqa: F401 - what a file of an effect needs
 )
 from pipeline.models.words import Sentences, find_words
-from pipeline.run import MotionError
-from pipeline.run.signals import Commands, Floats, Rolling, RunContext, Velocity, Wheels
-from pipeline.sources import Vehicle
-from pipeline.sources.kinematics import list_kinds
+from pipeline.run import Commands, Floats, MotionError, Rolling, RunContext, Velocity, Wheels
+from pipeline.sources import Vehicle, list_kinds
 
 # An effect's docstring is its manual page: what happens, the formula, the parameters, the source. Effects are
 # values: changing a parameter makes another effect.

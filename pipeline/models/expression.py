@@ -10,7 +10,7 @@ from fractions import Fraction
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.models.parameter import PLAIN, Unit
 from pipeline.run import MotionError
 

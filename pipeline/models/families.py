@@ -49,11 +49,11 @@ from pipeline.models.parameter import (
     Spread,
     parse_unit,
 )
-from pipeline.run import MotionError
-from pipeline.run.signals import (
+from pipeline.run import (
     LEAST_RIM_SPEED,
     Commands,
     Floats,
+    MotionError,
     Resets,
     Rolling,
     RunContext,

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from pipeline.core.machine_code import compiled
-from pipeline.run.signals import Floats, Resets, Signal
+from pipeline.core import compiled
+from pipeline.run import Floats, Resets, Signal
 
 _INSTANT_S = 1e-9  # time constant below which there is no lag: avoids a division by nearly zero
 _TINY = 1e-290

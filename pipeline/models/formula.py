@@ -12,12 +12,11 @@ from typing import Self
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.models.effect import AddedEffect, Effect, Excitation, Parameter
 from pipeline.models.expression import Expression, parse_expression
 from pipeline.models.parameter import Unit, parse_unit
-from pipeline.run import MotionError
-from pipeline.run.signals import Rolling, RunContext, Velocity, roll_ideally
+from pipeline.run import MotionError, Rolling, RunContext, Velocity, roll_ideally
 from pipeline.sources import Vehicle
 
 # A formula is arithmetic over named signals and the effect's own parameters; its unit is derived and must be

@@ -9,13 +9,11 @@ from functools import partial
 
 import numpy as np
 
-from pipeline.core import format_share
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, format_share
 from pipeline.models.effect import AddedEffect, Effect, Place
 from pipeline.models.filters import lag_signal
 from pipeline.models.model import Model
-from pipeline.run import MotionError
-from pipeline.run.signals import Resets, Rolling, RunContext, Velocity
+from pipeline.run import MotionError, Resets, Rolling, RunContext, Velocity
 from pipeline.sources import Vehicle
 
 LEARNED = "learned_term"

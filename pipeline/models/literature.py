@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from pipeline.core import guess_names
-from pipeline.core.rigid import GRAVITY_MPS2
+from pipeline.core import GRAVITY_MPS2, guess_names
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import ACKERMANN, ANY, Effect
 from pipeline.models.formula import FormulaEffect, make_parameter

@@ -11,7 +11,7 @@ from typing import Self, TypeVar, cast
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.models.effect import (
     AddedEffect,
     BodyEffect,
@@ -22,9 +22,19 @@ from pipeline.models.effect import (
     Place,
     ReportEffect,
 )
-from pipeline.run import MotionError
-from pipeline.run.heading import Grid, HeldDrive, MeasuredDrive
-from pipeline.run.signals import DriveSeries, Resets, Rolling, RunContext, Velocity, Wheels, roll_ideally
+from pipeline.run import (
+    DriveSeries,
+    Grid,
+    HeldDrive,
+    MeasuredDrive,
+    MotionError,
+    Resets,
+    Rolling,
+    RunContext,
+    Velocity,
+    Wheels,
+    roll_ideally,
+)
 from pipeline.sources import Vehicle
 
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core import SlipError, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
+from pipeline.core import SlipError, TomlError, parse_toml, read_bounded_text, require_finite, shorten
 from pipeline.models.catalogue import (
     EffectClass,
     find_effect,
@@ -27,8 +26,7 @@ from pipeline.models.learned_term import parse_learned
 from pipeline.models.model import Model
 from pipeline.models.parameter import Parameter, stands_at_bound
 from pipeline.run import MotionError
-from pipeline.sources import ConfigurationError, Vehicle, resolve_vehicle
-from pipeline.sources.configuration import StandIn, VehicleSection
+from pipeline.sources import ConfigurationError, StandIn, Vehicle, VehicleSection, resolve_vehicle
 
 FORMAT = 1
 """Version of the format of model files; other versions are rejected."""

@@ -10,8 +10,7 @@ from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import ClassVar, Literal
 
-from pipeline.core import JSON_DIGITS, NORMAL_95, round_digits
-from pipeline.core.arrays import Floats
+from pipeline.core import JSON_DIGITS, NORMAL_95, Floats, round_digits
 from pipeline.run import MotionError
 
 

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.machine_code import LANES, compiled, deal_lanes
+from pipeline.core import LANES, Floats, Ints, compiled, deal_lanes
 
 ROTATING = 0.7
 """Inertia of the rotating parts over that of the vehicle: the loss of nine Warthog runs on five grounds

@@ -12,8 +12,7 @@ from importlib import resources
 
 import msgspec
 
-from pipeline.core import enumerate_texts, format_angle, format_length, format_share
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, enumerate_texts, format_angle, format_length, format_share
 from pipeline.models.expression import Expression, parse_expression
 from pipeline.models.parameter import PLAIN
 from pipeline.sources import Vehicle

@@ -15,30 +15,33 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from pipeline.core import SlipError
-from pipeline.datasets.forecast import Forecast, forecast_vehicle, join_evidence, list_held
-from pipeline.datasets.joint_levels import RunEvidence
-from pipeline.datasets.prediction import find_estimates
+from pipeline.datasets import (
+    Forecast,
+    RunEvidence,
+    find_estimates,
+    forecast_vehicle,
+    join_evidence,
+    list_held,
+)
 from pipeline.estimation import Recording
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
-from pipeline.models.effect import Effect, Late
-from pipeline.models.model import Model
-from pipeline.plan import Area, Limits, is_steered
+from pipeline.models import Effect, Late, Model
+from pipeline.plan.manoeuvres import Area, Limits, is_steered
 from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question
 from pipeline.plan.rehearsal import Knowledge
 from pipeline.results import RunDiagnosis
 from pipeline.run import load_motion_run
-from pipeline.sources import Vehicle
-from pipeline.sources.one_vehicle import load_vehicle
+from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest
 
 if TYPE_CHECKING:
-    from pipeline.core.arrays import Floats
+    from pipeline.core import Floats
     from pipeline.estimation.fit import PartFit
     from pipeline.run import MotionRun
     from pipeline.store import Store
@@ -243,7 +246,7 @@ def plan_drive(
     Raises:
         SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
-    from pipeline.plan import Reached, choose_limits  # noqa: PLC0415 - heavy
+    from pipeline.plan.manoeuvres import Reached, choose_limits  # noqa: PLC0415 - heavy
     from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import measure_reached  # noqa: PLC0415 - heavy
 
@@ -303,7 +306,7 @@ def study(
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
-    from pipeline.results.reading import find_refusal  # noqa: PLC0415 - heavy
+    from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
 
     joint = diagnose_runs(recordings, vehicle, notify=notify)
     diagnosis = joint.runs[0]
@@ -386,7 +389,7 @@ def ask(
 
 def read_command(manifest: Manifest) -> dict[str, object]:
     """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
-    from pipeline.store.stored_runs import read_choices  # noqa: PLC0415 - heavy
+    from pipeline.store import read_choices  # noqa: PLC0415 - heavy
 
     configuration = manifest.details.get("configuration")
     source = configuration.get("command") if isinstance(configuration, dict) else None

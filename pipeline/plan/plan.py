@@ -8,11 +8,9 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import enumerate_texts, finite_or_none, format_share, pick
-from pipeline.core.arrays import Complex, Floats
-from pipeline.models import Effect, list_effects
-from pipeline.models.parameter import Largest
-from pipeline.plan import (
+from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_share, pick
+from pipeline.models import Effect, Largest, list_effects
+from pipeline.plan.manoeuvres import (
     LEAD_S,
     RATE_HZ,
     TAIL_S,

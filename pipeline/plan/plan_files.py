@@ -12,22 +12,28 @@ import msgspec
 import numpy as np
 from mcap_ros2.writer import Writer
 
-from pipeline.core import format_share
-from pipeline.core.arrays import Floats
-from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text
+from pipeline.core import Floats, TomlError, format_share, parse_toml, read_bounded_text
 from pipeline.logs.schema import definition_text
-from pipeline.models import format_value
-from pipeline.models.catalogue import find_effect
-from pipeline.plan import LEAD_S, RATE_HZ, Commands, Limits, PlanError, hold_within, is_steered, join, wait
+from pipeline.models import find_effect, format_value
+from pipeline.plan.manoeuvres import (
+    LEAD_S,
+    RATE_HZ,
+    Commands,
+    Limits,
+    PlanError,
+    hold_within,
+    is_steered,
+    join,
+    wait,
+)
 from pipeline.plan.plan import SAFETY, ExpectedGain, Plan, since_when
 from pipeline.plan.questions import Impossible, Judge, Question
 from pipeline.plan.rehearsal import Knowledge, Rehearsal
 from pipeline.results import RunDiagnosis
-from pipeline.run import MotionRun
-from pipeline.run.signals import DriveSeries, name_inputs
+from pipeline.run import DriveSeries, MotionRun, name_inputs
 from pipeline.sources import Vehicle
-from pipeline.store.files import TEMPORARY, replace_file
-from pipeline.words.effects import describe_separation, suggest_drive
+from pipeline.store import TEMPORARY, replace_file
+from pipeline.words import describe_separation, suggest_drive
 
 PAGE = "plan.html"
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")

@@ -14,14 +14,20 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, enumerate_texts, suffix_unit
-from pipeline.core.arrays import STRETCH_S, Flags, Floats, Ints
+from pipeline.core import (
+    FEWEST_OF_SPREAD,
+    NORMAL_95,
+    STRETCH_S,
+    Flags,
+    Floats,
+    Ints,
+    enumerate_texts,
+    suffix_unit,
+)
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.driving_need import find_goal
-from pipeline.models import Excitation, find_effect, list_effects
-from pipeline.models.catalogue import explain_idle, suggest_manoeuvre
-from pipeline.models.parameter import Largest
-from pipeline.plan import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser, PlanError
+from pipeline.models import Excitation, Largest, explain_idle, find_effect, list_effects, suggest_manoeuvre
+from pipeline.plan.manoeuvres import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser, PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
 
 # The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly

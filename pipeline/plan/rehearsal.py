@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import msgspec
 import numpy as np
 
-from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.core import Complex, Flags, Floats
 from pipeline.estimation import Comparison, Input, Problem, State, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.decision import list_costs
@@ -18,12 +18,19 @@ from pipeline.estimation.model_fit import Fitted
 from pipeline.estimation.problem import average_sustained, measure_largest
 from pipeline.estimation.state import Free
 from pipeline.estimation.window_residuals import average_windows, locate_windows
-from pipeline.models import Effect, Model, Place, Timing
-from pipeline.models.parameter import Excitation, Largest
-from pipeline.plan import Commands, PlanError, Reached, is_steered
-from pipeline.run import Alignment, GyroFit, MotionRun, Track
-from pipeline.run.signals import STILL_MPS, DriveSeries, Velocity, name_inputs
-from pipeline.run.windows import WINDOW_S
+from pipeline.models import Effect, Excitation, Largest, Model, Place, Timing
+from pipeline.plan.manoeuvres import Commands, PlanError, Reached, is_steered
+from pipeline.run import (
+    STILL_MPS,
+    WINDOW_S,
+    Alignment,
+    DriveSeries,
+    GyroFit,
+    MotionRun,
+    Track,
+    Velocity,
+    name_inputs,
+)
 from pipeline.sources import Vehicle
 
 # Commands rehearsed: a run that has not been driven yet, with the poses that a model predicts.

@@ -11,15 +11,13 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Flags, Floats, fit_robustly, robust_spread
+from pipeline.core import Flags, Floats, fit_robustly, robust_spread
 from pipeline.recording.geometry import roll_wheels
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS
-from pipeline.run import Alignment
-from pipeline.run.signals import STILL_MPS
+from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import Vehicle, list_presets
-from pipeline.stages import Finding
-from pipeline.stages.trust import ONE_SCALE
+from pipeline.stages import ONE_SCALE, Finding
 
 _LEAST_RATIO = 0.02
 """Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""

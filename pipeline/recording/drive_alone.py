@@ -15,7 +15,7 @@ from pipeline.recording.examination import Candidate, Examination, Recording, de
 from pipeline.recording.geometry import Geometry, Length, roll_wheels
 from pipeline.recording.motion import Motion
 from pipeline.recording.score import CLEAR
-from pipeline.run.signals import GROUND_UNOBSERVABLE
+from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.sources import (
     Configuration,
     DriveForm,
@@ -25,8 +25,7 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import Finding
-from pipeline.stages.reading import find_sideways_share
+from pipeline.stages import Finding, find_sideways_share
 
 _REASON = "no pose is recorded: the motion of the wheels stands in"
 

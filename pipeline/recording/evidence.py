@@ -15,12 +15,11 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, join_parts
+from pipeline.core import Floats, join_parts
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Reading
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
-from pipeline.sources.candidates import COMMANDED, MEASURED
-from pipeline.sources.configuration import convert_unit
+from pipeline.sources import COMMANDED, MEASURED, convert_unit
 
 # Frame of the pose.
 

@@ -9,8 +9,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError, enumerate_texts
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, SlipError, enumerate_texts
 from pipeline.logs import LogData
 from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
@@ -53,10 +52,7 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import Finding
-from pipeline.stages.drive_numbers import find_timeout, report_timeout
-from pipeline.stages.extract import Extraction
-from pipeline.stages.reading import find_sideways_share
+from pipeline.stages import Extraction, Finding, find_sideways_share, find_timeout, report_timeout
 
 
 @dataclass(frozen=True)

@@ -10,13 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import format_share
-from pipeline.core.arrays import join_parts
+from pipeline.core import format_share, join_parts
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
-from pipeline.sources import find_alike
-from pipeline.sources.configuration import RANGES
+from pipeline.sources import RANGES, find_alike
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _ROUGH = 2e-3

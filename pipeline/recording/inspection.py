@@ -8,14 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core import SlipError
-from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints
+from pipeline.core import PAUSE_NS, Flags, Floats, Ints, SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
 from pipeline.recording import LogOptions
 from pipeline.recording.log_choice import UNKNOWN_VEHICLE, Choice, choose, make_stand_in
 from pipeline.recording.log_setup import report_unused, require_messages, require_sources
 from pipeline.sources import Configuration, Sources, Vehicle, choose_sources, load_configuration
-from pipeline.stages.clocks import describe_pauses, find_pauses
+from pipeline.stages import describe_pauses, find_pauses
 
 _GAP_PERIODS = 3.0
 

@@ -33,6 +33,7 @@ from pipeline.logs import (
 )
 from pipeline.sources import (
     CONFIGURED,
+    LOCALIZED,
     Configuration,
     ConfigurationError,
     Controller,
@@ -47,26 +48,24 @@ from pipeline.sources import (
     apply_parameters,
     choose_sources,
     find_preset,
+    find_type,
     list_contradictions,
     list_metadata,
+    list_topics,
     make_vehicle,
+    plain_type,
     read_description,
     read_frames,
     read_parameters,
     recognize_vehicle,
     resolve_vehicle,
 )
-from pipeline.sources.candidates import LOCALIZED
-from pipeline.sources.message_types import find_type, plain_type
-from pipeline.sources.topics import list_topics
-from pipeline.stages import Finding
-from pipeline.stages.extract import Extracted
-from pipeline.stages.reading import find_sideways_share, list_wanted, with_texts
+from pipeline.stages import Extracted, Finding, find_sideways_share, list_wanted, with_texts
 from pipeline.store import JSON
 
 if TYPE_CHECKING:
     from pipeline.recording import Recording
-    from pipeline.stages.pose_choice import PoseRating
+    from pipeline.stages import PoseRating
 
 _EVENTS = "rcl_interfaces/ParameterEvent"
 _LISTS = ("new_parameters", "changed_parameters")
@@ -473,7 +472,7 @@ def _compare(
 ) -> Choice:
     """Choose among the poses by their content, then the other roles by the motion of the pose."""
     from pipeline.recording import examine  # noqa: PLC0415 - heavy
-    from pipeline.stages.pose_choice import rate_poses, replace_pose  # noqa: PLC0415 - heavy
+    from pipeline.stages import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, [*rivals, *drives]))

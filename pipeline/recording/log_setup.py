@@ -14,10 +14,18 @@ from pipeline.logs import TRANSFORM_TYPES, LogIndex, Ragged, Wanted, list_fields
 from pipeline.recording import LogOptions, RecordingError
 from pipeline.recording.log_choice import Choice, choose
 from pipeline.run import Alignment
-from pipeline.sources import Configuration, DriveForm, Sources, Vehicle, load_configuration
-from pipeline.sources.candidates import COMMANDED
-from pipeline.sources.message_types import MessageType, find_type, plain_type
-from pipeline.sources.topics import find_pose_fields
+from pipeline.sources import (
+    COMMANDED,
+    Configuration,
+    DriveForm,
+    MessageType,
+    Sources,
+    Vehicle,
+    find_pose_fields,
+    find_type,
+    load_configuration,
+    plain_type,
+)
 from pipeline.stages import Finding, Severity, blame_damage
 
 UNKNOWN = "unknown"

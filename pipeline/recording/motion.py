@@ -10,8 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import rigid
-from pipeline.core.arrays import Complex, Flags, Floats
+from pipeline.core import Complex, Flags, Floats, rigid
 from pipeline.recording.score import FEWEST_STEPS, Steps
 
 STEP_S = 0.1

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly
-from pipeline.core.student import find_scale, list_likelihoods
+from pipeline.core import Flags, Floats, Ints, find_scale, fit_robustly, list_likelihoods
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import Steps
-from pipeline.run.signals import LIVE_SHARE
-from pipeline.stages.spans import BLOCK_S, follow_likeliest, price_change
+from pipeline.run import LIVE_SHARE
+from pipeline.stages import BLOCK_S, follow_likeliest, price_change
 
 _LEAST = 0.03
 """Fraction of the usual largest speed of a side below which a difference is no contradiction."""

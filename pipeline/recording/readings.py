@@ -11,8 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
-from pipeline.core.machine_code import compiled
+from pipeline.core import Flags, Floats, compiled
 from pipeline.recording.motion import Motion
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
 

@@ -13,9 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.core.machine_code import compiled
-from pipeline.core.student import find_scale, list_likelihoods, weigh
+from pipeline.core import Flags, Floats, Ints, compiled, find_scale, list_likelihoods, weigh
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""

@@ -27,11 +27,16 @@ from urllib.parse import quote
 
 import polars as pl
 
-from pipeline.core import SlipError, format_part, format_share, naming_os_errors, shorten, suffix_unit
-from pipeline.core.untrusted import mapping_in
-from pipeline.store import LOG_NOTES, Manifest, Store
-from pipeline.store.names import date_runs
-from pipeline.store.parquet_tables import scan_table
+from pipeline.core import (
+    SlipError,
+    format_part,
+    format_share,
+    mapping_in,
+    naming_os_errors,
+    shorten,
+    suffix_unit,
+)
+from pipeline.store import LOG_NOTES, Manifest, Store, date_runs, scan_table
 
 if TYPE_CHECKING:
     from jinja2 import Environment

@@ -7,24 +7,27 @@ from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_duration
-from pipeline.core.untrusted import format_csv
-from pipeline.datasets import MEASURES, THIS_RUN
-from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
-from pipeline.datasets.pairs import (
+from pipeline.core import INPUT_WORDS, FigureFormat, format_csv, format_duration
+from pipeline.datasets import (
     ABOUT_BLOCKS,
     ABOUT_UNIT,
     AS_DRIVEN,
     AS_PUBLISHED,
     DIFFERENT,
     EQUAL_DRIVING,
+    LEAST_SAMPLES,
+    MEASURES,
     OF_TWO_RUNS,
+    SPEED_EDGES,
+    THIS_RUN,
+    TURN_EDGES,
     Answer,
     View,
     compare_orders,
     judge_pair,
+    kendall_tau,
+    list_swaps,
 )
-from pipeline.datasets.rank_tests import kendall_tau, list_swaps
 from pipeline.report import (
     MISSING,
     Cell,
@@ -41,7 +44,8 @@ from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
 from pipeline.store import Store
-from pipeline.words.comparison import Line, list_lines, list_pairs, list_shown_notes, title_line
+from pipeline.words import Line, list_pairs, list_shown_notes, title_line
+from pipeline.words.comparison import list_lines
 
 _ROW_HEIGHT = 34
 _GUTTER = 210

@@ -11,8 +11,8 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core.untrusted import PathError, read_bounded, read_bounded_text, resolve_inside
-from pipeline.plan.plan import SAFETY, Plan
+from pipeline.core import PathError, read_bounded, read_bounded_text, resolve_inside
+from pipeline.plan import SAFETY, Plan
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
@@ -24,10 +24,7 @@ from pipeline.report.theme import (
     share_rows,
     stack,
 )
-from pipeline.store import Manifest, Store
-from pipeline.store.files import make_folder, replace_file
-from pipeline.store.names import encode_run
-from pipeline.store.stored_runs import REPORT
+from pipeline.store import REPORT, Manifest, Store, encode_run, make_folder, replace_file
 
 # Subsampling of poses, and the largest number of predicted paths.
 _EVERY = 4
@@ -225,7 +222,7 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
     Raises:
         PlanError: as `write_plan`.
     """
-    from pipeline.plan.plan_files import write_plan  # noqa: PLC0415 - heavy
+    from pipeline.plan import write_plan  # noqa: PLC0415 - heavy
     from pipeline.report.drive_pages import render_plan  # noqa: PLC0415 - heavy
 
     return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
@@ -245,7 +242,7 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
     Raises:
         SlipError: the results cannot be written.
     """
-    from pipeline.plan.plan_files import FILES  # noqa: PLC0415 - heavy
+    from pipeline.plan import FILES  # noqa: PLC0415 - heavy
     from pipeline.report.drive_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
 
     run, results = manifest.run, store.root

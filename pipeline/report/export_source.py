@@ -9,15 +9,14 @@ from functools import cached_property
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core import Floats, Ints
 from pipeline.estimation import Comparison, Prediction, choose_input, predict_at_from, predict_from
 from pipeline.logs.writer import Given, LogWriter
 from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
 from pipeline.report.scene import CAP_QUANTILE, INPUTS
 from pipeline.run import TABLE_COLUMNS, MotionError, MotionRun, make_motion_run
-from pipeline.store import Manifest
-from pipeline.store.names import name_damage
+from pipeline.store import Manifest, name_damage
 
 
 class Feed:
@@ -89,7 +88,7 @@ class ExportSource:
 
         if table not in self.manifest.tables:
             return
-        from pipeline.store.parquet_tables import check_rows  # noqa: PLC0415 - heavy
+        from pipeline.store import check_rows  # noqa: PLC0415 - heavy
 
         path = self.manifest.path(table)
         check_rows(path, self.manifest.count_rows(table))

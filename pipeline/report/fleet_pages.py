@@ -12,22 +12,36 @@ from typing import cast
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_share, suffix_unit
-from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.datasets.causes import (
+from pipeline.core import (
+    INPUT_WORDS,
+    FigureFormat,
+    format_share,
+    mapping_in,
+    number_in,
+    objects_in,
+    suffix_unit,
+)
+from pipeline.datasets import (
+    FLEET,
+    GEOJSON,
+    PAGE,
+    SHARE_DIGITS,
     Budget,
     Causes,
     Difference,
+    FleetModel,
+    PassEffect,
+    TerrainMap,
+    fit_results,
     format_difference,
+    list_features,
     name_causes,
+    summarize_fleet,
     tabulate_budgets,
     tabulate_differences,
+    tabulate_fleet,
 )
-from pipeline.datasets.forecast import FleetModel
-from pipeline.datasets.prediction import FLEET, fit_results, summarize_fleet, tabulate_fleet
-from pipeline.datasets.terrain import SHARE_DIGITS, PassEffect, TerrainMap
-from pipeline.datasets.terrain_map import GEOJSON, PAGE, list_features
-from pipeline.models.catalogue import name_parameter
+from pipeline.models import name_parameter
 from pipeline.report import (
     MISSING,
     Cell,
@@ -53,8 +67,7 @@ from pipeline.report.theme import (
     layer,
     make_axis,
 )
-from pipeline.store import Store
-from pipeline.store.stored_runs import NoRunsError
+from pipeline.store import NoRunsError, Store
 
 _LEVELS = (
     Column("parameter"), Column("level"), Column("value", number=True), Column("95 %", number=True),

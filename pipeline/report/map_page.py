@@ -11,8 +11,7 @@ from typing import Any
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, FigureFormat
-from pipeline.datasets import Measure
-from pipeline.datasets.deployments import ZONES, DeploymentMap
+from pipeline.datasets import ZONES, DeploymentMap, Measure
 from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import add_figures, render_figures

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
 from pipeline.models import Timing
-from pipeline.results import Errors, RunDiagnosis, Step
-from pipeline.results.reading import read_model
+from pipeline.results import Errors, RunDiagnosis, Step, read_model
 from pipeline.run import MotionError, load_run
 
 if TYPE_CHECKING:

@@ -10,8 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from pipeline.core import INPUT_WORDS, FigureFormat, format_recorded, naming_os_errors
-from pipeline.core.untrusted import mapping_in, number_in, numbers_in
+from pipeline.core import (
+    INPUT_WORDS,
+    FigureFormat,
+    format_recorded,
+    mapping_in,
+    naming_os_errors,
+    number_in,
+    numbers_in,
+)
 from pipeline.report import (
     MISSING,
     Cell,
@@ -38,9 +45,9 @@ from pipeline.report.sections_why import (
     view_why,
 )
 from pipeline.report.theme import build_spec, fill_spec, load_bundle, share_rows
-from pipeline.results.reading import has_no_pose, read_findings
+from pipeline.results import has_no_pose, read_findings
 from pipeline.store import Store
-from pipeline.words.errors import describe_regions, format_step, name_span
+from pipeline.words import describe_regions, format_step, name_span
 
 _STEPS_SHOWN = 3
 """Next steps that are shown; the others are folded."""

@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core.untrusted import mapping_in, number_in, objects_in
+from pipeline.core import mapping_in, number_in, objects_in
 from pipeline.report import format_number
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import Named, RunDiagnosis
-from pipeline.run.windows import HORIZON_S
+from pipeline.run import HORIZON_S
 
 if TYPE_CHECKING:
     from pipeline.report.motion_view import MotionView
@@ -77,14 +77,14 @@ class RunReport:
     @property
     def verdict(self) -> str:
         """Verdict on the run; empty without a diagnosis."""
-        from pipeline.words.verdict import format_verdict  # noqa: PLC0415 - heavy
+        from pipeline.words import format_verdict  # noqa: PLC0415 - heavy
 
         return format_verdict(self.diagnosis) if self.is_diagnosed else self.text("verdict")
 
     @property
     def effects(self) -> tuple[list[Named], list[Named]]:
         """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
-        from pipeline.results.reading import split_main  # noqa: PLC0415 - heavy
+        from pipeline.results import split_main  # noqa: PLC0415 - heavy
 
         diagnosis = self.diagnosis
         return split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
@@ -92,7 +92,7 @@ class RunReport:
     @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
-        from pipeline.results.reading import find_refusal, read_findings  # noqa: PLC0415 - heavy
+        from pipeline.results import find_refusal, read_findings  # noqa: PLC0415 - heavy
 
         return find_refusal(read_findings(self.summary))
 
@@ -104,14 +104,14 @@ class RunReport:
     @property
     def undecided(self) -> list[tuple[str, str]]:
         """Effects that explain the data equally well, and the manoeuvre that would separate them."""
-        from pipeline.words.effects import describe_separation, name_group  # noqa: PLC0415 - heavy
+        from pipeline.words import describe_separation, name_group  # noqa: PLC0415 - heavy
 
         return [(name_group(one.candidates), describe_separation(one)) for one in self.diagnosis.undecided]
 
     @property
     def small_groups(self) -> int:
         """Number of undecided groups that count as one smaller effect each."""
-        from pipeline.results.reading import is_small  # noqa: PLC0415 - heavy
+        from pipeline.results import is_small  # noqa: PLC0415 - heavy
 
         return sum(is_small(group.in_model, self.diagnosis.ladder) for group in self.diagnosis.undecided)
 

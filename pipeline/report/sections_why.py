@@ -7,10 +7,8 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from pipeline.core import split_interval
-from pipeline.core.untrusted import mapping_in, number_in, objects_in
-from pipeline.models.catalogue import list_effects, suggest_manoeuvre
-from pipeline.models.parameter import AT_BOUND, UNDETERMINED
+from pipeline.core import mapping_in, number_in, objects_in, split_interval
+from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, suggest_manoeuvre
 from pipeline.report import (
     MISSING,
     Cell,
@@ -27,15 +25,18 @@ from pipeline.report import (
 from pipeline.report.figures import Section
 from pipeline.report.scene import RunReport
 from pipeline.results import Named
-from pipeline.words.diagnosis import (
+from pipeline.words import (
+    describe_cause,
+    describe_motion,
+    describe_rest,
+    describe_unexplained,
     format_learned_share,
+    format_remaining_error,
     format_short,
     format_suggestion,
     list_largest_falls,
     list_terms,
 )
-from pipeline.words.effects import describe_cause, describe_motion
-from pipeline.words.errors import describe_rest, describe_unexplained, format_remaining_error
 
 if TYPE_CHECKING:
     from pipeline.report.page import Page

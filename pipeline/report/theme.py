@@ -438,7 +438,7 @@ def _read_checked(path: Path) -> str | None:
 
 
 def _write_checked(path: Path, script: str) -> None:
-    from pipeline.store.files import replace_file  # noqa: PLC0415 - only where it is not cached yet
+    from pipeline.store import replace_file  # noqa: PLC0415 - only where it is not cached yet
 
     body = script.encode()
     with contextlib.suppress(OSError):

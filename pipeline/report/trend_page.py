@@ -12,12 +12,11 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.core import TREND_THRESHOLD
-from pipeline.core.arrays import Floats
-from pipeline.core.untrusted import read_bounded
-from pipeline.datasets import WHISKER_REACH, ComparisonError
-from pipeline.datasets.trend import (
+from pipeline.core import TREND_THRESHOLD, Floats, read_bounded
+from pipeline.datasets import (
     TREND,
+    WHISKER_REACH,
+    ComparisonError,
     ParameterTrend,
     Series,
     Trend,
@@ -29,13 +28,12 @@ from pipeline.datasets.trend import (
     name_quantity,
     summarize_trend,
 )
-from pipeline.models.catalogue import name_parameter
+from pipeline.models import name_parameter
 from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme
 from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, encode_column, layer
-from pipeline.store import Store
-from pipeline.store.stored_runs import NoRunsError
+from pipeline.store import NoRunsError, Store
 
 _FEWEST_POINTS = 3
 _LIMITS = ("limit_low", "limit_high")

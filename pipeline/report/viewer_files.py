@@ -13,9 +13,7 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUT_WORDS
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.untrusted import format_csv
+from pipeline.core import INPUT_WORDS, Floats, Ints, format_csv
 from pipeline.estimation import Prediction
 from pipeline.logs.writer import Given, LogWriter
 from pipeline.report import theme, writing_export
@@ -39,8 +37,8 @@ from pipeline.report.export_source import (
     write_findings,
     write_trail,
 )
-from pipeline.stages.slip_stage import find_residual_modulus
-from pipeline.store.files import replace_file, temporary_beside
+from pipeline.stages import find_residual_modulus
+from pipeline.store import replace_file, temporary_beside
 from schemas import contract_of
 
 _BODY = "base_link"

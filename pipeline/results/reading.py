@@ -8,11 +8,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from pipeline.core import JSON_DIGITS, format_share, round_digits
-from pipeline.core.untrusted import number_in, objects_in
+from pipeline.core import JSON_DIGITS, format_share, number_in, objects_in, round_digits
 from pipeline.recording import FAULTS
-from pipeline.results import Errors, Finding, RunDiagnosis, Step
-from pipeline.run.signals import GROUND_UNOBSERVABLE
+from pipeline.results.structs import Errors, Finding, RunDiagnosis, Step
+from pipeline.run import GROUND_UNOBSERVABLE
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Sequence
@@ -73,7 +72,7 @@ def has_no_pose(findings: Iterable[Finding]) -> bool:
 
 def read_model(run: RunDiagnosis) -> ModelFile | None:
     """The model file that a diagnosis proposes; None without a readable one."""
-    from pipeline.models.model_file import parse_model  # noqa: PLC0415 - heavy
+    from pipeline.models import parse_model  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415 - heavy
 
     try:

@@ -6,10 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import arrays
-from pipeline.core.arrays import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, robust_spread
-from pipeline.core.machine_code import compiled
-from pipeline.run import GyroFit, MotionRun, Track
+from pipeline.core import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, arrays, compiled, robust_spread
+from pipeline.run.motion_run import GyroFit, MotionRun, Track
 from pipeline.run.signals import STILL, Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged

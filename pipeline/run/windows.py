@@ -4,11 +4,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import ROUNDING_S, Complex, Flags, Floats, Ints
-from pipeline.core.machine_code import compiled
-from pipeline.core.rigid import LONGEST_WAIT_S
-from pipeline.run import MotionError, MotionRun, Track
+from pipeline.core import LONGEST_WAIT_S, ROUNDING_S, Complex, Flags, Floats, Ints, compiled
 from pipeline.run.heading import SPAN_S, Grid, has_excluded
+from pipeline.run.motion_run import MotionError, MotionRun, Track
 from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
 
 # Models are compared by displacements over half a second and predictions over two seconds from a pose.

@@ -14,7 +14,7 @@ from typing import Any, Final, TypedDict, TypeVar, Unpack, get_args
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
+from pipeline.core import Floats, Ints
 from pipeline.simulate import messages
 from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.facts import (

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.simulate.facts import Effects, Vehicle
 from pipeline.simulate.programs import Commands, follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
 

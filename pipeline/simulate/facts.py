@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import msgspec
 import numpy as np
 
-from pipeline.core import SlipError, guess_names
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, SlipError, guess_names
 
 if TYPE_CHECKING:
     from pipeline.simulate.platforms import Published

@@ -4,8 +4,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.core.rigid import euler_from_quaternions, quaternions_from_yaw
+from pipeline.core import Floats, euler_from_quaternions, quaternions_from_yaw
 from pipeline.simulate.drivetrain import CORNERS, Drive, apply_ideal_model, drive_wheels, invert_ideal_model
 from pipeline.simulate.facts import (
     CommandTopic,

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.core.rigid import (
+from pipeline.core import (
     GRAVITY_MPS2,
+    Floats,
     invert_quaternions,
     multiply_quaternions,
     rotate,

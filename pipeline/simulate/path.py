@@ -6,9 +6,9 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
-from pipeline.core.rigid import (
+from pipeline.core import (
     GRAVITY_MPS2,
+    Floats,
     multiply_quaternions,
     quaternions_from_euler,
     quaternions_from_yaw,

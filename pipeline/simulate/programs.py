@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.simulate.facts import SimulateError, Vehicle, open_stream, unknown_name
 from pipeline.simulate.scenario import Program, Scenario
 

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from pipeline.core.arrays import Flags, Floats
-from pipeline.core.rigid import quaternions_from_euler
+from pipeline.core import Flags, Floats, quaternions_from_euler
 from pipeline.simulate.facts import VEHICLES, EffectSpec, Layout, SimulateError, Vehicle
 
 if TYPE_CHECKING:

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import rigid
-from pipeline.core.arrays import Floats
-from pipeline.core.rigid import (
+from pipeline.core import (
     GRAVITY_MPS2,
+    Floats,
     interpolate_poses,
     multiply_quaternions,
     quaternions_from_vectors,
     quaternions_from_yaw,
+    rigid,
     rotate,
 )
 from pipeline.simulate.drivetrain import Drive, move_by_corners

@@ -4,379 +4,86 @@ A vehicle is geometry and limits. A configuration adds what the log does not con
 by type and name, with a reason that is printed.
 """
 
-import fnmatch
-import os
-import re
-from collections.abc import Iterable, Iterator, Mapping
-from pathlib import Path
+from typing import TYPE_CHECKING
 
-import msgspec
+from pipeline.door import open_door
 
-from pipeline.core import guess_names, shorten
-from pipeline.core.untrusted import TomlError, parse_toml, read_bounded_text, require_finite
-from pipeline.logs import stem_of
-from pipeline.sources.candidates import (
-    CONFIGURED,
-    DriveForm,
-    DriveSource,
-    PoseContent,
-    PoseSource,
-    Signal,
-    Sources,
-)
-from pipeline.sources.configuration import (
-    Configuration,
-    ConfigurationError,
-    DriveSection,
-    OutageSection,
-    Vehicle,
-    convert_unit,
-    find_preset,
-    list_factors,
-    list_presets,
-    resolve_vehicle,
-)
-from pipeline.sources.recognition import (
-    Controller,
-    Description,
-    Recognized,
-    VehicleSource,
-    apply_parameters,
-    find_alike,
-    list_contradictions,
-    list_metadata,
-    make_vehicle,
-    read_description,
-    read_frames,
-    read_parameters,
-    recognize_vehicle,
-)
-from pipeline.sources.topics import DEFAULT_INTERVAL, choose_sources
-
-_PLACE = re.compile(r"at `\$\.?([^`]*)`")
-_UNKNOWN = re.compile(r"unknown field `([^`]*)`")
-_VALUE = re.compile(r"value '([^']*)'")
-_STEP = re.compile(r"[A-Za-z_]\w*|\[")
-
-
-def explain_fault(error: msgspec.ValidationError, where: str, source: Path | None) -> ConfigurationError:
-    """Convert a validation error of a configuration.
-
-    Args:
-        error: validation error.
-        where: the file, or another source of the values.
-        source: the file, to locate the line.
-    """
-    message = str(error)
-    key_path, unknown, value = (_find(pattern, message) for pattern in (_PLACE, _UNKNOWN, _VALUE))
-    steps = _STEP.findall(key_path)
-    if unknown:
-        keys = ", ".join(sorted(_list_keys(steps)))
-        hint = f"The keys there are: {keys}." if keys else "The handbook, Configuration, lists the keys."
-        steps.append(unknown)
-    else:
-        words = ", ".join(str(word) for word in _list_words(steps))
-        hint = f"Write one of: {words}." if words else "The handbook, Configuration, lists keys and units."
-    return ConfigurationError(
-        "config_invalid",
-        f"the configuration is not valid: {shorten(_readable(message))}",
-        where=_name_line(where, source, steps, value),
-        hint=hint,
+if TYPE_CHECKING:
+    from pipeline.sources.candidates import (
+        COMMANDED,
+        CONFIGURED,
+        DEAD_RECKONED,
+        FILTERED,
+        LOCALIZED,
+        MEASURED,
+        DriveForm,
+        DriveSource,
+        PoseContent,
+        PoseSource,
+        PowerSource,
+        Signal,
+        Sources,
     )
-
-
-def check_preset(tree: Mapping[str, object], source: Path) -> None:
-    """Reject an unknown preset where it is named, not where a log needs it.
-
-    Raises:
-        ConfigurationError: ``vehicle_unknown``.
-    """
-    vehicle = tree.get("vehicle")
-    name = vehicle.get("preset") if isinstance(vehicle, dict) else None
-    if isinstance(name, str) and find_preset(name) is None:
-        known = sorted(preset.id for preset in list_presets())
-        raise ConfigurationError(
-            "vehicle_unknown",
-            f"no vehicle preset is called {name!r}",
-            where=_name_line(str(source), source, ["vehicle", "preset"], name),
-            hint=f"{guess_names(name, known)}Write one of: {', '.join(known)}; or the vehicle's own values in"
-            " its place.",
-        )
-
-
-def _find(pattern: re.Pattern[str], message: str) -> str:
-    match = pattern.search(message)
-    return match[1] if match else ""
-
-
-def _readable(message: str) -> str:
-    return (
-        message.replace("Object contains unknown field", "unknown key")
-        .replace(" - at `$.", " in `")
-        .replace("`$`", "the top level")
+    from pipeline.sources.configuration import (
+        RANGES,
+        Configuration,
+        ConfigurationError,
+        DriveSection,
+        IntervalSection,
+        OutageSection,
+        OwnUnit,
+        PoseSection,
+        StandIn,
+        Vehicle,
+        VehicleSection,
+        VelocitySection,
+        check_geometry,
+        convert_unit,
+        find_preset,
+        list_factors,
+        list_presets,
+        resolve_vehicle,
     )
-
-
-def _walk(steps: Iterable[str]) -> Iterator[msgspec.inspect.Type]:
-    """Possible types at a path in the configuration."""
-    kinds: list[msgspec.inspect.Type] = [msgspec.inspect.type_info(Configuration)]
-    for step in steps:
-        inner: list[msgspec.inspect.Type] = []
-        for kind in _spread(kinds):
-            if step == "[" and isinstance(kind, msgspec.inspect.ListType | msgspec.inspect.VarTupleType):
-                inner.append(kind.item_type)
-            elif isinstance(kind, msgspec.inspect.StructType):
-                inner += [field.type for field in kind.fields if field.encode_name == step]
-        kinds = inner
-    return _spread(kinds)
-
-
-def _spread(kinds: Iterable[msgspec.inspect.Type]) -> Iterator[msgspec.inspect.Type]:
-    for kind in kinds:
-        if isinstance(kind, msgspec.inspect.UnionType):
-            yield from _spread(kind.types)
-        else:
-            yield kind
-
-
-def _list_words(steps: Iterable[str]) -> list[object]:
-    literals = (kind for kind in _walk(steps) if isinstance(kind, msgspec.inspect.LiteralType))
-    return [word for kind in literals for word in kind.values]
-
-
-def _list_keys(steps: Iterable[str]) -> list[str]:
-    structs = (kind for kind in _walk(steps) if isinstance(kind, msgspec.inspect.StructType))
-    return [field.encode_name for kind in structs for field in kind.fields]
-
-
-def name_key(source: Path, key: str) -> str:
-    """The file and, if it can be located, the line that sets a dotted key."""
-    return _name_line(str(source), source, key.split("."), "")
-
-
-def _name_line(where: str, source: Path | None, steps: list[str], value: str) -> str:
-    number = None if source is None else _find_line(source, [step for step in steps if step != "["], value)
-    return where if number is None else f"{where}, line {number}"
-
-
-def _find_line(source: Path, names: list[str], value: str) -> int | None:
-    """Number of the line that sets a key, or opens its section; None if it cannot be located."""
-    try:
-        lines = read_bounded_text(source).splitlines()
-    except (OSError, UnicodeDecodeError):
-        return None
-    if not names:
-        return None
-    above = names[:-1]
-    key = re.compile(rf"\s*\"?{re.escape(names[-1])}\"?\s*=")
-    section: list[str] = []
-    for number, line in enumerate(lines, start=1):
-        opened = _read_header(line)
-        if opened:
-            section = opened.split(".")
-            if section[-len(names) :] == names and not value:
-                return number
-        elif key.match(line) and section[len(section) - len(above) :] == above and value in line:
-            return number
-    return None
-
-
-def _read_header(line: str) -> str:
-    """Name of the section that a line opens; empty if it opens none."""
-    text = line.strip()
-    name, closed, _ = text.lstrip("[").partition("]")
-    return name.strip() if text.startswith("[") and closed else ""
-
-
-Tree = Mapping[str, object]
-
-FLEET_FILE = "fleet.toml"
-RUN_FILE = "run.toml"
-_BEGINNING = 10_000
-_MODEL = re.compile(rb"(?:\s|#[^\n]*\n)*format\s*=")
-_PLAN = re.compile(rb'(?:\s|#[^\n]*\n)*vehicle = "[^\n]*\nruns = ')
-
-
-def load_configuration(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None, overrides: Tree | None = None
-) -> Configuration:
-    """The configuration of one log.
-
-    Every `fleet.toml` from the root of the file system down to the log's folder is read, nearer ones with
-    priority, then the given fleet file; then `run.toml` or `<log's stem>.toml` beside the log, or the file
-    given instead; then overrides. A model file or a plan of that name is skipped.
-
-    Args:
-        log: the recording.
-        given: a configuration file that replaces the one beside the log.
-        fleet: a fleet file that need not be above the log; its globs are matched against every end of the
-            log's path that begins with a whole folder.
-        overrides: values from the command line, nested like the file.
-
-    Raises:
-        ConfigurationError: a file is missing, not TOML, or has an unknown key or a wrong value.
-    """
-    layers: list[Tree] = []
-    for path in list_configuration_files(log, given=given, fleet=fleet):
-        if path == fleet or (path.name == FLEET_FILE and path != given):
-            layers += _match_fleet(path, log.resolve())
-        else:
-            layers.append(_checked(read_toml(path), path))
-    if overrides:
-        layers.append(overrides)
-    return convert(merge(_forget_other_vehicles(layers)), "the command line")
-
-
-def list_configuration_files(
-    log: Path, *, given: Path | None = None, fleet: Path | None = None
-) -> tuple[Path, ...]:
-    """Files that configure a log, later ones with priority; arguments as of `load_configuration`.
-
-    A fleet file above the log counts only if the user, root or the owner of the log's folder owns it: anybody
-    may create one in a folder like `/tmp`.
-    """
-    folder = log.resolve().parent
-    fleets = [path / FLEET_FILE for path in (*reversed(folder.parents), folder)]
-    beside = [folder / RUN_FILE, folder / f"{stem_of(log)}.toml"]
-    files = [
-        file for file in fleets if _may_speak(file, folder) and (fleet is None or file != fleet.resolve())
-    ]
-    files += [] if fleet is None else [fleet]
-    own = [file for file in beside if file.is_file() and not (is_model(file) or is_model(file, _PLAN))]
-    return (*files, *(own if given is None else [given]))
-
-
-def is_model(file: Path, beginning: re.Pattern[bytes] = _MODEL) -> bool:
-    """Whether a file begins as model files do: beside a log and with its name, it configures nothing."""
-    try:
-        with file.open("rb") as opened:
-            return beginning.match(opened.read(_BEGINNING)) is not None
-    except OSError:
-        return False
-
-
-def _may_speak(file: Path, folder: Path) -> bool:
-    """Whether a fleet file exists and its owner is trusted for the logs in a folder."""
-    if not file.is_file():
-        return False
-    owners = {0, getattr(os, "getuid", int)(), folder.stat().st_uid if folder.is_dir() else 0}
-    return file.stat().st_uid in owners
-
-
-def _forget_other_vehicles(layers: list[Tree]) -> list[Tree]:
-    """Drop the vehicle values of lower layers if a higher layer names another preset.
-
-    A track width given beside `preset = "husky_a200"` must not apply to a Warthog.
-    """
-    others: list[Tree] = []
-    named: object = None
-    for layer in layers:
-        vehicle = layer.get("vehicle")
-        preset = vehicle.get("preset") if isinstance(vehicle, Mapping) else None
-        known = find_preset(preset) if isinstance(preset, str) else None
-        preset = preset if known is None else known.id
-        if preset is not None and named is not None and preset != named:
-            others = [{key: value for key, value in below.items() if key != "vehicle"} for below in others]
-        named = preset or named
-        others.append(layer)
-    return others
-
-
-def merge(layers: Iterable[Tree]) -> dict[str, object]:
-    """Merge nested tables; later layers win, lists are replaced whole."""
-    merged: dict[str, object] = {}
-    for layer in layers:
-        for key, value in layer.items():
-            below = merged.get(key)
-            if isinstance(value, Mapping) and isinstance(below, Mapping):
-                merged[key] = merge([below, value])
-            else:
-                merged[key] = value
-    return merged
-
-
-def convert(tree: Tree, where: str, *, source: Path | None = None) -> Configuration:
-    """Validate a merged table and convert it to a `Configuration`.
-
-    Args:
-        tree: the table.
-        where: source of the table, for the error.
-        source: file of the table, to locate the line.
-
-    Raises:
-        ConfigurationError: unknown key or wrong value, with its location.
-    """
-    try:
-        return msgspec.convert(tree, Configuration)
-    except msgspec.ValidationError as error:
-        raise explain_fault(error, where, source) from None
-
-
-def read_toml(path: Path) -> dict[str, object]:
-    """Parse a TOML file.
-
-    Raises:
-        ConfigurationError: the file is missing, unreadable or not TOML (with the line).
-    """
-    try:
-        tree = parse_toml(read_bounded_text(path))
-        require_finite(tree)
-    except FileNotFoundError:
-        raise ConfigurationError(
-            "config_not_found", "there is no such configuration file", where=str(path), hint="Check the path."
-        ) from None
-    except TomlError as error:
-        where = str(path) if error.line is None else f"{path}, line {error.line}"
-        if error.key:
-            where = name_key(path, error.key)
-        raise ConfigurationError(
-            "config_not_toml", error.what, where=where, hint="Correct that line."
-        ) from None
-    except UnicodeDecodeError as error:
-        raise ConfigurationError(
-            "config_not_toml", f"not a valid TOML file: {error}", where=str(path), hint="Correct that line."
-        ) from None
-    except OSError as error:
-        what, hint = f"cannot be read: {error.strerror}", "Check its permissions."
-        raise ConfigurationError("config_unreadable", what, where=str(path), hint=hint) from None
-    return tree
-
-
-def _checked(tree: dict[str, object], path: Path) -> dict[str, object]:
-    """Validate one file alone first, so that an error names the right file."""
-    convert(tree, str(path), source=path)
-    check_preset(tree, path)
-    return tree
-
-
-def _match_fleet(path: Path, log: Path) -> list[Tree]:
-    """Layers of a fleet file for one log: its plain keys, then every match in order."""
-    tree = read_toml(path)
-    matches = tree.pop("match", [])
-    layers: list[Tree] = [_checked(tree, path)]
-    names = _names_under(path.resolve().parent, log)
-    if not isinstance(matches, list):
-        raise _bad_match(path, 1)
-    for number, match in enumerate(matches, start=1):
-        if not isinstance(match, dict) or not isinstance(match.get("glob"), str):
-            raise _bad_match(path, number)
-        values = {key: value for key, value in match.items() if key != "glob"}
-        _checked(values, path)
-        if any(fnmatch.fnmatchcase(name, match["glob"]) for name in names):
-            layers.append(values)
-    return layers
-
-
-def _names_under(folder: Path, log: Path) -> list[str]:
-    """Texts for a glob: the log's path below the fleet file, or its name; else any end of its path."""
-    if log.is_relative_to(folder):
-        return [log.relative_to(folder).as_posix(), log.name]
-    parts = log.parts[1:]
-    return ["/".join(parts[start:]) for start in range(len(parts))]
-
-
-def _bad_match(path: Path, number: int) -> ConfigurationError:
-    hint = 'Write: [[match]] glob = "2026/*/warthog*" and the keys it sets.'
-    return ConfigurationError(
-        "config_invalid", f"[[match]] number {number} has no `glob`", where=str(path), hint=hint
+    from pipeline.sources.kinematics import list_kinds
+    from pipeline.sources.layers import (
+        FLEET_FILE,
+        RUN_FILE,
+        convert,
+        is_model,
+        list_configuration_files,
+        load_configuration,
+        merge,
     )
+    from pipeline.sources.message_types import (
+        MessageType,
+        PoseFields,
+        describe_types,
+        find_type,
+        plain_type,
+        read_tables,
+    )
+    from pipeline.sources.one_vehicle import Owner, agree_on_vehicle, load_vehicle
+    from pipeline.sources.recognition import (
+        Controller,
+        Description,
+        Recognized,
+        VehicleSource,
+        apply_parameters,
+        find_alike,
+        list_contradictions,
+        list_metadata,
+        make_vehicle,
+        read_description,
+        read_frames,
+        read_parameters,
+        recognize_vehicle,
+    )
+    from pipeline.sources.topics import (
+        DEFAULT_INTERVAL,
+        STRING_TYPE,
+        choose_sources,
+        find_pose_fields,
+        list_topics,
+    )
+else:
+    __getattr__ = open_door(__name__, __file__)

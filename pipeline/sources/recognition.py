@@ -11,8 +11,7 @@ from xml.etree import ElementTree as ET
 import msgspec
 import numpy as np
 
-from pipeline.core import rigid
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, rigid
 from pipeline.logs import ChannelInfo, LogError, TransformBuffer
 from pipeline.sources.configuration import Vehicle, list_presets, make_id
 

@@ -4,62 +4,39 @@ Each stage also returns findings: faults that it corrected or could not correct.
 file.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING
 
-import polars as pl
+from pipeline.door import open_door
 
-from pipeline.core import SlipError
-from pipeline.logs import Loss
-
-SURE = 5.0
-"""Significance threshold [standard errors] for reporting a difference: of a thousand runs without one, normal
-noise exceeds it in none."""
-
-
-class StageError(SlipError):
-    """A log or a table with too little data for a stage."""
-
-
-def blame_damage(losses: Sequence[Loss]) -> str:
-    """Data lost from the log, for messages on missing data; empty without a loss."""
-    further = len(losses) - 1
-    others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
-    return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
-
-
-Severity = Literal["info", "warning", "error"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One finding.
-
-    Attributes:
-        id: stable identifier in snake_case.
-        severity: info, warning, or error: results of this run are not reliable.
-        text: one sentence.
-        where: topic, column or channel; empty for the whole run.
-        t_start: start of the stretch concerned [s since the run's start].
-        t_end: its end [s].
-        value: the underlying number, in the unit stated in the text.
-        count: number of occurrences.
-    """
-
-    id: str
-    severity: Severity
-    text: str
-    where: str = ""
-    t_start: float | None = None
-    t_end: float | None = None
-    value: float | None = None
-    count: int | None = None
-
-
-def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
-    """Findings of one stage as a table (without the run's columns)."""
-    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
-
-    rows = [{"stage": stage, **vars(finding)} for finding in findings]
-    return tabulate("findings", rows)
+if TYPE_CHECKING:
+    from pipeline.stages.align import align_tables
+    from pipeline.stages.checks import WRONG_RADIUS, find_gain_of, is_grip
+    from pipeline.stages.clocks import describe_pauses, find_pauses
+    from pipeline.stages.drive_numbers import find_timeout, report_timeout
+    from pipeline.stages.extract import Extracted, Extraction, extract_tables
+    from pipeline.stages.findings import Finding, Severity, StageError, blame_damage, tabulate_findings
+    from pipeline.stages.inputs import WINDOW_S
+    from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose
+    from pipeline.stages.pose_topics import SLOW_HZ
+    from pipeline.stages.reading import (
+        FEWEST_MESSAGES,
+        find_sideways_share,
+        list_wanted,
+        read_fixes,
+        with_texts,
+    )
+    from pipeline.stages.satellite import from_local_plane, to_local_plane
+    from pipeline.stages.slip_stage import (
+        PUBLISHED_SAMPLES,
+        SUMMARY_DIGITS,
+        find_fastest,
+        find_residual_modulus,
+        pick_row,
+        round_number,
+        set_residuals,
+        summarize_inputs,
+    )
+    from pipeline.stages.spans import BLOCK_S, follow_likeliest, price_change
+    from pipeline.stages.trust import ONE_SCALE
+else:
+    __getattr__ = open_door(__name__, __file__)

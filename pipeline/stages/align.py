@@ -13,15 +13,12 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats
-from pipeline.run import Alignment, GyroFit, tabulate_alignment
-from pipeline.run.signals import ANSWERS_S
-from pipeline.sources import Vehicle
-from pipeline.sources.configuration import VelocitySection
-from pipeline.stages import Finding
+from pipeline.core import Flags, Floats, arrays
+from pipeline.run import ANSWERS_S, Alignment, GyroFit, tabulate_alignment
+from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.drive import Drive, interpolate_readings
 from pipeline.stages.drive_numbers import mark_late_starts
+from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import interpolate_wheels
 from pipeline.stages.pose_choice import find_steady_gain
 from pipeline.stages.pose_faults import align_poses

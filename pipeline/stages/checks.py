@@ -7,13 +7,11 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import arrays, format_share
-from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, robust_spread
-from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Late
-from pipeline.run.signals import LIVE_SHARE, MOVING_MPS, STILL_MPS
+from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, robust_spread
+from pipeline.models import Late, find_late_effect
+from pipeline.run import LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
-from pipeline.stages import SURE, Finding
+from pipeline.stages.findings import SURE, Finding
 from pipeline.stages.slip_stage import SlipResult
 from pipeline.stages.trust import (
     FEWEST_SAMPLES,

@@ -13,11 +13,10 @@ from typing import cast
 
 import numpy as np
 
-from pipeline.core import format_duration
-from pipeline.core.arrays import PAUSE_NS, Flags, Floats, Ints, robust_spread
-from pipeline.models.catalogue import find_late_effect
-from pipeline.models.effect import Late
-from pipeline.stages import Finding, Severity, timing
+from pipeline.core import PAUSE_NS, Flags, Floats, Ints, format_duration, robust_spread
+from pipeline.models import Late, find_late_effect
+from pipeline.stages import timing
+from pipeline.stages.findings import Finding, Severity
 
 Stamps = Ints
 

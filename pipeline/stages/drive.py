@@ -10,13 +10,21 @@ import numpy as np
 import polars as pl
 from msgspec import structs
 
-from pipeline.core.arrays import Floats, Ints, spread_equal
+from pipeline.core import Floats, Ints, spread_equal
 from pipeline.logs import Ragged, RaggedStrings, TopicColumns
-from pipeline.run.signals import LIVE_SHARE
-from pipeline.sources import DriveForm, DriveSection, DriveSource, Vehicle, convert_unit, list_factors
-from pipeline.sources.configuration import OwnUnit
-from pipeline.sources.message_types import find_type
-from pipeline.stages import Finding, StageError, reading
+from pipeline.run import LIVE_SHARE
+from pipeline.sources import (
+    DriveForm,
+    DriveSection,
+    DriveSource,
+    OwnUnit,
+    Vehicle,
+    convert_unit,
+    find_type,
+    list_factors,
+)
+from pipeline.stages import reading
+from pipeline.stages.findings import Finding, StageError
 
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")

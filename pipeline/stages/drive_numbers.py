@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95, rigid
-from pipeline.core.arrays import (
+from pipeline.core import (
+    NORMAL_95,
     PERIODS,
     ROUNDING_S,
     SILENT_S,
@@ -24,13 +24,15 @@ from pipeline.core.arrays import (
     Ints,
     fit_robustly,
     nearest_indices,
+    rigid,
     robust_spread,
 )
 from pipeline.logs import TopicColumns
-from pipeline.run.signals import MOVING_MPS
-from pipeline.sources.candidates import PowerSource, Signal
-from pipeline.stages import Finding, reading
+from pipeline.run import MOVING_MPS
+from pipeline.sources import PowerSource, Signal
+from pipeline.stages import reading
 from pipeline.stages.clocks import TopicClock
+from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
 from pipeline.stages.spans import LIVE
 

@@ -8,8 +8,7 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import SlipError, format_share
-from pipeline.core.arrays import PERIODS, Flags, Floats, Ints
+from pipeline.core import PERIODS, Flags, Floats, Ints, SlipError, format_share
 from pipeline.logs import LogData, TopicColumns, join_channels
 from pipeline.sources import (
     DEFAULT_INTERVAL,
@@ -17,16 +16,16 @@ from pipeline.sources import (
     DriveForm,
     DriveSection,
     DriveSource,
+    IntervalSection,
     OutageSection,
     PoseContent,
     PoseSource,
     Sources,
     Vehicle,
+    find_type,
     list_presets,
 )
-from pipeline.sources.configuration import IntervalSection
-from pipeline.sources.message_types import find_type
-from pipeline.stages import Finding, StageError, blame_damage, pose_topics, reading
+from pipeline.stages import pose_topics, reading
 from pipeline.stages.clocks import Recorded, TopicClock, align_clocks, find_pauses
 from pipeline.stages.drive import (
     Drive,
@@ -40,6 +39,7 @@ from pipeline.stages.drive import (
     read_speed,
 )
 from pipeline.stages.drive_numbers import tabulate_power
+from pipeline.stages.findings import Finding, StageError, blame_damage
 from pipeline.stages.pose_topics import read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.trust import check_echo

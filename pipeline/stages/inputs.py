@@ -9,10 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import arrays
-from pipeline.core.arrays import Flags, Floats
-from pipeline.run import read_wheel_times
-from pipeline.run.signals import STILL_MPS
+from pipeline.core import Flags, Floats, arrays
+from pipeline.run import STILL_MPS, read_wheel_times
 
 if TYPE_CHECKING:
     import polars as pl

@@ -13,16 +13,22 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import SlipError, arrays, format_share, rigid
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import Flags, Floats, SlipError, arrays, format_share, rigid
 from pipeline.logs import LogData
-from pipeline.run.signals import LIVE_SHARE
-from pipeline.run.windows import WINDOW_S
-from pipeline.sources import Configuration, PoseContent, PoseSource, Sources, Vehicle
-from pipeline.sources.candidates import DEAD_RECKONED, FILTERED, LOCALIZED
-from pipeline.stages import Finding
+from pipeline.run import LIVE_SHARE, WINDOW_S
+from pipeline.sources import (
+    DEAD_RECKONED,
+    FILTERED,
+    LOCALIZED,
+    Configuration,
+    PoseContent,
+    PoseSource,
+    Sources,
+    Vehicle,
+)
 from pipeline.stages.drive import read_speed
 from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.stages.findings import Finding
 from pipeline.stages.pose_topics import SLOW_HZ
 from pipeline.stages.reading import FEWEST_MESSAGES
 from pipeline.stages.satellite import estimate_noise

@@ -8,12 +8,20 @@ from dataclasses import replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import NORMAL_95, arrays
-from pipeline.core.arrays import Flags, Floats, Ints, robust_spread
-from pipeline.run import Alignment, MotionError, MotionRun, make_run
-from pipeline.run.heading import align_heading, fit_gyro, has_excluded, mark_excluded
-from pipeline.run.signals import DriveSeries, name_inputs
-from pipeline.run.windows import WINDOW_S
+from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, robust_spread
+from pipeline.run import (
+    WINDOW_S,
+    Alignment,
+    DriveSeries,
+    MotionError,
+    MotionRun,
+    align_heading,
+    fit_gyro,
+    has_excluded,
+    make_run,
+    mark_excluded,
+    name_inputs,
+)
 from pipeline.sources import Vehicle
 from pipeline.stages.timing import estimate_latency
 

@@ -8,8 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import format_share, rigid
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core import Flags, Floats, Ints, format_share, rigid
 from pipeline.logs import (
     TRANSFORM_TYPES,
     LogError,
@@ -19,11 +18,8 @@ from pipeline.logs import (
     TransformBuffer,
     TransformSeries,
 )
-from pipeline.sources import PoseSource, Vehicle
-from pipeline.sources.candidates import LOCALIZED
-from pipeline.sources.configuration import VelocitySection
-from pipeline.sources.message_types import PoseFields, plain_type
-from pipeline.stages import Finding, StageError
+from pipeline.sources import LOCALIZED, PoseFields, PoseSource, Vehicle, VelocitySection, plain_type
+from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.reading import FEWEST_MESSAGES, PoseArrays, axis_fields, first_text
 
 _BASE: Final = re.compile(r"(::|/)base(_link|_footprint)?$")

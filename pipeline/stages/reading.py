@@ -9,24 +9,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import rigid
-from pipeline.core.arrays import Flags, Floats, Ints
+from pipeline.core import Flags, Floats, Ints, rigid
 from pipeline.logs import Ragged, Strings, TopicColumns, Wanted, wanted_transforms
 from pipeline.logs.columns import complete_stamps, join_times
 from pipeline.logs.index import LONGEST_NAME
-from pipeline.run.signals import STILL_MPS
+from pipeline.run import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
     DriveForm,
     DriveSource,
+    IntervalSection,
     PoseContent,
+    PoseFields,
+    PoseSection,
     PoseSource,
     Signal,
     Sources,
+    find_type,
 )
-from pipeline.sources.configuration import IntervalSection, PoseSection
-from pipeline.sources.message_types import PoseFields, find_alike, find_type
-from pipeline.stages import Finding, StageError
+from pipeline.sources.message_types import find_alike
+from pipeline.stages.findings import Finding, StageError
 
 _LARGEST = 1e12
 """Largest number in SI units, above any position, angle, speed and acceleration; its powers stay finite."""

@@ -11,12 +11,11 @@ from typing import Final, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, format_share, rigid
-from pipeline.core.arrays import Flags, Floats, Ints
-from pipeline.run.heading import fit_turning
-from pipeline.run.signals import MOVING_MPS, STILL_MPS
-from pipeline.sources.message_types import find_type
-from pipeline.stages import Finding, reading
+from pipeline.core import Flags, Floats, Ints, arrays, format_share, rigid
+from pipeline.run import MOVING_MPS, STILL_MPS, fit_turning
+from pipeline.sources import find_type
+from pipeline.stages import reading
+from pipeline.stages.findings import Finding
 from pipeline.stages.reading import FEWEST_MESSAGES, Located, PoseArrays, Receiver
 
 # Heading of a vehicle from its course over ground, and possibly from a sensor that turns with it.

@@ -9,10 +9,9 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import format_duration
-from pipeline.core.arrays import Flags, Floats
+from pipeline.core import Flags, Floats, format_duration
 from pipeline.sources import Configuration, Vehicle
-from pipeline.stages import Finding, StageError
+from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known, mark_across, read_inputs
 from pipeline.stages.spans import find_spans
 from pipeline.stages.velocity import MotionEvents, find_events

@@ -15,13 +15,20 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import numpy as np
 
-from pipeline.core import format_share
-from pipeline.core.arrays import Flags, Floats, number_stretches
-from pipeline.core.machine_code import compiled
-from pipeline.core.rigid import find_runs
-from pipeline.core.student import LOG_PEAK, find_scale, list_likelihoods, weigh
-from pipeline.run.signals import LIVE_SHARE, STILL_MPS
-from pipeline.stages import Finding
+from pipeline.core import (
+    LOG_PEAK,
+    Flags,
+    Floats,
+    compiled,
+    find_runs,
+    find_scale,
+    format_share,
+    list_likelihoods,
+    number_stretches,
+    weigh,
+)
+from pipeline.run import LIVE_SHARE, STILL_MPS
+from pipeline.stages.findings import Finding
 
 if TYPE_CHECKING:
     import polars as pl

@@ -9,7 +9,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import isotonic_regression
 
-from pipeline.core.arrays import (
+from pipeline.core import (
+    LONGEST_WAIT_S,
     ROUNDING_S,
     Complex,
     Flags,
@@ -19,11 +20,9 @@ from pipeline.core.arrays import (
     robust_spread,
     solve_banded,
 )
-from pipeline.core.rigid import LONGEST_WAIT_S
-from pipeline.models.parameter import LEAST_DELAY_S
-from pipeline.run import GyroFit, MotionRun, Track
-from pipeline.run.heading import align_heading, fit_gyro, mark_excluded
-from pipeline.stages import SURE
+from pipeline.models import LEAST_DELAY_S
+from pipeline.run import GyroFit, MotionRun, Track, align_heading, fit_gyro, mark_excluded
+from pipeline.stages.findings import SURE
 
 # Rates of the recorder's clock and of the stamps' clock: a map between them from topics that have both.
 #

@@ -13,12 +13,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, format_share, rigid
-from pipeline.core.arrays import Flags, Floats, Ints, fit_robustly, student_quantile
-from pipeline.run.signals import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS
-from pipeline.run.windows import WINDOW_S
+from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, rigid, student_quantile
+from pipeline.run import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS, WINDOW_S
 from pipeline.sources import Vehicle
-from pipeline.stages import Finding
+from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal, Steps
 
 _STEP = 0.02

@@ -16,13 +16,20 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from pipeline.core import arrays, format_share, rigid
-from pipeline.core.arrays import Flags, Floats
-from pipeline.run import Alignment, GyroFit, select_fresh
-from pipeline.run.heading import SPAN_S
-from pipeline.run.signals import ANSWERS_S, DriveSeries, Limits, find_limits, trace_traction
-from pipeline.sources.configuration import VelocitySection
-from pipeline.stages import Finding, StageError
+from pipeline.core import Flags, Floats, arrays, format_share, rigid
+from pipeline.run import (
+    ANSWERS_S,
+    SPAN_S,
+    Alignment,
+    DriveSeries,
+    GyroFit,
+    Limits,
+    find_limits,
+    select_fresh,
+    trace_traction,
+)
+from pipeline.sources import VelocitySection
+from pipeline.stages.findings import Finding, StageError
 from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_excluded
 from schemas import tabulate
 

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast
 
-from pipeline.core.untrusted import PathError, read_bounded, resolve_inside
+from pipeline.core import PathError, read_bounded, resolve_inside
 from pipeline.store.files import JSON, MANIFEST, FileEntry, Manifest, TableEntry, hash_bytes, replace_file
 from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
 

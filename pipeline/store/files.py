@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, TypeAlias
 
-from pipeline.core.untrusted import read_bounded, walk_files
+from pipeline.core import read_bounded, walk_files
 from pipeline.store.names import (
     NOT_AS_WRITTEN,
     QUARANTINE,

@@ -22,7 +22,6 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.store import RUNS, Store
 from pipeline.store.checksums import LOG_NOTES, encode_manifest, load_manifest, parse_manifest
 from pipeline.store.files import (
     MANIFEST,
@@ -33,6 +32,7 @@ from pipeline.store.files import (
     make_folder,
 )
 from pipeline.store.names import Sample, StoreError, encode_run, is_file_name, join_inside, name_disk_errors
+from pipeline.store.results_folder import RUNS, Store
 from pipeline.store.verification import ABSENT, Examination, examine_files
 
 if TYPE_CHECKING:

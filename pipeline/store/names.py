@@ -13,8 +13,7 @@ from datetime import UTC, date, datetime
 from pathlib import Path, PurePosixPath
 from types import MappingProxyType
 
-from pipeline.core import SlipError
-from pipeline.core.untrusted import TOO_LARGE, PathError, may_lead_out, resolve_inside
+from pipeline.core import TOO_LARGE, PathError, SlipError, may_lead_out, resolve_inside
 
 
 class StoreError(SlipError):

@@ -8,11 +8,11 @@ import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from pipeline.core import SlipError, guess_names
-from pipeline.core.untrusted import resolve_inside
+from pipeline.core import SlipError, guess_names, resolve_inside
 from pipeline.logs import RemotePath, locate_recorded, spell_location, stem_of, to_location
-from pipeline.store import JSON, RUNS, Manifest, Store
+from pipeline.store.files import JSON, Manifest
 from pipeline.store.names import StoreError, encode_run, no_results
+from pipeline.store.results_folder import RUNS, Store
 
 
 def name_plainly(path: Path) -> str:

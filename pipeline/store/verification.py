@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pipeline.core.untrusted import read_bounded, walk_files
+from pipeline.core import read_bounded, walk_files
 from pipeline.store.checksums import NOTES, decode_checked, has_checksum, parse_manifest, parse_marker
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
 from pipeline.store.generation import LATEST

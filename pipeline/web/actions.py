@@ -14,7 +14,7 @@ import msgspec
 import polars as pl
 
 from pipeline import results
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.estimation import (
     Errors,
     Estimates,
@@ -34,13 +34,11 @@ from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.problem import predict_at_from
-from pipeline.models import Effect, Model, Timing, find_effect
-from pipeline.models.model_file import ModelFile
+from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.results import SlipBudget, read_result
 from pipeline.run import MotionRun, load_motion_run
-from pipeline.sources import Vehicle
-from pipeline.sources.one_vehicle import load_vehicle
+from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest
 from pipeline.web import WorkbenchError
 from pipeline.web.session import (
@@ -52,8 +50,7 @@ from pipeline.web.session import (
     show_session,
     switch_off,
 )
-from pipeline.words.errors import describe_region
-from pipeline.words.models import format_refusals
+from pipeline.words import describe_region, format_refusals
 
 _MOST_RUNS = 6
 _MOST_FITS = 60

@@ -17,8 +17,7 @@ from pipeline.analysis import STAGE_WORDS, STAGES, Options
 from pipeline.batch.batch_work import Entry, Report, Settings, Task
 from pipeline.batch.executors import LocalExecutor
 from pipeline.core import SlipError
-from pipeline.store import LogSighting, Manifest, Store, see_log
-from pipeline.store.stored_runs import name_run
+from pipeline.store import LogSighting, Manifest, Store, name_run, see_log
 from pipeline.web import Limits, ServerFolders, WorkbenchError
 from pipeline.web.stored_runs import Upload, Uploads, clean_name, find_run, write_diagnosis, write_run_plan
 

@@ -22,13 +22,13 @@ from starlette.routing import Route
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.server import ServerState
 
-from pipeline.core.untrusted import PathError, resolve_inside
+from pipeline.core import PathError, resolve_inside
 from pipeline.live.watch import read_statements
 from pipeline.report import CATALOGUE, PAGES, PLANS, is_page
 from pipeline.report.drive_pages import PREVIEW
 from pipeline.report.theme import load_bundle, warm_bundle
 from pipeline.sources import list_presets
-from pipeline.store.stored_runs import REPORT
+from pipeline.store import REPORT
 from pipeline.web import (
     ADMIT,
     LOOPBACK,

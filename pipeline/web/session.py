@@ -12,17 +12,24 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core import naming_os_errors
-from pipeline.core.untrusted import read_bounded
-from pipeline.models import Effect, Model, Parameter, format_model, list_effects
-from pipeline.models.catalogue import refuse_taken
-from pipeline.models.formula import CHANNELS, FormulaEffect, make_parameter
-from pipeline.models.learned_term import ResidualTerm
-from pipeline.models.model_file import ModelFile, parse_model
-from pipeline.models.parameter import stands_at_bound
+from pipeline.core import naming_os_errors, read_bounded
+from pipeline.models import (
+    CHANNELS,
+    Effect,
+    FormulaEffect,
+    Model,
+    ModelFile,
+    Parameter,
+    ResidualTerm,
+    format_model,
+    list_effects,
+    make_parameter,
+    parse_model,
+    refuse_taken,
+    stands_at_bound,
+)
 from pipeline.sources import Vehicle
-from pipeline.store.files import make_folder, replace_file
-from pipeline.store.stored_runs import locate_beside
+from pipeline.store import locate_beside, make_folder, replace_file
 from pipeline.web import WorkbenchError
 
 SLOTS = ("a", "b")

@@ -6,13 +6,13 @@ from collections.abc import Collection, Mapping
 
 import polars as pl
 
-from pipeline.core.untrusted import number_in
+from pipeline.core import number_in
 from pipeline.report import theme
 from pipeline.report.figures import draw_figure, list_figures, slip_figures
 from pipeline.report.scene import RunReport, Scene
 from pipeline.report.theme import build_spec, pack_rows, share_rows
 from pipeline.results import RunDiagnosis
-from pipeline.stages.slip_stage import find_residual_modulus
+from pipeline.stages import find_residual_modulus
 from pipeline.store import Manifest
 from pipeline.web import WorkbenchError
 from pipeline.web.actions import Shown

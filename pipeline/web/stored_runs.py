@@ -13,8 +13,15 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core import INPUTS, SlipError, naming_os_errors
-from pipeline.core.untrusted import mapping_in, objects_in, read_object, resolve_inside
+from pipeline.core import (
+    INPUTS,
+    SlipError,
+    mapping_in,
+    naming_os_errors,
+    objects_in,
+    read_object,
+    resolve_inside,
+)
 from pipeline.estimation.stored_diagnosis import (
     diagnose_stored,
     find_diagnosis,
@@ -22,11 +29,8 @@ from pipeline.estimation.stored_diagnosis import (
     read_recording,
 )
 from pipeline.report.drive_pages import PREVIEW, leave_plan, locate_plan, read_preview
-from pipeline.results import RunDiagnosis, read_result
-from pipeline.results.reading import find_refusal, read_findings
-from pipeline.store import Manifest, Store
-from pipeline.store.files import hold_lock
-from pipeline.store.stored_runs import DIAGNOSIS, UPLOADS
+from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
+from pipeline.store import DIAGNOSIS, UPLOADS, Manifest, Store, hold_lock
 from pipeline.web import Limits, WorkbenchError
 
 _LONGEST = 500
@@ -134,8 +138,7 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     Raises:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
-    from pipeline.plan import parse_area, parse_time  # noqa: PLC0415
-    from pipeline.plan.next_drive import Wish, plan_drive, read_command, study  # noqa: PLC0415 - heavy
+    from pipeline.plan import Wish, parse_area, parse_time, plan_drive, read_command, study  # noqa: PLC0415  # noqa: PLC0415 - heavy
 
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))

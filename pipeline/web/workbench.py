@@ -10,12 +10,9 @@ from pathlib import Path
 from pipeline.core import SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
-from pipeline.models import Effect, Model, write_model
-from pipeline.models.formula import FormulaEffect
-from pipeline.results import RunDiagnosis
-from pipeline.results.reading import find_refusal, read_findings, read_model
-from pipeline.store import Manifest, Store
-from pipeline.store.files import make_folder
+from pipeline.models import Effect, FormulaEffect, Model, write_model
+from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_model
+from pipeline.store import Manifest, Store, make_folder
 from pipeline.web import Ask, WorkbenchError, evaluating
 from pipeline.web.actions import Editor, PreparedRun, RunCache, Shown, keep_floor, move, open_session
 from pipeline.web.jobs import Jobs
@@ -38,7 +35,7 @@ from pipeline.web.stored_runs import (
     read_summary,
     summarize_run,
 )
-from pipeline.words.objects import diagnosis_as_json
+from pipeline.words import diagnosis_as_json
 
 _MOST_KEPT = 40
 _FITS = frozenset({"add", "add_named", "add_found", "formula", "drop", "fit", "try"})

@@ -8,19 +8,18 @@ from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
 from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
-from pipeline.datasets.changes import Change
-from pipeline.datasets.check import Check, find_pace
-from pipeline.datasets.check_readings import (
+from pipeline.datasets import (
     ERRORS,
     HEADING_ERROR,
     LOGARITHMS,
     MULTIPLIER,
     POSITION_ERROR,
+    Change,
+    Check,
     Label,
+    find_pace,
 )
-from pipeline.models.catalogue import name_term
-from pipeline.models.effect import Place
-from pipeline.models.parameter import Level
+from pipeline.models import Level, Place, name_term
 
 Line = tuple[str, str]
 _MOST_NAMED = 3

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, enumerate_texts, format_share
-from pipeline.core.untrusted import number_in
-from pipeline.datasets.compared_runs import NOT_VALID
-from pipeline.datasets.pairs import (
+from pipeline.core import INPUT_WORDS, enumerate_texts, format_share, number_in
+from pipeline.datasets import (
     ALIKE,
     AS_PUBLISHED,
     DIFFERENT,
+    NOT_VALID,
     OF_TWO_RUNS,
     UNTESTED,
     Answer,

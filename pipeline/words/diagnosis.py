@@ -16,9 +16,16 @@ from pipeline.core import (
     mark_finding,
     suffix_unit,
 )
-from pipeline.models.catalogue import list_effects, name_term
-from pipeline.models.effect import Excitation
+from pipeline.models import Excitation, list_effects, name_term
 from pipeline.results import (
+    ABOVE_FLOOR,
+    BREVITY,
+    CAUSE_NAMES,
+    CHANCE,
+    CHANGE,
+    DETECTED_SHARE,
+    ERRORS_OVER_2S,
+    SEARCH_CUT,
     Errors,
     Finding,
     Learned,
@@ -28,24 +35,14 @@ from pipeline.results import (
     Undecided,
     Unexplained,
     Value,
-    split_determined,
-)
-from pipeline.results.reading import (
-    ABOVE_FLOOR,
-    BREVITY,
-    CAUSE_NAMES,
-    CHANCE,
-    CHANGE,
-    DETECTED_SHARE,
-    ERRORS_OVER_2S,
-    SEARCH_CUT,
     format_rises,
     is_small,
     list_added,
     measure_excess,
+    split_determined,
     split_main,
 )
-from pipeline.run.windows import HORIZON_S
+from pipeline.run import HORIZON_S
 from pipeline.words.effects import (
     describe_cause,
     describe_motion,

@@ -7,9 +7,17 @@ from functools import lru_cache
 from typing import TYPE_CHECKING
 
 from pipeline.core import format_interval, round_digits, split_interval, suffix_unit
-from pipeline.models.catalogue import find_effect, list_effects, name_term, suggest_manoeuvre
-from pipeline.models.parameter import AT_BOUND, UNDETERMINED, Level, Reading
-from pipeline.results.reading import read_model
+from pipeline.models import (
+    AT_BOUND,
+    UNDETERMINED,
+    Level,
+    Reading,
+    find_effect,
+    list_effects,
+    name_term,
+    suggest_manoeuvre,
+)
+from pipeline.results import read_model
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -12,8 +12,8 @@ from pipeline.core import (
     format_length,
     format_share,
 )
-from pipeline.results.reading import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE
-from pipeline.run.windows import HORIZON_S
+from pipeline.results import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE
+from pipeline.run import HORIZON_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.core import format_digits, format_length, format_share, split_interval
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer
-from pipeline.models.parameter import AT_BOUND, UNDETERMINED
-from pipeline.results.reading import ERRORS_OVER_2S, format_rises
+from pipeline.models import AT_BOUND, UNDETERMINED
+from pipeline.results import ERRORS_OVER_2S, format_rises
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

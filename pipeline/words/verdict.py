@@ -7,7 +7,7 @@ from itertools import groupby
 from typing import TYPE_CHECKING
 
 from pipeline.core import enumerate_texts, format_share
-from pipeline.results.reading import (
+from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
     CHANGE,
@@ -19,7 +19,7 @@ from pipeline.results.reading import (
     measure_excess,
     rank_main,
 )
-from pipeline.run.windows import HORIZON_S
+from pipeline.run import HORIZON_S
 from pipeline.words.effects import describe_clause, list_names, name_group
 from pipeline.words.errors import format_excess, format_step
 

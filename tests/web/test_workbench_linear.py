@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from pipeline import sources
 from pipeline.core import SlipError
 from pipeline.logs import columns, index, schema
 from pipeline.logs import schema as idl
 from pipeline.models.parameter import parse_unit
 from pipeline.sources import Signal, candidates, read_description
+from pipeline.sources import layers as sources
 from pipeline.stages import drive, pose_choice
 from pipeline.web.session import make_formula
 from pipeline.web.stored_runs import clean_name

@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pipeline.core.arrays import join_parts, turn_units
+from pipeline.core import join_parts, turn_units
 from pipeline.models.effect import BodyEffect, Excitation, Late, Least, Plausible, Spread
 from pipeline.models.families import TIME_CONSTANT, is_one_motion
 from pipeline.models.filters import lag_signal
 from pipeline.models.parameter import Quantity
-from pipeline.run.signals import Rolling, RunContext, Velocity
+from pipeline.run import Rolling, RunContext, Velocity
 
 LEAST_LAG_S = 0.02
 """Smallest lag of the body to report [s]: stamps have errors of this size."""

@@ -12,7 +12,7 @@ Source: header stamps against log times; measured on the DRIVE recordings.
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect, Spread
 from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
-from pipeline.run.signals import RunContext, Velocity
+from pipeline.run import RunContext, Velocity
 
 
 class ClockOffset(ReportEffect):

@@ -25,15 +25,13 @@ from typing import Self, cast
 
 import numpy as np
 
-from pipeline.core.arrays import Floats, Ints
-from pipeline.core.machine_code import LANES, compiled, deal_lanes
-from pipeline.core.rigid import GRAVITY_MPS2
+from pipeline.core import GRAVITY_MPS2, LANES, Floats, Ints, compiled, deal_lanes
 from pipeline.models.effect import INF, Effect, Excitation, Parameter, Plausible, Search
 from pipeline.models.effects.body_inertia import LEAST_LAG_S
 from pipeline.models.effects.effective_track import EffectiveTrack
 from pipeline.models.model import JointBody
 from pipeline.models.parameter import Conditions, Level, Quantity
-from pipeline.run.signals import Rolling, RunContext, Velocity
+from pipeline.run import Rolling, RunContext, Velocity
 
 _LEAST_CREEP = 1e-3
 """Smallest creep [1]: without any, the friction of wheels that do not slip has no direction."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from pipeline.models.effect import Excitation, Late, Least, Parameter, Plausible, ReportEffect
 from pipeline.models.parameter import LEAST_DELAY_S, Conditions, Level, Reading
-from pipeline.run.signals import RunContext, Velocity, earlier_in_span
+from pipeline.run import RunContext, Velocity, earlier_in_span
 
 
 class HeadingSkew(ReportEffect):

@@ -18,7 +18,7 @@ from pipeline.models.effect import ACKERMANN, KinematicEffect
 from pipeline.models.effects.steering_play import SteeringPlay
 from pipeline.models.filters import follow_with_play
 from pipeline.models.parameter import Conditions
-from pipeline.run.signals import Rolling, RunContext
+from pipeline.run import Rolling, RunContext
 
 
 class SteeringSensorPlay(KinematicEffect):

@@ -23,7 +23,7 @@ from pipeline.models.effect import (
     Search,
 )
 from pipeline.models.parameter import Conditions
-from pipeline.run.signals import Rolling, RunContext
+from pipeline.run import Rolling, RunContext
 
 _LEAST = Least(0.08, Least.GROUND)
 _PLAUSIBLE = Plausible(0.4, 1.7, "wider than the 8 to 30 % that were seen")

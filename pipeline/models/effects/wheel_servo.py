@@ -35,13 +35,13 @@ from typing import Self
 
 import numpy as np
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.models.effect import INF, Excitation, Least, Parameter, Plausible, Search
 from pipeline.models.families import TIME_CONSTANT
 from pipeline.models.model import JointDrive
 from pipeline.models.parameter import Conditions, Largest, Level, Quantity
 from pipeline.models.servo_walk import ROTATING, walk_each
-from pipeline.run.signals import RunContext, Wheels
+from pipeline.run import RunContext, Wheels
 
 _LEAST_TAU_S = 0.01
 """Smallest time constant [s]: a quarter of a cell at 25 Hz, within which the wheels follow at once."""

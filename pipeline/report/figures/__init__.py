@@ -17,7 +17,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import INPUT_WORDS, suffix_unit
-from pipeline.models.catalogue import name_effect
+from pipeline.models import name_effect
 from pipeline.report import Picture, format_number, theme
 from pipeline.report.scene import Scene, Thinned
 from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis

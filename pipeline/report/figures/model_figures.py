@@ -22,9 +22,8 @@ from pipeline.report.scene import (
     thin_series,
 )
 from pipeline.report.theme import Channel, Chart, encode_column, find_range, layer, make_axis, stack
-from pipeline.results import Errors, Growth, SlipBudget, Step
-from pipeline.results.reading import CAUSE_NAMES, INTERVAL_SHARE, format_rises
-from pipeline.words.errors import describe_need
+from pipeline.results import CAUSE_NAMES, INTERVAL_SHARE, Errors, Growth, SlipBudget, Step, format_rises
+from pipeline.words import describe_need
 
 _QUANTITIES = {
     "x": ("forward velocity v_x", "m/s"),

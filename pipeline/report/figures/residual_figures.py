@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import polars as pl
 
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats
 from pipeline.estimation.effect_signature import (
     FEWEST,
     LONGEST_S,

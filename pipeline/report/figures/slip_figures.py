@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, format_length, format_share
-from pipeline.core.arrays import Floats
+from pipeline.core import INPUT_WORDS, Floats, format_length, format_share
 from pipeline.report import figures, format_number, theme
 from pipeline.report.figures import Drawing, Figure, Section, draw_shares, format_events, list_events
 from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series, thin_to_peaks

@@ -14,8 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from pipeline.core import rigid
-from pipeline.core.arrays import Floats
+from pipeline.core import Floats, rigid
 from pipeline.simulate.drivetrain import apply_ideal_model, invert_ideal_model
 from pipeline.simulate.facts import (
     Layout,

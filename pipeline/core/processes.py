@@ -1,0 +1,87 @@
+"""The program and its processes: version, warnings, how Python is started, and when it ends."""
+
+from __future__ import annotations
+
+import os
+import sys
+import threading
+import time
+import warnings
+from pathlib import Path
+
+
+def silence_warnings() -> None:
+    """Hide warnings in this process unless requested (``python -W``, ``PYTHONWARNINGS``).
+
+    Users are informed by findings, losses and errors. Filters are unchanged: warnings that are errors, as in
+    the tests, remain errors.
+    """
+    if not sys.warnoptions:
+        warnings.showwarning = _ignore
+
+
+def _ignore(*_: object, **__: object) -> None:
+    return None
+
+
+PACKAGE = "slip-pipeline"
+
+
+def read_version() -> str:
+    """Version of the installed package; in a checkout that is not installed, the declared one."""
+    # Every call of the program imports this module, and few need the version.
+    import importlib.metadata  # noqa: PLC0415
+    import tomllib  # noqa: PLC0415
+
+    try:
+        return importlib.metadata.version(PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        declared = Path(__file__).parents[2] / "pyproject.toml"
+        content = tomllib.loads(declared.read_text(encoding="utf-8"))
+        return str(content["project"]["version"])
+
+
+THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")
+"""Environment variables with the number of threads of numerical libraries."""
+
+
+_ORPHAN_PERIOD_S = 0.5
+"""Period of checking for the parent process [s]: an orphan ends within it; a check takes microseconds."""
+
+
+def python_command(*words: str) -> list[str]:
+    """Command line of this interpreter, by its absolute path, without the current folder in its import path.
+
+    Args:
+        words: arguments, such as ``-m pipeline batch``.
+    """
+    return [os.path.abspath(sys.executable), "-P", *words]  # noqa: PTH100 - a link into an environment stays
+
+
+def slip_command(*words: str) -> list[str]:
+    """Command line of a verb in a process of its own.
+
+    Args:
+        words: the verb and its arguments.
+    """
+    return python_command("-m", "pipeline", *words)
+
+
+def keep_current_folder_out() -> None:
+    """Exclude the current folder from the import path of Python processes started by libraries."""
+    os.environ["PYTHONSAFEPATH"] = "1"
+
+
+def end_with(parent: int) -> None:
+    """End this process when the one that started it is killed.
+
+    Args:
+        parent: id of that process.
+    """
+    threading.Thread(target=_die_with, args=(parent,), name="parent", daemon=True).start()
+
+
+def _die_with(parent: int) -> None:
+    while os.getppid() == parent:
+        time.sleep(_ORPHAN_PERIOD_S)
+    os._exit(1)

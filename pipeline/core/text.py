@@ -1,0 +1,225 @@
+"""Texts: errors, numbers with their digits, lengths, durations, and shares in words."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Literal, get_args
+
+_READABLE = 300
+"""Maximum number of characters of quoted text in a sentence: four lines of a screen."""
+_LONGEST = 1000
+"""Maximum number of characters of an error, which may quote a text of any size from a file."""
+
+
+class SlipError(Exception):
+    """An error that the user can correct.
+
+    Args:
+        code: stable identifier in snake_case, for example ``log_not_found``.
+        what: what is wrong, one sentence without a full stop.
+        where: the file, topic, key or line it concerns; empty when there is none.
+        hint: what to do about it.
+    """
+
+    def __init__(self, code: str, what: str, *, where: str = "", hint: str) -> None:
+        super().__init__(what)
+        self.code = code
+        # Errors quote files, whose texts may have any length.
+        self.what = shorten(what, _LONGEST)
+        self.where = where
+        self.hint = hint
+
+    def __str__(self) -> str:
+        """One line: where, what, what to do."""
+        origin = f"{self.where}: " if self.where else ""
+        return f"{origin}{self.what}. {self.hint.rstrip('.')}."
+
+    def _render_traceback_(self) -> list[str]:
+        """The same line in place of a traceback in a notebook."""
+        return [f"slip: {' '.join(str(self).split())}"]
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Keep every part when the error crosses a process boundary."""
+        return _rebuild, (type(self), self.code, self.what, self.where, self.hint)
+
+
+def shorten(text: str, most: int = _READABLE) -> str:
+    """A text, truncated if it is long."""
+    return text if len(text) <= most else f"{text[:most]}..."
+
+
+def make_plain(text: str) -> str:
+    """Replace unprintable characters, so that the text fits on one line, or into XML."""
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def guess_names(name: str, known: Iterable[str], *, end: str = "") -> str:
+    """`Did you mean husky_a200? ` if known names resemble an unknown one; else empty.
+
+    Args:
+        name: the unknown name.
+        known: the names that there are.
+        end: common end of all names, which does not make them alike.
+    """
+    import difflib  # noqa: PLC0415 - only needed once something is already wrong
+
+    near = difflib.get_close_matches(name.removesuffix(end), [one.removesuffix(end) for one in known], n=3)
+    return f"Did you mean {' or '.join(f'{one}{end}' for one in near)}? " if near else ""
+
+
+def _rebuild(kind: type[SlipError], code: str, what: str, where: str, hint: str) -> SlipError:
+    return kind(code, what, where=where, hint=hint)
+
+
+@contextmanager
+def naming_os_errors(
+    make: type[SlipError], code: str, what: str, *, where: object, hint: str
+) -> Iterator[None]:
+    """Context manager that raises errors of the operating system as `SlipError` with their reason.
+
+    Raises:
+        SlipError: of the class `make`.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
+
+
+_MINUTE, _HOUR = 60.0, 3600.0  # seconds
+_DAYS = 3
+"""Days from which a duration is told in days: an experiment of 48 h is one of hours."""
+_LEAST_PART = 0.001
+"""Part of a whole below which its digits say nothing: intervals of budgets are wider."""
+_NEARLY_ALL = 0.95
+"""Share of the recording below which the compared duration is shown as well."""
+
+INPUTS = ("command", "measured")
+INPUT_WORDS = {"command": "from commands", "measured": "from wheel encoders"}
+"""Text for each input of the ideal model."""
+
+TREND_THRESHOLD = 0.1
+"""Relative change of slip that raises an alert of a trend unless another is given."""
+
+FigureFormat = Literal["svg", "pdf", "png"]
+FIGURES: tuple[FigureFormat, ...] = get_args(FigureFormat)
+
+
+def suffix_unit(unit: object) -> str:
+    """A unit as the suffix of a number; empty for a plain number, or one of unknown unit."""
+    return "" if unit in {None, "", "1"} else f" {unit}"
+
+
+def mark_finding(severity: object) -> str:
+    """Mark in front of a finding: `!!` forbids conclusions, `!` is a warning."""
+    return {"error": "!! ", "warning": "!  "}.get(str(severity), "   ")
+
+
+def enumerate_texts(texts: Sequence[str]) -> str:
+    """Texts as a list in a sentence: `a, b and c`; empty where there are none."""
+    return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
+
+
+def format_digits(value: float, digits: int = 2) -> str:
+    """A number of so many significant digits, at least those before the point; a whole number for 0."""
+    leading = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0
+    places = max(digits - 1 - leading, 0) if digits else 0
+    text = f"{value:z.{places}f}"
+    return text.rstrip("0").rstrip(".") if places else text
+
+
+_LEAST_UNITS = 3.55
+"""Least half of an interval in units of the last digit of its value, as of the Particle Data Group: rounding
+moves a value by a seventh of that half at most; with twice as many a digit is chance, with half a quarter is
+lost."""
+_UNEVEN = 0.1
+"""Least half of an interval over the other half for the digits to follow it: one may be cut at a bound."""
+
+
+def count_places(half: float) -> int:
+    """Places behind the point that the half of an interval supports, negative for tens and hundreds."""
+    return -math.floor(math.log10(half / _LEAST_UNITS))
+
+
+def split_interval(value: float, low: float, high: float) -> tuple[str, str, str]:
+    """A value and the ends of its interval with the digits that the interval supports.
+
+    The last digit is that of the narrower half, so that both ends differ from the value as printed; a value
+    has one digit at least.
+    """
+    halves = value - low, high - value
+    half = max(min(halves), _UNEVEN * max(halves))
+    if not 0.0 < half < math.inf:
+        return f"{value:.3g}", f"{low:.3g}", f"{high:.3g}"
+    # Whole numbers at the coarsest: in tens, an end near zero would be zero.
+    places = max(count_places(half), 0, -math.floor(math.log10(abs(value))) if value else 0)
+    value_text, low_text, high_text = (f"{one:z.{places}f}" for one in (value, low, high))
+    return value_text, low_text, high_text
+
+
+def format_interval(value: float, low: float, high: float, unit: object = None) -> str:
+    """A value with its unit and its interval: `14.401 rad/s [14.378, 14.424]`."""
+    text, *ends = split_interval(value, low, high)
+    return f"{text}{suffix_unit(unit)} [{', '.join(ends)}]"
+
+
+def format_share(share: float, digits: int = 2) -> str:
+    """A share as text in percent: `56 %`, `8.6 %`, `0.5 %`.
+
+    Args:
+        share: 1 is the whole.
+        digits: see `format_digits`.
+    """
+    return f"{format_digits(100.0 * share, digits)} %"
+
+
+def format_part(share: float) -> str:
+    """A part of a whole in percent: `56 %`, `0.4 %`, `-2 %`, and `< 0.1 %` of either sign below that."""
+    return "< 0.1 %" if 0.0 < abs(share) < _LEAST_PART else format_share(share, 1)
+
+
+def format_length(metres: float) -> str:
+    """A length as text: `1.06 m`, or below one metre `5.7 cm`."""
+    return f"{format_digits(metres, 3)} m" if metres >= 1.0 else f"{format_digits(100.0 * metres)} cm"
+
+
+def format_angle(radians: float) -> str:
+    """An angle as text: `1 degree`, `0.8 degrees`, `12 degrees`."""
+    text = format_digits(math.degrees(radians))
+    return f"{text} degree{'s' * (text != '1')}"
+
+
+def format_errors(metres: float, radians: float) -> str:
+    """Errors of position and heading as text: `1.06 m and 55 degrees`; one that is NaN is left out."""
+    sizes = [format_length(metres)] if math.isfinite(metres) else []
+    sizes += [format_angle(radians)] if math.isfinite(radians) else []
+    return " and ".join(sizes) or "by an unknown amount"
+
+
+def format_duration(seconds: float) -> str:
+    """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
+    if seconds < _MINUTE:
+        return f"{round(seconds, 1):g} s"
+    whole = round(seconds)
+    if whole < _HOUR:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    if whole < _DAYS * 24 * _HOUR:
+        return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+    return f"{whole // 86400} days {whole % 86400 // 3600} h"
+
+
+def format_recorded(recorded_s: float, compared_s: object = None) -> str:
+    """Duration of a log, and of its part with slip if that is clearly less."""
+    text = format_duration(recorded_s)
+    if isinstance(compared_s, int | float) and compared_s < _NEARLY_ALL * recorded_s:
+        text += f", {format_duration(compared_s)} of it compared"
+    return text
+
+
+# Starting Python in a separate process, without imports from the current folder.
+#
+# ``python -c`` and ``python -m`` search the current folder before the standard library: a `tempfile.py` in a
+# folder with untrusted logs would run. ``-P`` excludes that folder. ``-I`` would also exclude PYTHONPATH and
+# the site packages of the user, which are trusted and may contain slip itself.

@@ -1,0 +1,61 @@
+"""Findings of the stages, and the error of a log with too little data for one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import polars as pl
+
+from pipeline.core import SlipError
+from pipeline.logs import Loss
+
+SURE = 5.0
+"""Significance threshold [standard errors] for reporting a difference: of a thousand runs without one, normal
+noise exceeds it in none."""
+
+
+class StageError(SlipError):
+    """A log or a table with too little data for a stage."""
+
+
+def blame_damage(losses: Sequence[Loss]) -> str:
+    """Data lost from the log, for messages on missing data; empty without a loss."""
+    further = len(losses) - 1
+    others = f"; {further} further loss{'es' * (further > 1)}" if further else ""
+    return f" (the log is damaged: {losses[0].text}{others})" if losses else ""
+
+
+Severity = Literal["info", "warning", "error"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One finding.
+
+    Attributes:
+        id: stable identifier in snake_case.
+        severity: info, warning, or error: results of this run are not reliable.
+        text: one sentence.
+        where: topic, column or channel; empty for the whole run.
+        t_start: start of the stretch concerned [s since the run's start].
+        t_end: its end [s].
+        value: the underlying number, in the unit stated in the text.
+        count: number of occurrences.
+    """
+
+    id: str
+    severity: Severity
+    text: str
+    where: str = ""
+    t_start: float | None = None
+    t_end: float | None = None
+    value: float | None = None
+    count: int | None = None
+
+
+def tabulate_findings(stage: str, findings: Sequence[Finding]) -> pl.DataFrame:
+    """Findings of one stage as a table (without the run's columns)."""
+    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
+
+    rows = [{"stage": stage, **vars(finding)} for finding in findings]
+    return tabulate("findings", rows)
