@@ -24,6 +24,7 @@ from game.play import Record, read_records, read_version
 from game.tables import has_wrong_name, is_clean, is_exact, is_flagged, is_narrowed, is_owned_up_to
 from measured_tables import MEASURED, ROOT, list_versions
 from measuring import RECORDINGS, RUNNER, read_rows
+from published import PUBLISHED, ask_sets
 from rivals import describe_sections
 
 from pipeline.analysis import Options
@@ -160,6 +161,13 @@ def measure_paper(asked: Asked) -> dict[str, object]:
     return {"command": "make measure ARGS=paper", "versions": stages, "rows": rows, "ratios": ratios}
 
 
+def measure_published(_: Asked) -> dict[str, object]:
+    """What is said of public recordings with published answers."""
+    rows = [{"set": name, **vars(one)} for name, one in ask_sets(PUBLISHED)]
+    versions = {name: version for name, version in list_versions().items() if name in {"diagnosis", "slip"}}
+    return {"command": "make published", "versions": versions, "rows": rows}
+
+
 def round_interval(row: Mapping[str, float]) -> dict[str, float]:
     """A value and its interval."""
     return {key: round(float(row[key]), 4) for key in ("value", "low", "high")}
@@ -198,6 +206,7 @@ def write_measured(name: str, content: Mapping[str, object]) -> None:
 MEASUREMENTS: dict[str, tuple[bool, Callable[[Asked], dict[str, object]]]] = {
     "paper": (True, measure_paper),
     "accuracy": (False, measure_accuracy),
+    "published": (True, measure_published),
     "rivals_command": (True, measure_rivals("command")),
     "rivals_measured": (True, measure_rivals("measured")),
 }
@@ -219,8 +228,9 @@ def run(chosen: argparse.Namespace) -> int:
     folder.mkdir(parents=True, exist_ok=True)
     for name in chosen.names or MEASUREMENTS:
         needs_recordings, measure = MEASUREMENTS[name]
-        if needs_recordings and not any(RECORDINGS.glob("*.mcap")):
-            sys.stdout.write(f"{name}: skipped, no recordings in {RECORDINGS.name}\n")
+        recordings = PUBLISHED if measure is measure_published else RECORDINGS
+        if needs_recordings and not any(recordings.rglob("*.mcap")):
+            sys.stdout.write(f"{name}: skipped, no recordings in {recordings.name}\n")
             continue
         write_measured(name, measure(Asked(chosen.logs, chosen.jobs, folder)))
         sys.stdout.write(f"{name}: measured\n")

@@ -233,6 +233,26 @@ def judge(paper: float, value: float, low: float, high: float) -> str:
     return f"yes, {off}" if low <= paper <= high else f"**no**, {off}"
 
 
+VERDICTS = {"wrong": "**wrong**", "refused": "**refused**"}
+"""Verdicts in bold: what is missed is to be seen."""
+
+
+def render_published(name: str, data: Data) -> list[str]:
+    """What was said of the questions of one set of public recordings."""
+    rows = [
+        (row["question"], escape(row["published"]), escape(row["said"]), VERDICTS.get(verdict, verdict))
+        for row in data["rows"]
+        if row["set"] == name
+        for verdict in (row["verdict"],)
+    ]
+    return make_table(("question", "published", "this program", ""), rows)
+
+
+def escape(text: str) -> str:
+    """Text in a cell of a table, alternatives as `or`."""
+    return text.replace(" | ", " or ").replace("|", "or")
+
+
 RIVALS = {source: f"rivals_{source}" for source in INPUTS}
 RENDERERS: dict[str, tuple[tuple[str, ...], Callable[..., list[str]]]] = {
     "accuracy": (("accuracy",), render_accuracy),
@@ -240,6 +260,10 @@ RENDERERS: dict[str, tuple[tuple[str, ...], Callable[..., list[str]]]] = {
     "learned": ((RIVALS["command"],), render_learned),
     "errors": ((RIVALS["command"],), render_errors),
     "paper": (("paper",), render_paper),
+    **{
+        f"published {name}": (("published",), partial(render_published, name))
+        for name in ("optiodom_differential", "optiodom_tricycle", "robotino_surfaces", "f1tenth_mocap")
+    },
     **{
         f"{RIVALS[source]} {place}": ((RIVALS[source],), partial(render_place, place))
         for source in INPUTS

@@ -77,7 +77,8 @@ def ask_differential(folder: Path, results: Path) -> Iterator[Answer]:
 def ask_tricycle(folder: Path, results: Path) -> Iterator[Answer]:
     """Four runs with a steered and driven front wheel; no command."""
     runs = analyze(sorted(folder.glob("tri_*.mcap")), results)
-    for word, chosen in (("one circular run", runs[:1]), ("four runs", runs)):
+    alone = [(run.name.rpartition("/")[2].rpartition("_")[0], [run]) for run in runs]
+    for word, chosen in (*alone, ("four runs", runs)):
         content = ask(chosen)
         yield judge_number(
             f"steering offset [rad], {word}",
@@ -253,11 +254,16 @@ def run(given: argparse.Namespace) -> None:
         print(f"the public recordings are not here ({given.folder}): nothing is asked")
         return
     print(f"{'set':<23}{'question':<45}{'published':<36}{'verdict':<11}said")
-    for name in given.sets:
+    for name, one in ask_sets(given.folder, given.sets):
+        print(f"{name:<23}{one.question:<45}{one.published:<36}{one.verdict:<11}{one.said}", flush=True)
+
+
+def ask_sets(folder: Path, sets: Iterable[str] = tuple(SETS)) -> Iterator[tuple[str, Answer]]:
+    """Every question of some sets, with its answer."""
+    for name in sets:
         with tempfile.TemporaryDirectory(prefix="published_") as results:
             try:
-                for one in SETS[name](given.folder / name, Path(results)):
-                    row = f"{name:<23}{one.question:<45}{one.published:<36}{one.verdict:<11}{one.said}"
-                    print(row, flush=True)
+                for one in SETS[name](folder / name, Path(results)):
+                    yield name, one
             except slip.SlipError as error:
-                print(f"{name:<23}{'-':<45}{'-':<36}{'refused':<11}{error}", flush=True)
+                yield name, Answer("-", "-", str(error), "refused")

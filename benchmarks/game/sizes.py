@@ -80,6 +80,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "body_acceleration_limit": {"limit": speed / (2.0 * size)},
         "turn_acceleration_limit": {"limit": turn / (2.0 * size)},
         "drive_gain": {"g": 1.0 - 0.1 * size},
+        "load_droop": {"d": 0.06 * size * small},
         "gain_drift": {"k": 0.15 * size},
         "difference_gain": {"g": 1.0 - 0.4 * size},
         "side_gain": {"e": sign * 0.06 * size},

@@ -106,7 +106,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 47
+VERSION = 48
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")

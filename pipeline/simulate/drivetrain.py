@@ -137,6 +137,8 @@ def drive_wheels(
         if effects.is_active("acceleration_limit"):
             wheel = limit_rate(wheel, per_second=effects.value("acceleration_limit", "limit"), step_s=step_s)
         wheel = effects.value("drive_gain", "g") * charge * wheel
+        lost = effects.value("load_droop", "d") / vehicle.wheel_radius_m
+        wheel = np.sign(wheel) * np.maximum(np.abs(wheel) - lost, 0.0)
         if pitch is not None:
             wheel = _load(wheel, pitch, vehicle.wheel_radius_m, effects.value("grade_load", "k"))
         wheel = lag_signal(wheel, tau_s=effects.value("drive_lag", "tau"), step_s=step_s)

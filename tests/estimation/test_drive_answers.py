@@ -40,6 +40,7 @@ _DRIVES = {
     "body_acceleration_limit": {"limit": 1.5},
     "turn_acceleration_limit": {"limit": 1.2},
     "grade_load": {"k": 1.2},
+    "load_droop": {"d": 0.08},
     "wheel_speed_limit": {"limit": 5.0},
     "wheel_speed_scaling": {"limit": 5.0},
 }

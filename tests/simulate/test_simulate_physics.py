@@ -67,6 +67,7 @@ INERTIA = 1.0 + (0.5 * W0) ** 2
         ({"deadband": 0.5}, (0.765 / 2, 0, 0.765 / 0.55)),
         ({"turn_droop": {"threshold": 1.5, "gain": 0.4}}, (V0, 0, 0.165 / 0.55 * (1.5 + 0.4 * 0.5))),
         ({"drive_gain": 0.9}, (0.9 * V0, 0, 0.9 * W0)),
+        ({"load_droop": 0.05}, (V0 - 0.05, 0, W0)),
         ({"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
         ({"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
         ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),

@@ -164,7 +164,7 @@ class WheelServo(JointDrive):
     )
     needs = (Excitation.DRIVING, Excitation.TURNING, Excitation.CHANGES)
     confused_with = ("turn_droop", "acceleration_limit", "wheel_radius")
-    contains = ("deadband", "drive_lag", "turn_lag", "difference_gain")
+    contains = ("deadband", "load_droop", "drive_lag", "turn_lag", "difference_gain")
     companions = (
         "transport_delay",
         "body_turn_limit",
