@@ -308,20 +308,26 @@ def measure_largest(runs: Sequence[MotionRun], vehicle: Vehicle) -> Largest:
         speed, turn = max(speed, float(np.abs(forward).max())), max(turn, float(np.abs(yaw_rate).max()))
         if series.sideways is not None:
             aside = max(aside, float(np.abs(sideways).max()))
-        fastest.append(find_fastest_wheel(series))
-        wheel = max(wheel, float(fastest[-1].max()))
+        wheels = find_fastest_wheel(series)
+        wheel = max(wheel, float(wheels.max()))
         difference = max(difference, float(np.abs(series.right - series.left).max()))
+        if series.sideways is None:
+            fastest.append(wheels)
+        else:
+            # Rollers turn faster on a diagonal, at the same speed.
+            half = 0.5 * np.abs(series.right - series.left)
+            fastest.append(np.hypot(forward, sideways) / vehicle.wheel_radius_m + half)
     moments, turns = _find_tenths(runs, vehicle)
     rim = vehicle.wheel_radius_m * wheel
     return Largest(
         speed, turn, wheel, max(difference, 1e-6), moments, sideways=aside, turns=turns, rim=rim,
-        is_one_speed=_is_one_speed(np.concatenate(fastest or [np.zeros(0)]), wheel),
+        is_one_speed=_is_one_speed(np.concatenate(fastest or [np.zeros(0)])),
     )  # fmt: skip
 
 
-def _is_one_speed(fastest: Floats, largest: float) -> bool:
+def _is_one_speed(fastest: Floats) -> bool:
     """Whether speeds that are commanded while not standing are one, but for some moments."""
-    moving = fastest[fastest > _STANDS * largest]
+    moving = fastest[fastest > _STANDS * fastest.max(initial=0.0)]
     if not moving.size:
         return False
     low, high = np.quantile(moving, (_MOMENTS, 1.0 - _MOMENTS))

@@ -94,7 +94,7 @@ def test_what_lowers_the_errors_most_is_offered_first_and_what_raises_them_is_no
 )
 def test_commands_of_one_speed_are_told_by_their_spread(speeds: list[float], *, is_one: bool) -> None:
     fastest = np.array(speeds, dtype=float)
-    assert _is_one_speed(fastest, float(fastest.max(initial=0.0))) is is_one
+    assert _is_one_speed(fastest) is is_one
 
 
 def diagnose(log: Path, folder: Path) -> tuple[dict[str, Any], Model]:
