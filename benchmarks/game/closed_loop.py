@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 
 from pipeline.simulate import Disturbance, Scenario, State, simulate_run
 from pipeline.simulate.messages import Truth
-from pipeline.simulate.programs import Commands
+from pipeline.simulate.signals import Commands
 
 _STEP_S = 0.01
 _EVERY = 5

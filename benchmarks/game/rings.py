@@ -49,7 +49,7 @@ from pipeline.simulate import (
     simulate_skid_steer,
     write_log,
 )
-from pipeline.simulate.programs import Commands
+from pipeline.simulate.signals import Commands
 
 Floats = NDArray[np.float64]
 Json = dict[str, Any]

@@ -5,17 +5,25 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
-from pipeline.cli.conventions import CLEAN, open_shown, print_json, print_lines, print_note, print_result
+from pipeline.cli.conventions import (
+    CLEAN,
+    Results,
+    TrustCode,
+    open_shown,
+    print_json,
+    print_lines,
+    print_note,
+    print_result,
+)
 from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError
 
 if TYPE_CHECKING:
-    from pipeline.cli.verb_model import On
     from pipeline.datasets import Forecast
     from pipeline.estimation.problem import Problem
     from pipeline.models import LiteratureModel, Model, ModelFile
@@ -481,3 +489,25 @@ def compare_rivals(
         for text in warnings:
             print_note(f"slip: {text}")
     return CLEAN
+
+
+@dataclass(frozen=True, kw_only=True)
+class On:
+    """On what a model is fitted and judged, and how the answer is printed."""
+
+    on: Annotated[list[str], Parameter(help="logs, or runs of the results folder", consume_multiple=True)]
+    input: Annotated[
+        Literal["command", "measured"] | None,
+        Parameter(help="input of the model (default: the command if effects need it, else as last time)"),
+    ] = None
+    vehicle_of: Annotated[
+        Literal["model", "run"] | None,
+        Parameter(help="geometry to use where the run is of another vehicle (default: refuse)"),
+    ] = None
+    results: Results = Path("results")
+    trust_code: TrustCode = False
+    json: Annotated[bool, Parameter(help="print one JSON object")] = False
+    quiet: Annotated[bool, Parameter(help="print no progress and no table")] = False
+
+
+Spoken = Annotated[On, Parameter(name="*")]

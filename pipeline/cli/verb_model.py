@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -21,6 +21,8 @@ from pipeline.cli.conventions import (
 )
 from pipeline.cli.model_runs import (
     Against,
+    On,
+    Spoken,
     compare_rivals,
     cut_first,
     expect_model,
@@ -48,28 +50,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.problem import Transfer
     from pipeline.models import Model, ModelFile
     from pipeline.run import MotionRun
-
-
-@dataclass(frozen=True, kw_only=True)
-class On:
-    """On what a model is fitted and judged, and how the answer is printed."""
-
-    on: Annotated[list[str], Parameter(help="logs, or runs of the results folder", consume_multiple=True)]
-    input: Annotated[
-        Literal["command", "measured"] | None,
-        Parameter(help="input of the model (default: the command if effects need it, else as last time)"),
-    ] = None
-    vehicle_of: Annotated[
-        Literal["model", "run"] | None,
-        Parameter(help="geometry to use where the run is of another vehicle (default: refuse)"),
-    ] = None
-    results: Results = Path("results")
-    trust_code: TrustCode = False
-    json: Annotated[bool, Parameter(help="print one JSON object")] = False
-    quiet: Annotated[bool, Parameter(help="print no progress and no table")] = False
-
-
-Spoken = Annotated[On, Parameter(name="*")]
 
 
 def build_model() -> App:

@@ -10,17 +10,16 @@ import numpy as np
 
 from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_share, pick
 from pipeline.models import Effect, Largest, list_effects
+from pipeline.plan.chooser import Chooser, Shape, explain_open
 from pipeline.plan.manoeuvres import (
     LEAD_S,
     RATE_HZ,
     TAIL_S,
     Area,
-    Chooser,
     Commands,
     Limits,
     Manoeuvre,
     PlanError,
-    Shape,
     is_steered,
     join,
     list_manoeuvres,
@@ -34,7 +33,6 @@ from pipeline.plan.questions import (
     Judge,
     Question,
     Separation,
-    explain_open,
     leave_open,
     list_reasons,
 )

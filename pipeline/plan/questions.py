@@ -7,9 +7,8 @@ parameter follows from its information (A-optimality). Both are sums over window
 end at rest add up.
 """
 
-import math
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
@@ -26,8 +25,8 @@ from pipeline.core import (
 )
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.driving_need import find_goal
-from pipeline.models import Excitation, Largest, explain_idle, find_effect, list_effects, suggest_manoeuvre
-from pipeline.plan.manoeuvres import LEAD_S, LONGEST_S, TAIL_S, Area, Chooser, PlanError
+from pipeline.models import Excitation, Largest, explain_idle, find_effect, list_effects
+from pipeline.plan.manoeuvres import PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
 
 # The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly
@@ -422,13 +421,6 @@ def list_names(knowledge: Knowledge) -> tuple[str, ...]:
 
 # Open questions of a plan: what keeps a drive from answering them, found by driving without it.
 
-_RESERVES = (1.4, 2.0, 2.8, 4.0)
-"""Factors on the goals of a suggested drive: gains of manoeuvres do not add up exactly. They are raised until
-the drive is longer than the given time, in which the question stays open."""
-_MOST_TIMES = 10
-"""Longest suggested drive, in multiples of the given time: beyond it, another drive is better."""
-_EVERYWHERE = Area(math.inf, math.inf)
-
 
 @dataclass(frozen=True)
 class Impossible:
@@ -467,63 +459,3 @@ def leave_open(one: Answerable, weight: Floats) -> Impossible:
     """
     reached = one.format_reached(weight) if weight.any() else ""
     return Impossible(one.question.text, one.question.effects, "", reached)
-
-
-def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -> Impossible:
-    """An open question with the reason.
-
-    The drive is continued for this question alone: for a longer time, in an unlimited area, and both. The
-    first that answers it shows what is in its way; if none does, the limits of the commands are.
-
-    Args:
-        question: the question, as `leave_open` gives it.
-        chooser: the manoeuvres within the limits, and their information on all questions.
-        order: manoeuvres of the plan.
-    """
-    one = next(known for known in chooser.questions if known.question.text == question.question)
-    library = np.ones(chooser.durations.size)
-    best, longest_s = library, min(_MOST_TIMES * chooser.time_s, LONGEST_S - LEAD_S - TAIL_S)
-    for advice, drive in _continue(one, chooser, order, longest_s):
-        weight = np.bincount(np.array(drive, np.int64), minlength=library.size).astype(np.float64)
-        if float(one.answer(weight, _RESERVES[0])) >= 1.0:
-            seconds = math.ceil(LEAD_S + float(chooser.durations[list(drive)].sum()) + TAIL_S)
-            return replace(question, because=advice.format(seconds=seconds))
-        best = weight if _is_better(one, weight, best) else best
-    if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
-        seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
-        return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    at_best = f"expected {one.format_reached(best)}"
-    because = _advise(one.question, longest_s)
-    return replace(question, because=because, reached=at_best, needs_limits=True)
-
-
-def _continue(
-    one: Answerable, chooser: Chooser, order: Sequence[int], longest_s: float
-) -> Iterator[tuple[str, list[int]]]:
-    """The plan continued for one question without one of its limits after the other, and what that takes."""
-    for area, time_s, advice in (
-        (chooser.area, longest_s, "give --time {seconds}s"),
-        (_EVERYWHERE, chooser.time_s, "give a larger --area"),
-        (_EVERYWHERE, longest_s, "give a larger --area, and --time {seconds}s"),
-    ):
-        alone = Chooser([one], chooser.durations, chooser.shapes, area, time_s)
-        for reserve in _RESERVES:
-            drive = alone.extend(order, reserve)
-            spent = float(chooser.durations[drive].sum())
-            if time_s == chooser.time_s or spent > chooser.time_s:
-                yield advice, drive
-                break
-
-
-def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:
-    """Whether a drive reaches more than another."""
-    return bool(weight.any()) and one.rate(weight) > one.rate(than)
-
-
-def _advise(question: Question, longest_s: float) -> str:
-    """Why no drive answers a question, and what shows it."""
-    effects = [find_effect(name)() for name in question.effects]
-    on_slope = any(Excitation.SLOPE in effect.needs for effect in effects)
-    tried = f"no drive of up to {LEAD_S + longest_s + TAIL_S:.0f} s that was tried decides it"
-    why = "no drive on level ground decides it" if on_slope else tried
-    return f"{why}; to observe it: {suggest_manoeuvre(*effects)}"

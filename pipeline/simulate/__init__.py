@@ -16,7 +16,6 @@ import numpy as np
 
 from pipeline.core import Floats, Ints
 from pipeline.simulate import messages
-from pipeline.simulate.drivetrain import Drive
 from pipeline.simulate.facts import (
     CATALOGUE,
     LAYOUTS,
@@ -57,6 +56,7 @@ from pipeline.simulate.scenario import (
     Scenario,
     State,
 )
+from pipeline.simulate.signals import Drive
 
 Stamps = Ints
 

@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.core import Floats
 from pipeline.simulate.facts import Effects, Vehicle
-from pipeline.simulate.programs import Commands, follow, hold_on_grid, integrate_cells, lag_signal, limit_rate
+from pipeline.simulate.programs import follow, hold_on_grid, lag_signal, limit_rate
+from pipeline.simulate.signals import Commands, Drive
 
 # From commands to wheels: limits, deadband, delay, reversal, rate limit, lags and droop, in that order.
 #
@@ -22,30 +22,6 @@ _STEPS = 8
 _SMOOTHER_S = 0.005
 _SMOOTHED_S = 5.0
 """A smoother speaks so often, and as long beyond the last command."""
-
-
-@dataclass(frozen=True)
-class Drive:
-    """What the drivetrain does, on cells of ``step_s``.
-
-    Attributes:
-        step_s: cell width [s].
-        left, right: true wheel speeds [rad/s], shape (n,); equal on a car, whose rear axle they are; means of
-            a side on mecanum wheels.
-        steering: true steering angle [rad], shape (n,); zero on a differential vehicle.
-        corners: true speeds of mecanum wheels by place; on omni wheels those of wheels at the corners of the
-            same body motion; None on a vehicle that cannot move sideways.
-    """
-
-    step_s: float
-    left: Floats
-    right: Floats
-    steering: Floats
-    corners: Mapping[str, Floats] | None = None
-
-    def wheel_angles(self) -> tuple[Floats, Floats]:
-        """Turned angles [rad] of left and right wheels at the cell edges, each of shape (n + 1,)."""
-        return integrate_cells(self.left, step_s=self.step_s), integrate_cells(self.right, step_s=self.step_s)
 
 
 CORNERS = ("front_left", "front_right", "rear_left", "rear_right")

@@ -16,7 +16,7 @@ import numpy as np
 from pipeline.core import Floats, SlipError, guess_names
 
 if TYPE_CHECKING:
-    from pipeline.simulate.platforms import Published
+    from pipeline.simulate.published import Published
 
 
 class SimulateError(SlipError):

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core import Floats, euler_from_quaternions, quaternions_from_yaw
-from pipeline.simulate.drivetrain import CORNERS, Drive, apply_ideal_model, drive_wheels, invert_ideal_model
+from pipeline.simulate.drivetrain import CORNERS, apply_ideal_model, drive_wheels, invert_ideal_model
 from pipeline.simulate.facts import (
     CommandTopic,
     Effects,
@@ -19,17 +19,18 @@ from pipeline.simulate.facts import (
     resolve_effects,
     spread_times,
 )
-from pipeline.simulate.path import BodyMotion, Path, integrate_path, move_body
-from pipeline.simulate.programs import Commands, integrate_cells, make_commands, make_wishes, walk_in_plane
-from pipeline.simulate.scenario import (
-    Scenario,
+from pipeline.simulate.incidents import (
     brake_wheels,
     disturb_body,
     freeze_poses,
     record_commands,
     send_commands,
 )
+from pipeline.simulate.path import BodyMotion, Path, integrate_path, move_body
+from pipeline.simulate.programs import make_commands, make_wishes, walk_in_plane
+from pipeline.simulate.scenario import Scenario
 from pipeline.simulate.sensors import ImuReadings, Poses, WheelReadings, read_encoders, read_imu, report_poses
+from pipeline.simulate.signals import Commands, Drive, integrate_cells
 
 _SETTLED_M = 1e-6
 """Two passes over hills that are this close to each other are one."""

@@ -14,16 +14,11 @@ from pipeline.core import (
     quaternions_from_yaw,
     rotate,
 )
-from pipeline.simulate.drivetrain import TURNING_MPS, Drive, move_by_corners, steer_tyres
+from pipeline.simulate.drivetrain import TURNING_MPS, move_by_corners, steer_tyres
 from pipeline.simulate.facts import Effects, SimulateError, Vehicle
-from pipeline.simulate.programs import (
-    filter_pole,
-    integrate_cells,
-    lag_signal,
-    make_coloured_noise,
-    walk_in_plane,
-)
+from pipeline.simulate.programs import filter_pole, lag_signal, make_coloured_noise, walk_in_plane
 from pipeline.simulate.scenario import Disturbance, ExtraPhysics, Ground, State
+from pipeline.simulate.signals import Drive, integrate_cells
 
 # From wheels to body velocity: rolling, then inertia and ground effects in parallel, then rotation centres.
 #

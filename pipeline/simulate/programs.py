@@ -9,6 +9,7 @@ import numpy as np
 from pipeline.core import Floats
 from pipeline.simulate.facts import SimulateError, Vehicle, open_stream, unknown_name
 from pipeline.simulate.scenario import Program, Scenario
+from pipeline.simulate.signals import Commands, integrate_cells
 
 # Held signals, first-order lags, rate limits and coloured noise on a uniform grid.
 #
@@ -117,43 +118,10 @@ def walk_in_plane(along: Floats, aside: Floats, heading: Floats, *, step_s: floa
     return np.stack((x, y, np.zeros_like(heading)), axis=1)
 
 
-def integrate_cells(signal: Floats, *, step_s: float) -> Floats:
-    """Integral at the cell edges, shape (n + 1,), starting from zero."""
-    return np.concatenate(([0.0], np.cumsum(signal) * step_s))
-
-
 # Command programs: what a driver or a test protocol asks of the vehicle.
 #
 # Every program is a function of its seed; a turn is a yaw rate [rad/s] on a differential vehicle and a
 # steering angle [rad] on a car.
-
-
-@dataclass(frozen=True)
-class Commands:
-    """Body commands at their own stamps.
-
-    Attributes:
-        time_s: increasing, shape (n,).
-        speed_mps: shape (n,).
-        turn: yaw rate [rad/s] or steering angle [rad], shape (n,).
-        sideways_mps: speed to the left, shape (n,); None on a vehicle that cannot.
-    """
-
-    time_s: Floats
-    speed_mps: Floats
-    turn: Floats
-    sideways_mps: Floats | None = None
-
-    @property
-    def sideways(self) -> Floats:
-        """Speed to the left [m/s], zero on a vehicle that cannot, shape (n,)."""
-        return np.zeros_like(self.speed_mps) if self.sideways_mps is None else self.sideways_mps
-
-    def yaw_rate(self, vehicle: Vehicle) -> Floats:
-        """The yaw rate that is asked for [rad/s], which a car's steering stands for."""
-        if vehicle.kind != "ackermann":
-            return self.turn
-        return self.speed_mps * np.tan(self.turn) / vehicle.wheelbase_m
 
 
 @dataclass(frozen=True)

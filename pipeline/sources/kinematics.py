@@ -10,14 +10,12 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, ClassVar, TypeAlias
+from typing import TYPE_CHECKING, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
-
-    from pipeline.sources.configuration import Vehicle
 
     Floats: TypeAlias = NDArray[np.float64]
     Inputs: TypeAlias = Mapping[str, Floats]
@@ -41,6 +39,34 @@ class Quantity:
     required: bool = True
 
 
+class Geometry(Protocol):
+    """What kinematics need of a vehicle; lengths in metres, angles in radians."""
+
+    @property
+    def wheel_radius_m(self) -> float:
+        """Radius of the wheels."""
+
+    @property
+    def track_width_m(self) -> float | None:
+        """Distance between the centres of the left and right wheels."""
+
+    @property
+    def wheelbase_m(self) -> float | None:
+        """Distance between the axles."""
+
+    @property
+    def base_to_rear_axle_m(self) -> float:
+        """Distance of base_link ahead of the rear axle."""
+
+    @property
+    def max_steering_rad(self) -> float | None:
+        """Largest steering angle."""
+
+    @property
+    def controller_track_multiplier(self) -> float:
+        """Factor on the track width in the controller."""
+
+
 class Kinematics(ABC):
     """Ideal motion of one kind of vehicle.
 
@@ -58,23 +84,23 @@ class Kinematics(ABC):
     known_joints: ClassVar[bool] = True
 
     @abstractmethod
-    def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+    def forward(self, inputs: Inputs, vehicle: Geometry) -> Body:
         """Ideal body velocity of inputs."""
 
     @abstractmethod
-    def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
+    def inverse(self, body: Body, vehicle: Geometry) -> dict[str, Floats]:
         """Inputs that a controller sends to the drive for a body command, within the drive's limits."""
 
-    def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+    def asked(self, inputs: Inputs, vehicle: Geometry) -> Body:
         """Body command that a controller converted into inputs: the inverse of `inverse`."""
         return self.forward(inputs, vehicle)
 
-    def lever_m(self, vehicle: Vehicle) -> float:
+    def lever_m(self, vehicle: Geometry) -> float:
         """Distance of base_link ahead of the point that moves straight ahead without slip [m]."""
         del vehicle
         return 0.0
 
-    def turning_width_m(self, vehicle: Vehicle) -> float:
+    def turning_width_m(self, vehicle: Geometry) -> float:
         """Width that converts a speed difference of the sides into a yaw rate [m]; one if unknown."""
         return vehicle.track_width_m or 1.0
 
@@ -101,25 +127,25 @@ class Differential(Kinematics):
         Quantity("controller_track_multiplier", "1", "the controller's track over b", required=False),
     )
 
-    def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+    def forward(self, inputs: Inputs, vehicle: Geometry) -> Body:
         """See the formula above."""
         return self._roll(inputs, vehicle, self.turning_width_m(vehicle))
 
-    def asked(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+    def asked(self, inputs: Inputs, vehicle: Geometry) -> Body:
         """As `forward`, with the geometry that the controller uses."""
         return self._roll(inputs, vehicle, self._controller_width_m(vehicle))
 
-    def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
+    def inverse(self, body: Body, vehicle: Geometry) -> dict[str, Floats]:
         """Wheel speeds of a body command with the controller's geometry; sideways motion is ignored."""
         forward, _, turning = body
         half = turning * self._controller_width_m(vehicle) / 2.0
         radius = vehicle.wheel_radius_m
         return {"left": (forward - half) / radius, "right": (forward + half) / radius}
 
-    def _controller_width_m(self, vehicle: Vehicle) -> float:
+    def _controller_width_m(self, vehicle: Geometry) -> float:
         return self.turning_width_m(vehicle) * vehicle.controller_track_multiplier
 
-    def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
+    def _roll(self, inputs: Inputs, vehicle: Geometry, width_m: float) -> Body:
         left, right, radius = inputs["left"], inputs["right"], vehicle.wheel_radius_m
         forward, turning = left + right, right - left
         # These are the longest sums of the models' signals: computing in place halves the time.
@@ -153,13 +179,13 @@ class Ackermann(Kinematics):
         Quantity("max_steering_rad", "rad", "largest steering angle", required=False),
     )
 
-    def forward(self, inputs: Inputs, vehicle: Vehicle) -> Body:
+    def forward(self, inputs: Inputs, vehicle: Geometry) -> Body:
         """See the formula above."""
         speed = inputs["speed"]
         turning = speed * np.tan(inputs["steering"]) / (vehicle.wheelbase_m or 1.0)
         return speed, vehicle.base_to_rear_axle_m * turning, turning
 
-    def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
+    def inverse(self, body: Body, vehicle: Geometry) -> dict[str, Floats]:
         """Speed and steering angle of a body command; straight ahead at standstill."""
         forward, _, turning = body
         moving = np.abs(forward) > _SLOW_MPS
@@ -169,7 +195,7 @@ class Ackermann(Kinematics):
             steering = np.clip(steering, -vehicle.max_steering_rad, vehicle.max_steering_rad)
         return {"speed": forward, "steering": steering}
 
-    def lever_m(self, vehicle: Vehicle) -> float:
+    def lever_m(self, vehicle: Geometry) -> float:
         """The arm of the formula above."""
         return vehicle.base_to_rear_axle_m
 
@@ -202,16 +228,16 @@ class Mecanum(Differential):
         ),
     )
 
-    def inverse(self, body: Body, vehicle: Vehicle) -> dict[str, Floats]:
+    def inverse(self, body: Body, vehicle: Geometry) -> dict[str, Floats]:
         """Wheel speeds of a body command with the controller's geometry."""
         sideways = np.asarray(body[1] / vehicle.wheel_radius_m)
         return {**super().inverse(body, vehicle), "sideways": sideways}
 
-    def turning_width_m(self, vehicle: Vehicle) -> float:
+    def turning_width_m(self, vehicle: Geometry) -> float:
         """The sum b + l: a wheel with rollers turns the vehicle about a lever of half of it."""
         return (vehicle.track_width_m or 1.0) + (vehicle.wheelbase_m or 1.0)
 
-    def _roll(self, inputs: Inputs, vehicle: Vehicle, width_m: float) -> Body:
+    def _roll(self, inputs: Inputs, vehicle: Geometry, width_m: float) -> Body:
         forward, _, turning = super()._roll(inputs, vehicle, width_m)
         return forward, vehicle.wheel_radius_m * inputs["sideways"], turning
 
@@ -234,7 +260,7 @@ class Omni(Mecanum):
     )
     known_joints = False
 
-    def turning_width_m(self, vehicle: Vehicle) -> float:
+    def turning_width_m(self, vehicle: Geometry) -> float:
         """The diameter of the circle."""
         return vehicle.track_width_m or 1.0
 

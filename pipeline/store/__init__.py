@@ -44,8 +44,8 @@ if TYPE_CHECKING:
         check_table,
         encode_parquet,
         list_complaints,
-        scan_table,
     )
+    from pipeline.store.queries import scan_table
     from pipeline.store.results_folder import RUNS, Store
     from pipeline.store.stored_runs import (
         ANALYZE_FIRST,

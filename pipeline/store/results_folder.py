@@ -191,7 +191,7 @@ class Store:
         Raises:
             StoreError: ``no_such_table``, or a manifest is damaged.
         """
-        from pipeline.store.parquet_tables import scan_table  # noqa: PLC0415 - heavy
+        from pipeline.store.queries import scan_table  # noqa: PLC0415 - heavy
 
         return scan_table(table, root=self.root, manifests=self.manifests(), partition=partition)
 
@@ -205,7 +205,7 @@ class Store:
         Raises:
             StoreError: ``bad_query``, or a manifest or a table is damaged.
         """
-        from pipeline.store.parquet_tables import answer_query  # noqa: PLC0415 - heavy
+        from pipeline.store.queries import answer_query  # noqa: PLC0415 - heavy
 
         return answer_query(sql, root=self.root, manifests=self.manifests(), partition=partition)
 

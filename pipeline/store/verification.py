@@ -7,16 +7,13 @@ from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 from pipeline.core import read_bounded, walk_files
 from pipeline.store.checksums import NOTES, decode_checked, has_checksum, parse_manifest, parse_marker
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
 from pipeline.store.generation import LATEST
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
-
-if TYPE_CHECKING:
-    from pipeline.store.mirror import Mirror
 
 RUNS = "runs"
 ABSENT = ""
@@ -64,6 +61,22 @@ class Examination:
     files: Tally = field(default_factory=Tally)
 
 
+class Files(Protocol):
+    """The files of results, on disk or in an object store."""
+
+    def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
+        """Every name in the results; ``skip`` is told of what is left out, and why."""
+
+    def read(self, name: str) -> bytes | None:
+        """The content of a file; None when there is none."""
+
+    def hash(self, name: str) -> str:
+        """SHA-256 of a file in hexadecimal; `ABSENT` when there is none."""
+
+    def locate(self, name: str) -> Path:
+        """The path to show."""
+
+
 class DiskFiles:
     """The files of a results folder.
 
@@ -104,7 +117,7 @@ class DiskFiles:
         return self._root / name
 
 
-def examine_files(files: DiskFiles | Mirror, *, sample: Sample | None = None) -> Examination:
+def examine_files(files: Files, *, sample: Sample | None = None) -> Examination:
     """Read all results again, and hold them against what says what they were.
 
     Args:
@@ -115,7 +128,7 @@ def examine_files(files: DiskFiles | Mirror, *, sample: Sample | None = None) ->
 
 
 class _Examiner:
-    def __init__(self, files: DiskFiles | Mirror, sample: Sample | None) -> None:
+    def __init__(self, files: Files, sample: Sample | None) -> None:
         self._files = files
         self._unread: list[Problem] = []
         self._names = files.names(self._leave_out)

@@ -20,7 +20,7 @@ from pipeline.simulate import PLATFORMS, simulate_case
 if TYPE_CHECKING:
     import pytest
 
-    from pipeline.simulate.platforms import Published
+    from pipeline.simulate.published import Published
 
 NAME = (
     'bot"""; EXECUTED = 1; """ \'\'\'---><include file="/etc/passwd"/><!--- '

@@ -22,7 +22,7 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.simulate.programs import Commands
+from pipeline.simulate.signals import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import Spans

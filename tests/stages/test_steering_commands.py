@@ -25,7 +25,7 @@ from pipeline.simulate import (
     write_log,
 )
 from pipeline.simulate.facts import CommandTopic
-from pipeline.simulate.programs import Commands
+from pipeline.simulate.signals import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.checks import check_turn
 from pipeline.store import Manifest

@@ -27,23 +27,12 @@ from pipeline.simulate.facts import (
     unknown_name,
 )
 from pipeline.simulate.messages import Field, Sheet, SimulatedRun
-from pipeline.simulate.programs import integrate_cells, make_wishes, walk_in_plane
+from pipeline.simulate.programs import make_wishes, walk_in_plane
+from pipeline.simulate.published import Json, Published, Q, Source, Value
 from pipeline.simulate.sensors import to_earth
+from pipeline.simulate.signals import integrate_cells
 
 Series = dict[str, Floats]
-Source = Literal[
-    "command",
-    "wish",
-    "wheels",
-    "odometry",
-    "filter",
-    "localization",
-    "satellites",
-    "correction",
-    "imu",
-    "battery",
-    "once",
-]
 
 _LATE_S = 0.002
 _TURN = 2.0 * np.pi
@@ -54,50 +43,6 @@ _DOPPLER_NOISE_MPS = 0.03
 _BATTERY_V, _IDLE_W, _RESISTANCE_N = 36.0, 40.0, 120.0
 _ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
-
-
-@dataclass(frozen=True)
-class Q:
-    """A quantity of the run: ``gain * quantity + offset``, cut to a whole number where one is wanted."""
-
-    name: str
-    gain: float = 1.0
-    offset: float = 0.0
-    whole: bool = False
-
-
-@dataclass(frozen=True)
-class Json:
-    """A text with a JSON object of quantities by key."""
-
-    numbers: Mapping[str, Q]
-
-
-Value = Q | Json | tuple[Q, ...] | str | list[str] | float
-
-
-@dataclass(frozen=True)
-class Published:
-    """A topic.
-
-    Attributes:
-        topic, type_name: where and what.
-        source: whose times and quantities it has: ``command``; ``wheels``; ``odometry`` integrated from them,
-            ``filter`` the same with the gyro's heading; ``localization``; ``satellites``, its place on Earth
-            and the velocity of its sensor over ground; ``correction``, the transform from
-            the localization's frame to the odometry's; ``imu``; ``battery``; ``once`` at the start;
-            ``wish``, a body command that the controller never gets.
-        fields: by field path a quantity, several for an array, a text of them, or a constant.
-        every: one message in so many is published.
-        stamp: ``header``; ``none``; or the field that holds the time, ``timestamp`` in microseconds.
-    """
-
-    topic: str
-    type_name: str
-    source: Source
-    fields: Mapping[str, Value] = field(default_factory=dict)
-    every: int = 1
-    stamp: str = "header"
 
 
 def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
