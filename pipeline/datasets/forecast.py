@@ -3,14 +3,20 @@
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, cast
+from typing import Literal
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Floats, format_interval
-from pipeline.datasets.joint_levels import RunEvidence, draw_joint_run
-from pipeline.datasets.levels import LevelFit, draw_run, find_outlier, split_levels
+from pipeline.datasets.levels import (
+    LevelFit,
+    RunEvidence,
+    draw_joint_run,
+    draw_run,
+    find_outliers,
+    split_levels,
+)
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.models import (
     USUAL_SPREAD,
@@ -224,17 +230,9 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, w
 
 def leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
     """Rows of one parameter without outlying runs, and the names of these runs."""
-    odd: list[str] = []
-    while (index := _find_odd(rows)) is not None:
-        odd.append(str(rows["run"][index]))
-        rows = rows.filter(pl.col("run") != odd[-1])
-    return rows, tuple(odd)
-
-
-def _find_odd(rows: pl.DataFrame) -> int | None:
-    return find_outlier(
-        rows["value"], rows["standard_error"], cast("Sequence[str]", rows["terrain"].to_list()), chance=SURE
-    )
+    values, errors = (rows[name].to_numpy() for name in ("value", "standard_error"))
+    odd = [str(rows["run"][index]) for index in find_outliers(values, errors, rows["terrain"].to_list())]
+    return rows.filter(~pl.col("run").is_in(odd)), tuple(odd)
 
 
 def _take_declared(parameter: Parameter) -> tuple[Level, str] | None:

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Floats, Ints, student_quantile
+from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Flags, Floats, Ints, student_quantile
 from pipeline.datasets.confidence import Interval
 from pipeline.datasets.rank_tests import StatisticsError, check_values
 
@@ -28,6 +28,8 @@ _NORMAL = 1e6
 _STARTS = ((0.7, 0.7), (0.7, 0.1), (0.1, 0.7))
 # A variance below this fraction of the total counts as zero.
 _NONE = 1e-8
+ODD = 0.01
+"""Significance level of outlying runs: one parameter in a hundred has a false outlier."""
 
 
 @dataclass(frozen=True)
@@ -108,22 +110,30 @@ def split_levels(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) ->
     )
 
 
-def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *, chance: float) -> int | None:
-    """Return the index of the run that is an outlier of its group; None without one.
+def find_outliers(values: Floats, errors: Floats, groups: Sequence[str]) -> list[int]:
+    """Indices of the runs that are outliers of their group, identified one after the other.
 
     The most distant run is removed and compared with the prediction of the others for its group by Student's
     t, with a Bonferroni correction for the number of candidate runs. Groups of fewer than three runs are not
-    tested: with two runs the outlier is ambiguous.
+    tested: with two runs the outlier is ambiguous. A parameter has a false outlier with probability `ODD`.
 
     Args:
-        values: as for `split_levels`.
-        errors: as for `split_levels`.
+        values: as for `split_levels`, shape (n,).
+        errors: as for `split_levels`, shape (n,).
         groups: as for `split_levels`.
-        chance: probability of one or more false outliers.
     """
+    remaining, odd = list(range(len(values))), list[int]()
+    while remaining:
+        sample, _ = make_sample(values[remaining], errors[remaining], [groups[one] for one in remaining])
+        if (index := _find_outlier(sample)) is None:
+            break
+        odd.append(remaining.pop(index))
+    return odd
+
+
+def _find_outlier(sample: Sample) -> int | None:
     from scipy.special import stdtr  # noqa: PLC0415 - heavy, and only this function of it
 
-    sample, _ = make_sample(values, errors, groups)
     runs = np.bincount(sample.group, minlength=sample.count)[sample.group]
     asked = runs > 2  # noqa: PLR2004 - with two runs the outlier is ambiguous
     if not asked.any():
@@ -143,7 +153,7 @@ def find_outlier(values: ArrayLike, errors: ArrayLike, groups: Sequence[str], *,
     group = sample.group[worst]
     deviation = math.sqrt(sample.known[worst] + run + 1.0 / float(total[group]))
     farther = 2.0 * float(stdtr(freedom, -abs(sample.y[worst] - means[group]) / deviation))
-    return worst if farther * int(asked.sum()) < chance else None
+    return worst if farther * int(asked.sum()) < ODD else None
 
 
 def make_sample(values: ArrayLike, errors: ArrayLike, groups: Sequence[str]) -> tuple[Sample, list[str]]:
@@ -395,28 +405,24 @@ def weigh_run_spreads(
     Raises:
         StatisticsError: as for `split_levels`.
     """
-    sample, names = make_sample(values, errors, groups)
+    sample, _ = make_sample(values, errors, groups)
     spreads: Floats = usual * _GRID
-    within = _rate_spreads(sample.y, sample.known, _mark_groups(groups, names), spreads)[2]
+    within = rate_spreads(sample, spreads)[2]
     score = within + _PRIOR
     chances = np.exp(score - score.max())
     return spreads, chances / chances.sum()
 
 
-def _mark_groups(groups: Sequence[str], names: Sequence[str]) -> Floats:
-    """One where a run belongs to a group, else zero, shape (groups, runs)."""
-    return np.array([[name == label for label in groups] for name in names], dtype=np.float64)
-
-
-def _rate_spreads(y: Floats, known: Floats, member: Floats, narrow: Floats) -> tuple[Floats, Floats, Floats]:
+def rate_spreads(sample: Sample, narrow: Floats) -> tuple[Floats, Floats, Floats]:
     """Weight and mean of each group by spread between runs, shape (k, g), and a log likelihood.
 
     The last is the restricted log likelihood with a mean for each group, shape (k,).
     """
-    weight = 1.0 / (known + narrow[:, None] ** 2)
+    member = np.eye(sample.count)[:, sample.group]
+    weight = 1.0 / (sample.known + narrow[:, None] ** 2)
     total = weight @ member.T
-    means = (weight * y) @ member.T / total
-    rest = np.sum(weight * (y - means @ member) ** 2, axis=1)
+    means = (weight * sample.y) @ member.T / total
+    rest = np.sum(weight * (sample.y - means @ member) ** 2, axis=1)
     return total, means, -0.5 * (rest - np.log(weight).sum(axis=1) + np.log(total).sum(axis=1))
 
 
@@ -456,14 +462,12 @@ _PRIOR = np.log(_GRID) - 0.5 * _GRID**2
 def _weigh_spreads(
     values: ArrayLike, errors: ArrayLike, groups: Sequence[str], usual: tuple[float, float]
 ) -> _Spreads:
-    y, s = check_values(values, what="values"), check_values(errors, what="errors")
-    if not y.size == s.size == len(groups) or min(s.min(), *usual) <= 0.0:
-        what = f"{y.size} values have {s.size} errors and {len(groups)} groups, usual spreads {usual}"
-        hint = "Give every value a group and a positive error, and positive spreads."
-        raise StatisticsError("bad_errors", what, hint=hint)
-    names = sorted(set(groups))
+    sample, names = make_sample(values, errors, groups)
+    if min(usual) <= 0.0:
+        hint = "Give positive spreads."
+        raise StatisticsError("bad_errors", f"usual spreads {usual} are not positive", hint=hint)
     wide, narrow = (size * _GRID for size in usual)
-    total, means, within = _rate_spreads(y, s**2, _mark_groups(groups, names), narrow)
+    total, means, within = rate_spreads(sample, narrow)
     # Axes: spread between groups, spread between runs, group.
     outer = 1.0 / (wide[:, None, None] ** 2 + 1.0 / total)
     mass = outer.sum(axis=2)
@@ -472,3 +476,141 @@ def _weigh_spreads(
     likelihood = within - 0.5 * (away - np.log(outer).sum(axis=2) + np.log(mass))
     score = likelihood + _PRIOR[:, None] + _PRIOR
     return _Spreads(names, wide, narrow, total, means, centre, mass, score)
+
+
+# Joint draws of many parameters in another run.
+#
+#     x_r = mu + a_g(r) + b_r,    a ~ N(0, diag(group spread^2)),  b ~ N(0, diag(run spread^2))
+#
+# The same model, per parameter. Each run contributes its normal equations, possibly singular: near its fit,
+# minus twice the log likelihood is x' N x - 2 h' x (Gelman and Hill, Data Analysis Using Regression, 2007,
+# chapter 13). Spreads are drawn per parameter from the estimates of single runs, weighted by their errors;
+# then all parameters jointly, given the spreads.
+
+_NARROWEST = 1e-4
+"""Zero spread in usual sizes; not exactly zero, so that its inverse is finite."""
+_VAGUE = 10.0
+"""Prior standard deviation of a parameter in usual sizes: keeps unidentified parameters finite."""
+
+
+@dataclass(frozen=True)
+class RunEvidence:
+    """Information of one run on p parameters.
+
+    Attributes:
+        run: name of the run.
+        group: label of its group.
+        normal: matrix N of its normal equations, shape (p, p): the inverse covariance where it exists.
+        pull: right side h, shape (p,): N times the parameters that fit the run best.
+    """
+
+    run: str
+    group: str
+    normal: Floats
+    pull: Floats
+
+
+@dataclass(frozen=True)
+class JointDraws:
+    """Joint draws of p parameters.
+
+    Attributes:
+        group: means of the group, shape (n, p).
+        run: parameters in another run of that group, shape (n, p).
+        odd: outlying runs by parameter, which are ignored for it.
+        runs_known: number of runs that determine each parameter, shape (p,).
+    """
+
+    group: Floats
+    run: Floats
+    odd: tuple[tuple[str, ...], ...]
+    runs_known: tuple[int, ...]
+
+
+def draw_joint_run(
+    runs: Sequence[RunEvidence],
+    group: str,
+    *,
+    centre: Floats,
+    usual: Floats,
+    size: Floats,
+    shared: Flags,
+    count: int,
+    rng: np.random.Generator,
+) -> JointDraws:
+    """Draw all parameters jointly as in another run of a group.
+
+    Args:
+        runs: information of each run, one or more.
+        group: group of the other run; may have no runs.
+        centre: centre of the draws of unidentified parameters, shape (p,).
+        usual: prior scales of the spreads between groups and between runs of a group, shape (2, p).
+        size: usual sizes of the parameters, shape (p,), positive.
+        shared: parameters that all groups have in common, shape (p,).
+        count: number of draws.
+        rng: random generator.
+    """
+    # In usual sizes, about the centre: parameters of different units share one matrix.
+    normals = np.array([size[:, None] * run.normal * size for run in runs])
+    pulls = np.array([size * (run.pull - run.normal @ centre) for run in runs])
+    groups = [run.group for run in runs]
+    vague = np.eye(size.size) / _VAGUE**2
+    single = np.linalg.inv(normals + vague)
+    values = (single @ pulls[:, :, None])[:, :, 0]
+    errors = np.sqrt(np.diagonal(single, axis1=1, axis2=2))
+    wide, narrow = np.empty((2, count, size.size))
+    odd: list[tuple[str, ...]] = []
+    runs_known: list[int] = []
+    free = np.zeros((len(runs), size.size), dtype=bool)
+    for column in range(size.size):
+        # A run that does not determine a parameter gives no information on its spread.
+        known = errors[:, column] < 0.5 * _VAGUE
+        labels = [""] * len(runs) if shared[column] else groups
+        rows = np.flatnonzero(known)
+        apart = rows[find_outliers(values[rows, column], errors[rows, column], [labels[row] for row in rows])]
+        free[apart, column] = True
+        bound_by = known & ~free[:, column]
+        odd.append(tuple(runs[which].run for which in apart))
+        runs_known.append(int(bound_by.sum()))
+        spreads = (float(one) / float(size[column]) for one in usual[:, column])
+        wide[:, column], narrow[:, column] = draw_spreads(
+            values[bound_by, column],
+            errors[bound_by, column],
+            [name for name, one in zip(labels, bound_by.tolist(), strict=True) if one],
+            usual=(next(spreads), next(spreads)),
+            count=count,
+            rng=rng,
+        )
+    wide[:, shared] = _NARROWEST
+    means, others = np.empty((2, count, size.size))
+    names = sorted(set(groups))
+    for draw in range(count):
+        between, within = wide[draw] ** 2, narrow[draw] ** 2
+        by_group = {name: (np.zeros_like(vague), np.zeros(size.size)) for name in names}
+        for normal, pull, name, loose in zip(normals, pulls, groups, free, strict=True):
+            weight, pulled = _widen(normal, pull, np.where(loose, _VAGUE**2, within))
+            by_group[name] = (by_group[name][0] + weight, by_group[name][1] + pulled)
+        upper = [_widen(weight, pulled, between) for weight, pulled in by_group.values()]
+        pulled_up = np.sum([h for _, h in upper], axis=0)
+        common = _draw_normal(vague + sum(one for one, _ in upper), pulled_up, rng)
+        own, pulled = by_group.get(group, (np.zeros_like(vague), np.zeros(size.size)))
+        sharp = np.diag(1.0 / between)
+        means[draw] = _draw_normal(own + sharp, pulled + common / between, rng)
+        others[draw] = means[draw] + narrow[draw] * rng.standard_normal(size.size)
+    return JointDraws(centre + size * means, centre + size * others, tuple(odd), tuple(runs_known))
+
+
+def _widen(normal: Floats, pull: Floats, spread: Floats) -> tuple[Floats, Floats]:
+    """Normal equations of the mean, if parameters scatter about it with these variances."""
+    factor = np.linalg.inv(np.eye(spread.size) + normal * spread)
+    weight: Floats = factor @ normal
+    pulled: Floats = factor @ pull
+    even: Floats = 0.5 * (weight + weight.T)
+    return even, pulled
+
+
+def _draw_normal(sharp: Floats, pull: Floats, rng: np.random.Generator) -> Floats:
+    """Draw from the normal distribution with this precision matrix and precision times mean."""
+    lower = np.linalg.cholesky(sharp)
+    mean = np.linalg.solve(sharp, pull)
+    return np.asarray(mean + np.linalg.solve(lower.T, rng.standard_normal(pull.size)), dtype=np.float64)

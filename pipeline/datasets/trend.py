@@ -13,9 +13,9 @@ import polars as pl
 from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, guess_names, pick, suffix_unit
 from pipeline.datasets.compared_runs import ComparedRuns, find_material
 from pipeline.datasets.forecast import leave_out_odd, list_numbers
-from pipeline.datasets.joint_levels import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError, gather_runs
 from pipeline.datasets.rank_tests import LEVEL
+from pipeline.datasets.steps import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.models import UNDETERMINED, Level, cut_interval, find_effect, list_effects
 from pipeline.store import Store, lack_runs
 

@@ -51,7 +51,7 @@ _ENOUGH = 0.01
 
 @dataclass(frozen=True)
 class RunNormal:
-    """Normal equations of one run for the free parameters of a joint fit (`fleet.joint_levels.RunEvidence`).
+    """Normal equations of one run for the free parameters of a joint fit (`datasets.levels.RunEvidence`).
 
     Attributes:
         labels: ``effect.name`` of the parameters.

@@ -10,7 +10,7 @@ import pytest
 from test_fleet_levels import ALIKE, ICE_AND_OTHERS, draw
 
 from pipeline.datasets.forecast import Forecast, fit_fleet, forecast_vehicle, join_evidence
-from pipeline.datasets.joint_levels import RunEvidence
+from pipeline.datasets.levels import RunEvidence
 from pipeline.models.parameter import Level
 
 

@@ -17,7 +17,6 @@ from pipeline.datasets.confidence import (
     integrated_time,
     number_blocks,
 )
-from pipeline.datasets.joint_levels import find_changes
 from pipeline.datasets.rank_tests import (
     StatisticsError,
     adjust_holm,
@@ -32,6 +31,7 @@ from pipeline.datasets.rank_tests import (
     shift_between,
     smallest_p,
 )
+from pipeline.datasets.steps import find_changes
 
 NUMBERS = st.floats(-100.0, 100.0, allow_nan=False).map(lambda value: round(value, 3))
 SIDE = st.lists(NUMBERS, min_size=1, max_size=5)

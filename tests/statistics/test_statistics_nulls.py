@@ -14,7 +14,6 @@ import pytest
 from simulated_runs import RATE, simulate_runs
 
 from pipeline.datasets.confidence import bootstrap_median, cut_blocks
-from pipeline.datasets.joint_levels import find_changes
 from pipeline.datasets.pooled_tests import Difference, MeansTest, bound_levels, compare_means
 from pipeline.datasets.rank_tests import (
     adjust_holm,
@@ -24,6 +23,7 @@ from pipeline.datasets.rank_tests import (
     permute_means,
     permute_studentized,
 )
+from pipeline.datasets.steps import find_changes
 
 SPREAD = 0.1
 
