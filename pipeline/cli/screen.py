@@ -16,6 +16,7 @@ from pipeline.core import (
     format_interval,
     format_recorded,
     format_share,
+    format_size,
     mapping_in,
     number_in,
     objects_in,
@@ -59,7 +60,7 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        print_note(f"{todo} log{'s' * (todo != 1)} to work on ({size / 1e6:.1f} MB), {settled} already done")
+        print_note(f"{todo} log{'s' * (todo != 1)} to work on ({format_size(size)}), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""
@@ -345,12 +346,12 @@ def list_statements(seen: Seen) -> list[tuple[str, str]]:
     """
     knowledge = cast("Seen", seen["knowledge"])
     state = "closed" if seen["closed"] else "being written"
-    size = cast("float", seen["bytes"]) / 1e6
+    size = format_size(cast("float", seen["bytes"]))
     duration, distance = cast("float", seen["duration_s"]), cast("float", seen["distance_m"])
     rows = [
         ("watching", f"{seen['log']}    {state}"),
         ("server", str(seen.get("source") or "")),
-        ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size:.1f} MB"),
+        ("so far", f"{format_duration(duration)}, {distance:.0f} m, {size}"),
         ("slip", _format_slip_now(cast("Mapping[str, float]", seen["slip_mps"]), "over the last 10 s")),
         ("error", _format_model_error(seen)),
     ]

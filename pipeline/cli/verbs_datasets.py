@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Results, format_value, open_results, print_result
-from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part
+from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part, split_interval
 
 if TYPE_CHECKING:
     import polars as pl
@@ -174,8 +174,10 @@ _NUMBERS = (1, 2, 4)
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
-    low, high = row.get("low"), row.get("high")
-    return f"{low:.3g} to {high:.3g}" if isinstance(low, float) and isinstance(high, float) else "-"
+    value, low, high = (row.get(key) for key in ("value", "low", "high"))
+    if not (isinstance(value, float) and isinstance(low, float) and isinstance(high, float)):
+        return "-"
+    return " to ".join(split_interval(value, low, high)[1:])
 
 
 def _format_pairs(answer: Answer, name: str) -> list[str]:

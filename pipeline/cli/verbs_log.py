@@ -37,7 +37,14 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import trust_named
-from pipeline.core import FigureFormat, SlipError, format_duration, format_share, naming_os_errors
+from pipeline.core import (
+    FigureFormat,
+    SlipError,
+    format_duration,
+    format_share,
+    format_size,
+    naming_os_errors,
+)
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import Outcome
@@ -226,7 +233,7 @@ def _format_log(seen: Inspection) -> list[str]:
     packing = "compression " + (", ".join(name or "none" for name in index.compressions) or "none")
     lines = [
         f"log       {index.path}",
-        f"          {index.size_bytes / 1e6:.1f} MB, {format_duration(seen.duration_s)}, {packing}",
+        f"          {format_size(index.size_bytes)}, {format_duration(seen.duration_s)}, {packing}",
         f"          {_format_count(seen)}",
         f"          profile {index.profile or '-'}, written by {index.library or '-'}",
         f"health    {'complete' if not seen.losses else 'with losses'}"

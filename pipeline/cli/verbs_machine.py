@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Annotated, Literal
+from urllib.parse import urlencode
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -32,8 +33,9 @@ from pipeline.core import PACKAGE, measure_memory, read_version
 
 
 def serve(  # noqa: D417 - the results folder documents itself
-    results: Results = Path("results"),
+    run: str | None = None,
     *,
+    results: Results = Path("results"),
     port: int = 8321,
     host: str = "127.0.0.1",
     diagnosis: Annotated[bool, Parameter(negative="--no-diagnosis")] = True,
@@ -49,6 +51,8 @@ def serve(  # noqa: D417 - the results folder documents itself
     `Authorization: Bearer TOKEN`.
 
     Args:
+        run: run that it opens with, by its name or its log, in place of the one analyzed last; or the results
+            folder.
         port: port to listen on; 0 takes any that is free.
         host: address to listen on; anything but this machine's own opens it to the network.
         diagnosis: diagnose logs that are dropped on the page.
@@ -58,11 +62,13 @@ def serve(  # noqa: D417 - the results folder documents itself
         json: print address and token as one JSON object.
         quiet: print nothing.
     """
+    from pipeline.store import Store  # noqa: PLC0415 - heavy
+    from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 
     def notify(address: str, token: str) -> None:
-        whole = f"{address}?token={token}"
+        whole = f"{address}?token={token}{opened}"
         if json:
             print_json({"address": address, "token": token})
         elif not quiet:
@@ -80,6 +86,13 @@ def serve(  # noqa: D417 - the results folder documents itself
         timeout_s=timeout,
         memory_bytes=measure_memory() // 2 if memory is None else parse_memory_limit(memory),
     )
+    opened = ""
+    # A folder that is not there yet is filled by dropped logs.
+    named = None if run is None else Path(run)
+    if named is not None and (named.is_dir() or not (named.exists() or Store(results).runs())):
+        results = named
+    elif run is not None:
+        opened = f"#{urlencode({'a': find_run(run, Store(results)).run})}"
     serve_workbench(results, host=host, port=port, notify=notify, limits=limits, diagnosis=diagnosis)
     return CLEAN
 

@@ -24,7 +24,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     tidy_line,
 )
-from pipeline.core import INPUT_WORDS, SlipError
+from pipeline.core import INPUT_WORDS, SlipError, format_size
 
 if TYPE_CHECKING:
     import polars as pl
@@ -188,7 +188,7 @@ def _format_status(status_now: Status) -> list[str]:
     )
     old = f"{status_now.old_generations} old generation{'s' * (status_now.old_generations != 1)}"
     lines = [
-        f"runs          {status_now.runs}, {status_now.bytes / 1e6:.1f} MB, {old}",
+        f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
         f"last batch    {last}",
     ]
     counts = {state: count for state, count in status_now.counts.items() if count or state != "refused"}

@@ -101,6 +101,7 @@ if TYPE_CHECKING:
         format_part,
         format_recorded,
         format_share,
+        format_size,
         guess_names,
         make_plain,
         mark_finding,

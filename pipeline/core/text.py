@@ -198,6 +198,14 @@ def format_errors(metres: float, radians: float) -> str:
     return " and ".join(sizes) or "by an unknown amount"
 
 
+def format_size(count: float) -> str:
+    """A size in bytes, kB or MB: `1.8 MB`."""
+    for unit, size in (("MB", 1e6), ("kB", 1e3)):
+        if count >= size:
+            return f"{count / size:,.1f} {unit}"
+    return f"{count:.0f} B"
+
+
 def format_duration(seconds: float) -> str:
     """A duration in its two largest units: `3.2 s`, `10 min 48 s`, `2 h 03 min`, `30 days 2 h`."""
     if seconds < _MINUTE:

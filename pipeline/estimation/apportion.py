@@ -226,13 +226,21 @@ def find_moments(judgement: Judgement) -> tuple[Moments, ...]:
             square = errors[number] ** 2
             known = np.isfinite(square)
             if known.any() and float(square[known].mean()) > (ABOVE_FLOOR * least) ** 2:
-                share, spans = _find_half(stretch[known], square[known])
+                share, spans = find_half(stretch[known], square[known])
                 moments.append(Moments(quantity, share, tuple(Span(*span) for span in spans), number))
     return tuple(moments)
 
 
-def _find_half(stretch: Ints, square: Floats) -> tuple[float, tuple[tuple[float, float, float], ...]]:
-    """The fewest stretches with half of a sum: their share of the time, and spans of adjacent ones."""
+def find_half(stretch: Ints, square: Floats) -> tuple[float, tuple[tuple[float, float, float], ...]]:
+    """The fewest stretches of 2 s with half of a sum of squares.
+
+    Args:
+        stretch: number of the stretch of each square, shape (n,).
+        square: shape (n,).
+
+    Returns:
+        Their share of the time, and spans of adjacent ones: start, end [s] and share, the largest first.
+    """
     numbers, position = np.unique(stretch, return_inverse=True)
     sums, counts = np.bincount(position, square) / square.sum(), np.bincount(position)
     order = np.argsort(-sums)

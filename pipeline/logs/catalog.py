@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Final
 
 from mcap.records import Channel, Schema
 
+from pipeline.core import format_size
 from pipeline.logs.chunks import largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
@@ -250,9 +251,9 @@ def keep_within(catalog: Catalog, size: int, most: int | None) -> None:
         (within if fits else omitted).append(span)
     catalog.spans = within
     text = (
-        f"the chunks of the file decompress to {_spell(total)}, {total / size:.0f} times its size, and at "
-        f"most {_spell(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks were left "
-        f"out; --max-inflated {-(-total // 10**6)}MB reads them"
+        f"the chunks of the file decompress to {format_size(total)}, {total / size:.0f} times its size, and "
+        f"at most {format_size(allowed)} are read: {len(omitted)} of {len(omitted) + len(within)} chunks "
+        f"were left out; --max-inflated {-(-total // 10**6)}MB reads them"
     )
     catalog.losses.append(
         Loss(
@@ -273,10 +274,6 @@ def _work(inflated: int, stored: int) -> int:
 
 def _list_known(times: Iterable[int | None]) -> list[int]:
     return [time for time in times if time is not None]
-
-
-def _spell(size: int) -> str:
-    return f"{size / 1e6:,.1f} MB"
 
 
 _NOTHING_COVERED: Final = "no checksum covers its messages: damage in them cannot be detected"

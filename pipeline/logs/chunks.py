@@ -14,7 +14,7 @@ import zstandard
 from mcap.records import Channel, Schema
 from numpy.typing import NDArray
 
-from pipeline.core import Ints
+from pipeline.core import Ints, format_size
 from pipeline.logs import records as rec
 from pipeline.logs.records import Buffer, Effort, find_record
 
@@ -450,7 +450,7 @@ class Allowance:
         self.remaining -= size
         if self.remaining < 0:
             raise BudgetError(
-                f"it decompresses to more than {self.most / 1e6:,.1f} MB, and no more is read; "
+                f"it decompresses to more than {format_size(self.most)}, and no more is read; "
                 "a larger --max-inflated reads more"
             )
 

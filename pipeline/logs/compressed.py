@@ -11,7 +11,7 @@ import tempfile
 import weakref
 from typing import IO, TYPE_CHECKING, Final
 
-from pipeline.core import Newest
+from pipeline.core import Newest, format_size
 from pipeline.logs.catalog import limit_inflated
 from pipeline.logs.records import LogError
 
@@ -77,7 +77,7 @@ def _inflate(path: Path, size: int, source: IO[bytes], target: IO[bytes]) -> Non
             total += target.write(frame.decompress(rest))
             rest = frame.unused_data if frame.eof else b""
             if total > most:
-                what = f"it inflates to more than {most / 1e6:.0f} MB, which no recording of its size does"
+                what = f"it inflates to more than {format_size(most)}, which no recording of its size does"
                 raise LogError("too_large", what, where=str(path), hint="Unpack it: zstd -d")
         target.flush()
     except zstandard.ZstdError as error:
@@ -91,5 +91,5 @@ def _inflate(path: Path, size: int, source: IO[bytes], target: IO[bytes]) -> Non
 
 
 def _refuse_damage(path: Path, how: str, total: int) -> LogError:
-    what = f"the compressed file is {how}, after {total / 1e6:.3g} MB of its content"
+    what = f"the compressed file is {how}, after {format_size(total)} of its content"
     return LogError("log_unreadable", what, where=str(path), hint="Copy it from its origin again")

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final, cast
 
-from pipeline.core import PAUSE_NS, PathError, resolve_inside, usable_threads
+from pipeline.core import PAUSE_NS, PathError, format_size, resolve_inside, usable_threads
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name
@@ -289,7 +289,7 @@ def find_parts(path: Path) -> tuple[list[Path], list[Loss]]:
         if listing.stat().st_size > _MAX_LISTING:
             raise LogError(
                 "not_a_recording",
-                f"metadata.yaml holds {listing.stat().st_size / 1e6:.0f} MB, which no listing of files does",
+                f"metadata.yaml holds {format_size(listing.stat().st_size)}, which no listing of files does",
                 where=str(listing),
                 hint="Put it back from where it was recorded, or remove it: the files are then found by name",
             )

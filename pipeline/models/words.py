@@ -12,17 +12,22 @@ from importlib import resources
 
 import msgspec
 
-from pipeline.core import Floats, enumerate_texts, format_angle, format_length, format_share
+from pipeline.core import Floats, enumerate_texts, format_angle, format_digits, format_length, format_share
 from pipeline.models.expression import Expression, parse_expression
 from pipeline.models.parameter import PLAIN
 from pipeline.sources import Vehicle
 
 _FIELD = re.compile(r"\{([^{}:]+):([^{}]*)\}")
 _PART = re.compile(r"(?=, | \()(?![^{]*\})")
+_SHORT_S = 0.1
+"""Time below which it is said in milliseconds: two digits of them are as short as those of seconds above."""
 _FORMATS: Mapping[str, Callable[[float], str]] = {
     "length": format_length,
     "angle": format_angle,
     "share": format_share,
+    "time": lambda value: (
+        f"{format_digits(value)} s" if value >= _SHORT_S else f"{format_digits(1e3 * value)} ms"
+    ),
     "percent": lambda value: format_share(value, 3),
     "less": lambda value: f"{format_share(abs(1.0 - value), 0)} {'less' if value <= 1.0 else 'more'}",
 }

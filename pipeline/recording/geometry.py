@@ -189,7 +189,7 @@ def describe_vehicle(
     parts = {
         key: f"{words[key]} {lengths[key]:.3g} m"
         + (
-            f" (+- {format_share(errors[key] / lengths[key])})"
+            f" (±{format_share(errors[key] / lengths[key])})"
             if key not in given and errors.get(key, 0.0) > _ROUGH * lengths[key]
             else ""
         )
@@ -217,7 +217,7 @@ def describe_vehicle(
     radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
     alike = None if track is None else find_alike(radius, track)
     guess = (
-        f"a {alike.name}? then --vehicle {alike.id}"
+        f"a {alike.name} has about these: confirm with --vehicle {alike.id}"
         if alike
         else "--wheel-radius and --track-width give others"
     )

@@ -159,16 +159,6 @@ def format_date(run: str, nanoseconds: int | None) -> str:
     return day.strftime("%Y-%m-%d %H:%M UTC") if day.year >= _EARLIEST_YEAR else ""
 
 
-def format_bytes(count: float | None) -> str:
-    """A size in bytes, kB or MB."""
-    if count is None:
-        return MISSING
-    for unit, size in (("MB", 1e6), ("kB", 1e3)):
-        if count >= size:
-            return f"{count / size:.1f} {unit}"
-    return f"{count:.0f} B"
-
-
 # HTML from the templates beside the code; all texts are escaped.
 #
 # A template is named by its path below `pipeline`. Only `base.html` marks content as `safe`: our own style
@@ -208,7 +198,6 @@ def _environment() -> Environment:
     )
     environment.filters |= {
         "bracket_unit": bracket_unit,
-        "bytes": format_bytes,
         "capital": begin_large,
         "squares": set_squares,
         "split_literals": _LITERAL.split,

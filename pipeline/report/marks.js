@@ -213,5 +213,5 @@ const slipMarks = (parts, { marked = () => {} } = {}) => {
     set([], [], { told: false });
   };
 
-  return { follow, join, leave, own, reset, zoomOf: () => zoom };
+  return { follow, join, leave, mark: markTime, own, reset, zoomOf: () => zoom };
 };

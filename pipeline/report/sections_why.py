@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
-from pipeline.core import mapping_in, number_in, objects_in, split_interval
+from pipeline.core import format_size, mapping_in, number_in, objects_in, split_interval
 from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, suggest_manoeuvre
 from pipeline.report import (
     MISSING,
@@ -16,7 +16,6 @@ from pipeline.report import (
     Table,
     begin_large,
     count_serious,
-    format_bytes,
     format_known_share,
     format_number,
     format_split,
@@ -119,11 +118,11 @@ def _format_stretch(start: float | None, end: float | None) -> str:
 def _tabulate_losses(report: RunReport) -> Table:
     rows = []
     for loss in objects_in(report.part("log"), "losses"):
-        chunks = number_in(loss, "chunks")
+        chunks, size = number_in(loss, "chunks"), number_in(loss, "bytes")
         rows.append(
             [
                 str(loss.get("kind", "")),
-                format_bytes(number_in(loss, "bytes")),
+                MISSING if size is None else format_size(size),
                 MISSING if chunks is None else f"{chunks:.0f}",
                 _format_stretch(number_in(loss, "start_s"), number_in(loss, "end_s")),
             ]
@@ -289,8 +288,10 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         yield "undecided", f"{names}: {advice}", ""
     if diagnosis.unexplained is not None:
         rest = diagnosis.unexplained
-        told = [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest)]
-        yield "unexplained", "; ".join(filter(None, told)), rest.formula or ""
+        terms = list_terms(rest)
+        told = [describe_unexplained(rest), *terms, format_suggestion(rest)]
+        # A formula that is too long for a line is nothing that anybody reads.
+        yield "unexplained", "; ".join(filter(None, told)), (rest.formula or "") if terms else ""
     if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
         yield "beyond the effects", beyond, ""
     if diagnosis.unobservable_why:

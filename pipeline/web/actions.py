@@ -11,6 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 import msgspec
+import numpy as np
 import polars as pl
 
 from pipeline import results
@@ -26,7 +27,7 @@ from pipeline.estimation import (
     choose_input,
 )
 from pipeline.estimation.additions import explain_refusal, explain_refusals
-from pipeline.estimation.apportion import apportion
+from pipeline.estimation.apportion import apportion, find_half
 from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
 from pipeline.estimation.folds import errors_as_json, score
@@ -36,8 +37,8 @@ from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.problem import predict_at_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView
-from pipeline.results import SlipBudget, read_result
-from pipeline.run import MotionRun, load_motion_run
+from pipeline.results import RunDiagnosis, SlipBudget, list_excess, read_result
+from pipeline.run import HORIZON_S, MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest
 from pipeline.web import WorkbenchError
@@ -87,12 +88,14 @@ class Shown:
     Attributes:
         view: rows to draw.
         where: regions with most of its error, as text of `slip diagnose`.
+        largest: span with the largest part of its squared error over 2 s [s]; None without predictions.
         predict: function for its body velocities at times of aligned poses [s], shape (n, 3).
         apportion: function for its budgets by cause, given the length scale of the slip modulus [m].
     """
 
     view: MotionView
     where: list[str]
+    largest: tuple[float, float] | None
     predict: Callable[[Floats], Floats]
     apportion: Callable[[float], Sequence[SlipBudget]]
 
@@ -199,12 +202,12 @@ class PreparedRun:
             whole, comparison = self.problem.whole, self.problem.comparisons[0]
             residual = whole.find_residuals(state)
             regions = map_errors(whole, residual, whole.find_places())
+            steps = [read_result(step, results.Step) for step in ladder]
+            least = None if floor is None else read_result(floor, results.Errors)
+            view = self.stage.view(state, steps, least)
             return Shown(
-                view=self.stage.view(
-                    state,
-                    [read_result(step, results.Step) for step in ladder],
-                    None if floor is None else read_result(floor, results.Errors),
-                ),
+                view=view,
+                largest=_find_largest(view, steps[-1], least),
                 where=[describe_region(one) for one in pick_regions(regions, residual, whole.noise)],
                 predict=partial(predict_at_from, comparison, state.effects_of(0), state.timing[0]),
                 apportion=partial(self.apportion, model),
@@ -216,6 +219,22 @@ class PreparedRun:
             if self._second is None:
                 self._second = Problem([self.run], self.vehicle, self.problem.source)
             return self._second
+
+
+def _find_largest(
+    view: MotionView, last: results.Step, floor: results.Errors | None
+) -> tuple[float, float] | None:
+    """The span with the largest part of the squared error that is furthest above its noise floor."""
+    excess = list_excess(RunDiagnosis(ladder=(last,), noise_floor=floor))
+    is_heading = excess and max(excess, key=excess.__getitem__) == "r_mrmse_rad"
+    known = view.horizon_errors.select("t", error="model_yaw" if is_heading else "model")
+    known = known.filter(pl.col("error").is_finite())
+    if known.is_empty():
+        return None
+    # Predictions are numbered by the middle of their 2 s.
+    number = np.floor((known["t"].to_numpy() + 0.5 * HORIZON_S) / HORIZON_S).astype(np.int64)
+    start, end, _ = find_half(number, np.square(known["error"].to_numpy()))[1][0]
+    return start, end
 
 
 class RunCache:

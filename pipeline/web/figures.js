@@ -1,7 +1,8 @@
 // Figures as elements, and the rows of those that come and go.
 import { h } from "./parts.js";
 
-export const SIGNATURE = "signature";
+// Before the id of an effect: the figure with its signature.
+export const SIGNATURES = "signature-";
 
 // The effects whose signatures can be drawn: not those that are off, or neutral.
 export const listSignatures = (rows) => Object.keys(rows).filter((name) => name.startsWith("signature_"));

@@ -5,6 +5,7 @@ import { buildPlan } from "./plan.js";
 const REST_MS = 350;
 const FIRST_ROWS = 4;
 const CAUSE = ". Cause: ";
+const LONGEST = 70;
 
 // All anew, but what is open stays open, what has the focus keeps it, and nothing scrolls.
 export const buildModel = (pane) => {
@@ -27,19 +28,40 @@ export const buildModel = (pane) => {
     if (value) field.value = value;
     // What was added is no longer among the choices.
     if (field.selectedIndex < 0) field.selectedIndex = 0;
+    field.dispatchEvent(new Event("change"));
   }
   if (focus) model.querySelector(`[data-keep="${CSS.escape(focus)}"]`)?.focus({ preventScroll: true });
 };
+
+// What an effect does here, or its formula where it is one that anybody reads.
+export const nameEffect = (effect) => {
+  const formula = effect.formula.join("; ");
+  if (formula) return formula.length > LONGEST ? `A formula of ${effect.formula.join(" + ").split(/ [+−-] /).length} terms` : formula;
+  return (effect.sentence || effect.about).split(CAUSE)[0];
+};
+
+const lead = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
+
+// What is to be added next, within reach of a thumb wherever a narrow page is scrolled to.
+const buildReach = (pane, next) => {
+  const { session } = pane.state;
+  const fall = next && Math.min(...["t", "r"].map((key) => next.to[key] / session.errors[key] - 1));
+  pane.reach.replaceChildren(...(next
+    ? [h("span", {}, "Next: ", h("b", {}, nameEffect(next)), ` ${sayShare(fall)}`), h("button", { type: "button", class: "add", "aria-label": `add ${next.id} now`, onclick: () => addRow(pane, next) }, "Add")]
+    : [h("span", { class: session.done ? "done" : "" }, session.remains)]));
+};
+
+const addRow = (pane, row) => (row.named && row.formula.length ? pane.addFound() : pane.add(row.id));
 
 // Cards -----------------------------------------------------------------------------------------------------
 
 const buildCard = (pane, effect) => {
   const carries = effect.without_m !== null && !effect.off ? effect.without_m - pane.state.session.errors.t : null;
-  const [named, cause] = (effect.sentence || effect.about).split(CAUSE);
-  const words = effect.formula.length ? effect.formula.join("; ") : named;
+  const cause = effect.sentence.split(CAUSE)[1];
   const [turn, told] = effect.off ? ["Switch on", "switch it on again with its present values"] : ["Switch off", "switch it off without a new fit"];
   return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
-    h("b", { class: "name" }, words), h("p", { class: "quiet id" }, effect.id),
+    h("b", { class: "name" }, nameEffect(effect)), h("p", { class: "quiet id" }, effect.id),
+    !effect.formula.length && h("p", { class: "quiet about" }, lead(effect.about)),
     cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
     effect.refused && h("p", { class: "no-help", role: "note" }, `Not supported by the data: ${effect.refused}.`),
     effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
@@ -50,10 +72,11 @@ const buildCard = (pane, effect) => {
 };
 
 const buildSlider = (pane, effect, parameter) => {
-  const { name, unit, value, low, high, at_bound: atBound } = parameter;
+  const { name, unit, value, at_bound: atBound } = parameter;
   const label = `${effect.id}.${name}`;
   const words = (number) => setSquares(`${say(number, 4)} ${unit === "1" ? "" : unit}`.trim());
-  const shown = h("output", {}, words(value));
+  const unitSaid = unit === "1" ? "" : ` ${unit}`;
+  const shown = h("output", {}, parameter.said ? setSquares(`${parameter.said.replace("-", "−")}${unitSaid}`) : words(value));
   const input = h("input", {
     type: "range", min: String(parameter.from), max: String(parameter.to), step: String(parameter.step),
     value: String(value), "aria-label": `${label} [${unit}], ${parameter.about}`, "aria-valuetext": words(value), data: { keep: label },
@@ -71,9 +94,9 @@ const buildSlider = (pane, effect, parameter) => {
     pane.resting = { effect: effect.id, parameter: name, value: Number(input.value) };
     pane.rest = setTimeout(() => pane.settle().then(() => pane.redraw()), REST_MS);
   });
-  const span = low === null ? (parameter.undetermined ? "undetermined" : "") : `95 %: ${say(low, 4)} to ${say(high, 4)}`;
+  const span = parameter.ends.length ? `95 %: ${parameter.ends.join(" to ").replaceAll("-", "−")}` : parameter.undetermined ? "not determined by this run" : "";
   return h("div", { class: `slider${atBound ? " at-bound" : ""}` },
-    h("div", { class: "named-value" }, h("span", { title: label }, parameter.about), shown),
+    h("div", { class: "named-value" }, h("span", { title: label }, effect.formula.length ? name : parameter.about), shown),
     input,
     h("p", { class: "quiet" }, atBound ? h("b", { class: "bound" }, "at its bound") : span,
       h("button", { type: "button", class: "lock", "aria-pressed": String(parameter.locked), "aria-label": `hold ${label} fixed in fits`, title: parameter.locked ? "held fixed in fits; press to release it" : "hold this value fixed in fits", data: { keep: `lock ${label}` }, onclick: () => pane.act("lock", { effect: effect.id, parameter: name }) }, parameter.locked ? "held fixed" : "hold fixed")));
@@ -109,21 +132,23 @@ const holdStill = (pane, rows) => {
 };
 
 const buildNext = (pane) => {
+  pane.reach.replaceChildren();
   if (pane.state.run.refusal) return h("div", { class: "next" }, h("p", { class: "no-help" }, "No effect can be estimated: this run cannot show slip."));
   const { session, trial, catalogue, diagnosis, missing } = pane.state;
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
   const running = trial && !trial.done;
   const next = findNext(rows, running);
+  buildReach(pane, next);
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
-  const rest = diagnosis?.unexplained && !diagnosis.unexplained.formula ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
+  const rest = diagnosis?.unexplained && !diagnosis.unexplained.formula && !session.done ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row) => buildRow(pane, row, row === next);
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build)),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map(build))),
     missing.length > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, title: missing.join(", "), onclick: () => pane.addAll() }, `Add all ${missing.length} of the diagnosis`),
-    trial?.done && !next && h("p", { class: isAtFloor(session) ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
+    trial?.done && !next && h("p", { class: session.done ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     undecided, rest, buildPlan(pane),
@@ -131,38 +156,37 @@ const buildNext = (pane) => {
 };
 
 const buildRow = (pane, row, first) => {
-  const change = (key, words) => `${words(row.to[key])} (${sayShare(row.to[key] / pane.state.session.errors[key] - 1)})`;
-  const isFormula = row.formula.length > 0;
-  const words = isFormula ? row.formula.join("; ") : (row.sentence || row.about).split(CAUSE)[0];
-  const marks = [row.named && h("i", { class: "mark" }, isFormula ? "suggested by the diagnosis for what no effect explains" : row.about),
+  const change = (name, key, words) => {
+    const share = sayShare(row.to[key] / pane.state.session.errors[key] - 1);
+    return Number.parseInt(share.replace("−", ""), 10) === 0 ? `${name} unchanged` : `${name} to ${words(row.to[key])} (${share})`;
+  };
+  const about = row.named && row.formula.length ? "a formula that the diagnosis suggests for what no effect explains" : row.about;
+  const marks = [row.named && h("i", { class: "mark" }, "diagnosis"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id, ...(row.named && { named: "" }) }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },
     h("div", {},
       first && h("span", { class: "quiet" }, "Next"),
-      h("b", { title: row.sentence || row.about }, words), h("span", { class: "quiet id" }, row.id),
-      h("span", { class: "quiet falls" }, `position to ${change("t", sayLength)}, heading to ${change("r", sayAngle)}`),
+      h("b", {}, nameEffect(row)), h("span", { class: "quiet id" }, row.id),
+      row.sentence || row.formula.length ? h("span", { class: "quiet about" }, lead(about)) : null,
+      h("span", { class: "falls" }, `${change("position", "t", sayLength)}, ${change("heading", "r", sayAngle)}`),
       marks.length > 0 && h("span", { class: "marks" }, marks)),
-    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, title: row.about, data: { keep: `add ${row.id}` }, onclick: () => (row.named && isFormula ? pane.addFound() : pane.add(row.id)) }, "Add"));
+    h("button", { type: "button", class: "add", "aria-label": `add ${row.id}`, data: { keep: `add ${row.id}` }, onclick: () => addRow(pane, row) }, "Add"));
 };
-
-// The larger error in times the noise floor.
-const findRoom = (session) => (session.floor ? Math.max(...["t", "r"].map((key) => session.errors[key] / session.floor[key])) : Infinity);
-const isAtFloor = (session) => findRoom(session) < 1.5;
 
 const tellNothing = (session, diagnosis) => {
   if ((diagnosis?.findings ?? []).some((finding) => finding.id === "little_driving")) return "No effect is identified: the run is too short.";
-  const room = findRoom(session);
-  if (isAtFloor(session)) return "No effect is missing: the remaining error is at the noise floor.";
-  const remain = `${sayLength(session.errors.t)} and ${sayAngle(session.errors.r)} remain${Number.isFinite(room) ? `, ${room.toFixed(1)} times the noise floor` : ""}`;
-  return `${remain}. No further effect of the catalogue reduces the error: look at the residual, or write the effect as a formula.`;
+  if (session.done) return "Nothing is left to add.";
+  return "No other effect of the catalogue lowers the error: look where it is largest, or write the effect as a formula.";
 };
 
 // Chosen and said apart: with keys one passes every entry of a list.
 const buildCatalogue = (pane, entries) => {
-  const chosen = h("select", { "aria-label": "Any effect of the catalogue", class: "catalogue", data: { keep: "catalogue", field: "catalogue" } }, h("option", { value: "" }, "any other effect …"),
-    entries.map((entry) => h("option", { value: entry.id, title: entry.about }, entry.id)));
+  const about = h("p", { class: "quiet about" });
+  const tell = () => (about.textContent = chosen.value ? lead(entries.find(({ id }) => id === chosen.value).about) : "");
+  const chosen = h("select", { "aria-label": "Any effect of the catalogue", class: "catalogue", data: { keep: "catalogue", field: "catalogue" }, onchange: tell }, h("option", { value: "" }, "any other effect …"),
+    entries.map((entry) => h("option", { value: entry.id }, entry.id)));
   const add = h("button", { type: "button", class: "add-chosen", "aria-label": "add the chosen effect", onclick: () => chosen.value && pane.add(chosen.value) }, "Add");
-  return h("div", { class: "any" }, chosen, add);
+  return h("div", { class: "any" }, chosen, add, about);
 };
 
 const buildFormula = (pane) => {

@@ -1,8 +1,8 @@
 // Dropped logs, one pane or two; what is open stands in the address, so that a reload brings it back.
 import { drawDifference, repaintDifference, showDifference } from "./difference.js";
 import { Pane } from "./pane.js";
-import { get, h, post, toast, upload } from "./parts.js";
-import { buildRivals, listRivals, sortBySoundness } from "./runs.js";
+import { get, h, post, toast, untoast, upload } from "./parts.js";
+import { buildRivals, listRivals, sortByAge } from "./runs.js";
 
 // A notice of what went well goes away by itself.
 const NOTICE_MS = 8000;
@@ -83,6 +83,8 @@ const arrange = (two) => {
   drawDifference(find("apart"), panes.a, panes.b);
   // What is marked in one is marked in the other, as long as both show the same run.
   const other = { a: "b", b: "a" };
+  for (const pane of Object.values(panes))
+    if (pane) pane.pointed = (t) => panes[other[pane.slot]]?.run === pane.run && panes[other[pane.slot]].cursor.show(t, { told: false });
   for (const pane of Object.values(panes))
     if (pane) pane.marked = (spans) => panes[other[pane.slot]]?.run === pane.run && panes[other[pane.slot]].marks.follow(spans);
   if (!listed.runs.length) return;
@@ -216,7 +218,10 @@ addEventListener("dragleave", (event) => event.relatedTarget === null && documen
 // Beginning --------------------------------------------------------------------------------------------------
 
 addEventListener("keydown", (event) => {
-  if (event.key === "Escape") Object.values(panes).forEach((pane) => pane?.marks.leave());
+  if (event.key === "Escape") {
+    untoast();
+    Object.values(panes).forEach((pane) => pane?.marks.leave());
+  }
   if ((event.ctrlKey || event.metaKey) && event.key === "z" && !/INPUT|SELECT|TEXTAREA/.test(document.activeElement.tagName)) {
     event.preventDefault();
     panes[panes.b ? aimed : "a"]?.act(event.shiftKey ? "redo" : "undo");
@@ -244,11 +249,11 @@ const openAddress = async () => {
   const kept = address();
   arrange(kept.has("b"));
   const known = (run) => run && listed.runs.some((entry) => entry.run === run);
-  // Unless one was asked for, the soundest run opens, and of these the one with the most slip.
-  const soundest = sortBySoundness(listed.runs);
+  // Unless one was asked for, the run that was analyzed last opens.
+  const newest = sortByAge(listed.runs);
   let first = known(kept.get("a")) ? kept.get("a") : null;
   if (first) await panes.a.open(first);
-  else for (const { run } of soundest.slice(0, 3)) if (await panes.a.open((first = run))) break;
+  else for (const { run } of newest.slice(0, 3)) if (await panes.a.open((first = run))) break;
   if (panes.b && first) await panes.b.open(known(kept.get("b")) ? kept.get("b") : first);
 };
 

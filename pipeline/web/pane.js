@@ -1,14 +1,14 @@
 // One session: its numbers, its figures, and beside them its model.
-import { EMPTY, SIGNATURE, buildFigure, flatten, listSignatures, working } from "./figures.js";
-import { buildModel } from "./model.js";
-import { h, inAngle, inLength, post, runTo, sayAngle, sayDuration, sayLength, sayShare, toast } from "./parts.js";
+import { EMPTY, SIGNATURES, buildFigure, flatten, listSignatures, working } from "./figures.js";
+import { buildModel, nameEffect } from "./model.js";
+import { h, inAngle, inLength, post, runTo, sayAngle, sayDuration, sayLength, sayShare, toast, untoast } from "./parts.js";
 import { buildRuns } from "./runs.js";
 import { Tabs, TABS } from "./tabs.js";
 
 const WAIT_MS = 60;
 const HEADROOM = 1.05;
-// An error within a quarter of what the localization itself scatters by cannot fall by much more.
-const AT_FLOOR = 1.25;
+// A change that rounds to nothing.
+const NOTHING = 0.005;
 
 export class Pane {
   constructor(slot, changed, working) {
@@ -24,12 +24,15 @@ export class Pane {
     this.glance = h("section", { class: "glance", "aria-label": "Error of the model" });
     this.model = h("section", { class: "model", "aria-label": "Model" });
     this.first = h("section", { class: "first-view", "aria-label": "Measured and modelled" });
+    this.reach = h("section", { class: "reach", "aria-label": "Next effect" });
     this.marks = this.buildMarks();
+    this.cursorBar = h("div", { class: "cursor" });
+    this.cursor = slipCursor(this.cursorBar, { moved: (t) => this.pointed?.(t) });
     this.stretch = 0;
     this.tabs = new Tabs(slot, (name) => this.openTab(name));
     this.tabs.panels.runs.append(...buildRuns(this));
     this.tabs.panels.where.prepend(this.whereSaid = h("p", { class: "where" }), this.marking);
-    this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.glance, this.model, this.first, this.tabs.root);
+    this.root = h("article", { class: "pane", data: { slot } }, this.hero, this.glance, this.model, this.first, this.tabs.root, this.reach);
   }
 
   grid(tab) {
@@ -64,6 +67,8 @@ export class Pane {
 
   async ask(action, more = {}) {
     const run = more.run ?? this.run;
+    // What was said of the step before does not stand over this one.
+    untoast();
     this.busy(true);
     try {
       const input = more.input ?? this.state?.session.input ?? null;
@@ -123,7 +128,8 @@ export class Pane {
     this.signatures = [];
     this.loaded = new Set();
     this.stretch = 0;
-    for (const part of [this.glance, this.model, this.first, ...Object.values(this.tabs.grids)]) part.replaceChildren();
+    this.cursor.stop();
+    for (const part of [this.glance, this.model, this.first, this.reach, ...Object.values(this.tabs.grids)]) part.replaceChildren();
     this.hero.replaceChildren(h("h2", {}, run), h("p", { class: "lead waiting", role: "status" }, "preparing the run …"), working());
   }
 
@@ -177,6 +183,7 @@ export class Pane {
           h("div", { class: "track", role: "img" }, h("i", { class: "now" }), h("i", { class: "floor" }), h("i", { class: "ceiling" })),
           h("p", { class: "ends" }, h("span", { class: "floor-said" }), h("span", { class: "ideal-said" }))),
         h("div", { class: "steps" }, tool("undo", "Undo", () => this.act("undo")), tool("redo", "Redo", () => this.act("redo")))),
+      h("p", { class: "end", role: "status" }),
       h("p", { class: "said", role: "status" }));
   }
 
@@ -207,14 +214,15 @@ export class Pane {
       place.querySelector("small").textContent = unit === "°" ? unit : ` ${unit}`;
       const fall = ideal[key] ? errors[key] / ideal[key] - 1 : 0;
       const last = before && before[key] ? errors[key] / before[key] - 1 : 0;
-      const shown = Math.abs(last) >= 0.005 && Math.abs(last - fall) >= 0.005;
-      place.querySelector(".fall").textContent = Math.abs(fall) < 0.005 ? "the ideal model" : `ideal ${words[key](ideal[key])}, ${sayShare(fall)}`;
-      place.querySelector(".now-said").textContent = shown ? `last step ${sayShare(last)}` : "";
-      place.classList.toggle("fallen", fall < -0.005);
-      place.classList.toggle("risen", fall > 0.005);
+      const isFirst = Math.abs(last - fall) < NOTHING;
+      const still = effects.length ? "unchanged" : "the ideal model";
+      place.querySelector(".fall").textContent = Math.abs(fall) < NOTHING ? still : `ideal ${words[key](ideal[key])}, ${sayShare(fall)}`;
+      place.querySelector(".now-said").textContent = !before || isFirst ? "" : `last step ${Math.abs(last) < NOTHING ? "unchanged" : sayShare(last)}`;
+      place.classList.toggle("fallen", fall < -NOTHING);
+      place.classList.toggle("risen", fall > NOTHING);
       // Below the noise floor, or by an effect that does not help, nothing was gained.
-      place.classList.toggle("gained", last < -0.005 && helps && !(floor && before[key] <= floor[key]));
-      place.classList.toggle("lost", last > 0.005);
+      place.classList.toggle("gained", last < -NOTHING && helps && !(floor && before[key] <= floor[key]));
+      place.classList.toggle("lost", last > NOTHING);
     }
     const most = Math.max(ideal.t, errors.t) * HEADROOM;
     const track = this.glance.querySelector(".track");
@@ -222,10 +230,34 @@ export class Pane {
     track.style.setProperty("--floor", floor ? floor.t / most : 0);
     track.style.setProperty("--ideal", ideal.t / most);
     track.setAttribute("aria-label", `position error ${sayLength(errors.t)} of ${sayLength(ideal.t)} for the ideal model${floor ? `, noise floor ${sayLength(floor.t)}` : ""}`);
-    const reached = floor && errors.t <= floor.t * AT_FLOOR;
-    this.glance.querySelector(".floor-said").textContent = floor ? `noise floor ${sayLength(floor.t)}${reached ? ": reached" : ""}` : "";
+    this.glance.querySelector(".floor-said").textContent = floor ? `noise floor ${sayLength(floor.t)}` : "";
+    this.sayEnd(session);
     this.glance.querySelector(".ideal-said").textContent =
       `ideal model ${sayLength(ideal.t)}${byHand ? " · set by hand, not fitted" : ""}`;
+  }
+
+  // What remains, and where to look; green only at the noise floor.
+  sayEnd({ done, remains }) {
+    const place = this.glance.querySelector(".end");
+    place.classList.toggle("done", done);
+    const span = done ? null : this.largest;
+    place.replaceChildren(remains, ...(span ? [`; largest from ${span.map(Math.round).join(" to ")} s: `, h("button", { type: "button", class: "look", data: { keep: "look" }, onclick: () => this.look(span) }, "look")] : []));
+  }
+
+  // The half minute that holds a span, drawn large, with the span marked and the cursor at its beginning.
+  async look([from, to]) {
+    const middle = (from + to) / 2;
+    const place = this.spans.findIndex(([start, end]) => middle >= start && middle <= end);
+    if (place >= 0 && place !== this.stretch) await this.showStretch(place);
+    this.marks.mark(from, to);
+    this.cursor.show(from);
+    this.first.scrollIntoView({ block: "nearest" });
+  }
+
+  async showStretch(place) {
+    this.stretch = place;
+    this.loaded.delete("first");
+    await this.load("first");
   }
 
   async switchInput(name) {
@@ -367,13 +399,15 @@ export class Pane {
     Object.assign(this.album.figures, album.figures);
     Object.assign(this.album.rows, album.rows);
     this.album.dark = album.dark;
-    this.plots ??= slipPlots(this.album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf });
+    this.plots ??= slipPlots(this.album, { strict: true, own: this.marks.own, zoomOf: this.marks.zoomOf, drawn: () => this.cursor.refresh() });
     for (const { id } of album.shown) this.plots.forget(id);
     if (tab === "effects") this.signatures = listSignatures(album.rows);
-    this.tellWhere(album.where);
-    const nodes = album.shown.map(buildFigure);
+    this.tellWhere(album);
+    const nodes = album.shown.map((figure) => this.buildNode(figure));
     grid.replaceChildren(...(tab === "first" ? [this.buildStretch(album.stretch)] : []), ...nodes, ...(nodes.length ? [] : [h("p", { class: "quiet" }, EMPTY[tab] ?? "Nothing to draw on this run.")]));
     const places = nodes.map((node) => node.querySelector(".plot"));
+    if (tab === "first" && album.stretch) this.cursor.setSpan(album.stretch.from, album.stretch.to);
+    this.cursor.join(this.plots, places);
     this.marks.join(this.album, this.plots, () => this.paintAnew(), places);
     for (const place of places) {
       if (turn !== this.turn) return;
@@ -384,16 +418,15 @@ export class Pane {
   // The stretch that is drawn large: the one in which the ideal model is worst first.
   buildStretch(stretch) {
     if (!stretch) return h("p", { class: "quiet" }, "The run is too short for two-second predictions.");
-    const { place, count, from, to } = stretch;
-    const go = (by) => async () => {
-      this.stretch = (place + by + count) % count;
-      this.loaded.delete("first");
-      await this.load("first");
-    };
+    const { place, spans, from, to } = stretch;
+    const count = spans.length;
+    this.spans = spans;
+    const go = (by) => () => this.showStretch((place + by + count) % count);
     const button = (by, text, title) => h("button", { type: "button", class: by < 0 ? "stretch-back" : "stretch-on", title, "aria-label": title, disabled: count < 2, onclick: go(by) }, text);
-    return h("p", { class: "stretch-said" },
+    return h("div", { class: "stretch-said" },
       h("span", {}, `${Math.round(from)} to ${Math.round(to)} s: ${place ? `number ${place + 1} of ${count} by error` : `the worst ${Math.round(to - from)} s${count > 1 ? ` of ${count} stretches` : ""}`}`),
-      button(-1, "‹", "the stretch before it in the order of error"), button(1, "›", "the next stretch in the order of error"));
+      button(-1, "‹", "the stretch before it in the order of error"), button(1, "›", "the next stretch in the order of error"),
+      this.cursorBar);
   }
 
   async openTab(name) {
@@ -422,38 +455,50 @@ export class Pane {
     this.tabs.panels.compare.replaceChildren(...(this.buildRivals?.() ?? []));
   }
 
-  // Panels came or went with their effects: that figure alone is put in, out, or in the place of the old one.
+  // The signature of an effect is called as its card is.
+  buildNode(figure) {
+    const effect = this.state?.session.effects.find(({ id }) => figure.id === SIGNATURES + id);
+    return buildFigure(effect ? { ...figure, title: nameEffect(effect) } : figure);
+  }
+
+  // Effects came or went, and their signatures with them.
   async renewSignatures(turn) {
     const album = await post("/api/figures", { ...this.request, tab: "effects" });
     if (turn !== this.turn) return;
     const grid = this.grid("effects");
-    grid.querySelector(`figure[data-id="${SIGNATURE}"]`)?.remove();
-    this.plots.forget(SIGNATURE);
+    for (const node of grid.querySelectorAll(`figure[data-id^="${SIGNATURES}"]`)) {
+      this.plots.forget(node.dataset.id);
+      node.remove();
+    }
     Object.assign(this.album.figures, album.figures);
     Object.assign(this.album.rows, album.rows);
     this.signatures = listSignatures(album.rows);
-    const at = album.shown.findIndex(({ id }) => id === SIGNATURE);
-    if (at < 0) return;
-    const node = buildFigure(album.shown[at]);
-    grid.append(node);
-    const place = node.querySelector(".plot");
-    if (place.clientWidth) await this.plots.draw(place);
+    for (const figure of album.shown.filter(({ id }) => id.startsWith(SIGNATURES))) {
+      const node = this.buildNode(figure);
+      grid.append(node);
+      const place = node.querySelector(".plot");
+      if (place.clientWidth) await this.plots.draw(place);
+    }
   }
 
-  tellWhere(regions) {
+  tellWhere({ where: regions, largest }) {
+    this.largest = largest;
+    if (this.state) this.sayEnd(this.state.session);
     this.whereSaid.textContent = regions.length
       ? `Where: ${regions.slice(0, 2).join("; ")}`
       : "Where: the error is spread evenly over the run.";
   }
 
   // What another model moves: rows of the figures, where it fails, what the figures say to those who hear them.
-  async take({ rows, where, words }) {
-    this.tellWhere(where);
+  async take(answer) {
+    const { rows, words } = answer;
+    this.tellWhere(answer);
     for (const [id, text] of Object.entries(words)) this.root.querySelector(`[data-figure=${id}]`)?.setAttribute("aria-label", text);
     // Words are seen before the figures are drawn.
     await new Promise((done) => setTimeout(done));
     const idle = this.signatures.filter((name) => !(name in rows)).map((name) => [name, flatten(this.plots.rowsOf(name))]);
     await this.plots?.feed({ ...rows, ...Object.fromEntries(idle) });
+    this.cursor.renew();
     this.moved?.();
   }
 

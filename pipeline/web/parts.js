@@ -19,9 +19,11 @@ export const h = (tag, props = {}, ...children) => {
   return node;
 };
 
+export const untoast = () => (document.getElementById("toast").hidden = true);
+
 export const toast = (text, word, action) => {
   const place = document.getElementById("toast");
-  place.replaceChildren(text);
+  place.replaceChildren(h("span", {}, text));
   if (action)
     place.append(
       " ",
@@ -30,9 +32,10 @@ export const toast = (text, word, action) => {
         action();
       } }, word),
     );
+  place.append(" ", h("button", { type: "button", class: "drop", title: "close this notice", "aria-label": "close this notice", onclick: untoast }, "×"));
   place.hidden = false;
   clearTimeout(toast.timer);
-  toast.timer = setTimeout(() => (place.hidden = true), 9000);
+  toast.timer = setTimeout(untoast, 9000);
 };
 
 const read = async (answer) => {
@@ -69,7 +72,8 @@ export const say = (value, digits = 3) => {
 // Metres and radians as people read them: the text, and its unit.
 export const inLength = (metres) => (Math.abs(metres) >= 1 ? { factor: 1, unit: "m" } : { factor: 100, unit: "cm" });
 export const inAngle = () => ({ factor: 180 / Math.PI, unit: "°" });
-const sayIn = (value, { factor, unit }, gap) => (Number.isFinite(value) ? `${say(value * factor)}${gap}${unit}` : "–");
+// Two digits in words, as on the screen; three in the large numbers, so that one sees them move.
+const sayIn = (value, { factor, unit }, gap) => (Number.isFinite(value) ? `${say(value * factor, Math.abs(value * factor) >= 1 && unit === "m" ? 3 : 2)}${gap}${unit}` : "–");
 export const sayLength = (metres) => sayIn(metres, inLength(metres), "\u00a0");
 export const sayAngle = (radians) => sayIn(radians, inAngle(), "");
 

@@ -2,11 +2,12 @@
 import { h, say, sayDuration } from "./parts.js";
 
 const ORDERS = {
+  newest: (a, b) => b.analyzed_s - a.analyzed_s || a.run.localeCompare(b.run),
   slip: (a, b) => (b.median_modulus ?? -1) - (a.median_modulus ?? -1),
   name: (a, b) => a.run.localeCompare(b.run),
   length: (a, b) => (b.duration_s ?? 0) - (a.duration_s ?? 0),
 };
-const ORDER_WORDS = { slip: "most slip first", name: "by name", length: "longest first" };
+const ORDER_WORDS = { newest: "analyzed last first", slip: "most slip first", name: "by name", length: "longest first" };
 
 // How far a run cannot be trusted: the number of losses and warnings; infinite where it allows no conclusions.
 const doubt = (run) => {
@@ -14,7 +15,9 @@ const doubt = (run) => {
   return count("error") || !Number.isFinite(run.median_modulus) ? Infinity : run.losses.length + count("warning");
 };
 
-export const sortBySoundness = (runs) => [...runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
+export const sortByAge = (runs) => [...runs].sort(ORDERS.newest);
+
+const sortBySoundness = (runs) => [...runs].sort((a, b) => doubt(a) - doubt(b) || ORDERS.slip(a, b));
 
 const sayHealth = (run) => {
   const told = [run.losses.length && "losses", run.findings.some((finding) => finding.severity === "error") && "no conclusions"].filter(Boolean).join(", ");

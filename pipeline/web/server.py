@@ -230,7 +230,7 @@ _SCRIPTS = {
         "difference",
         "live",
     ),
-    "pipeline.report": ("marks", "plots"),
+    "pipeline.report": ("cursor", "marks", "plots"),
 }
 
 # The report contains its own policy: it may run its own scripts, and access nothing else.

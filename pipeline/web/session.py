@@ -12,7 +12,8 @@ from pathlib import Path
 
 import msgspec
 
-from pipeline.core import naming_os_errors, read_bounded
+from pipeline import results
+from pipeline.core import naming_os_errors, read_bounded, split_interval
 from pipeline.models import (
     CHANNELS,
     Effect,
@@ -28,9 +29,11 @@ from pipeline.models import (
     refuse_taken,
     stands_at_bound,
 )
+from pipeline.results import read_result
 from pipeline.sources import Vehicle
 from pipeline.store import locate_beside, make_folder, replace_file
 from pipeline.web import WorkbenchError
+from pipeline.words.errors import describe_end
 
 SLOTS = ("a", "b")
 
@@ -204,11 +207,15 @@ def show_session(session: Session, file: ModelFile) -> dict[str, object]:
     """
     step = session.step
     before = session.steps[session.at - 1] if session.at > 0 else None
+    floor = read_result(session.floor, results.Errors) if session.floor else None
+    done, remains = describe_end(read_result(step.ladder[-1], results.Step), floor)
     return {
         "run": session.run,
         "input": session.input,
         "said": step.said,
         "by_hand": step.by_hand,
+        "done": done,
+        "remains": remains,
         "ideal": _errors(step.ladder[0]),
         "errors": _errors(step.ladder[-1]),
         "before": _errors(before.ladder[-1]) if before is not None and before.ladder else None,
@@ -260,7 +267,7 @@ def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
 def summarize_effect(effect: Effect | type[Effect]) -> str:
     """The first sentence of an effect's page, without its name."""
     if isinstance(effect, FormulaEffect):
-        return "a formula of your own"
+        return "a formula"
     title = effect.find_page().splitlines()[0]
     return title.split(": ", 1)[-1].rstrip(".")
 
@@ -271,11 +278,15 @@ def _show_parameter(
     value = effect.values[parameter.name]
     low, high = find_range(parameter, value)
     interval = file.intervals.get(f"{effect.id}.{parameter.name}")
+    # With the digits that the interval supports, as on the screen.
+    said, *ends = split_interval(value, *interval) if interval else ("",)
     return {
         "name": parameter.name,
         "unit": parameter.unit,
         "about": parameter.about,
         "value": value,
+        "said": said,
+        "ends": ends,
         "low": interval[0] if interval else None,
         "high": interval[1] if interval else None,
         "from": low,

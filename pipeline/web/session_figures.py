@@ -65,6 +65,7 @@ class FigureCache:
             "rows": share_rows(one.drawing for _, one in pictures),
             "dark": dict(theme.DARK_TWINS),
             "where": shown.where,
+            "largest": shown.largest,
             "stretch": _show_stretch(scene),
             "tabs": TABS,
             "shown": [
@@ -88,7 +89,8 @@ class FigureCache:
         if scene.track is not None:
             rows["track"] = scene.track.frame
         words = {name: format_words(scene) for name, format_words in _COLOURED.items()}
-        return {"rows": pack_rows(rows), "where": shown.where, "words": words}
+        told = {"where": shown.where, "largest": shown.largest, "words": words}
+        return {"rows": pack_rows(rows), **told}
 
     def _scene(self, shown: Shown, stretch: int, *, with_budget: bool = False) -> Scene:
         """Data of the figures of the run, with the input of the model."""
@@ -122,9 +124,9 @@ def _list_ids(tab: str) -> Collection[str]:
 
 
 def _show_stretch(scene: Scene) -> dict[str, object] | None:
-    """Index and times of the enlarged stretch, and the number of stretches."""
+    """Index and times of the enlarged stretch, and the times of all stretches."""
     if scene.stretch is None:
         return None
+    spans = scene.stretches
     start, end = scene.stretch
-    count = len(scene.stretches)
-    return {"place": scene.stretch_number % count, "count": count, "from": start, "to": end}
+    return {"place": scene.stretch_number % len(spans), "spans": spans, "from": start, "to": end}

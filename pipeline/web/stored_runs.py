@@ -30,7 +30,7 @@ from pipeline.estimation.stored_diagnosis import (
 )
 from pipeline.report.drive_pages import PREVIEW, leave_plan, locate_plan, read_preview
 from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_result
-from pipeline.store import DIAGNOSIS, UPLOADS, Manifest, Store, hold_lock
+from pipeline.store import DIAGNOSIS, MANIFEST, UPLOADS, Manifest, Store, hold_lock
 from pipeline.web import Limits, WorkbenchError
 
 _LONGEST = 500
@@ -64,6 +64,7 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
     log = mapping_in(summary, "log")
     return {
         "run": manifest.run,
+        "analyzed_s": _find_age(manifest),
         **{key: _cut(summary.get(key)) for key in _KEYS},
         "sha256": _cut(log.get("sha256")),
         "duration_s": _cut(log.get("duration_s")),
@@ -73,6 +74,14 @@ def summarize_run(manifest: Manifest) -> dict[str, object]:
         "refusal": _cut(find_refusal(read_findings(summary))),
         "report": "report.html" in manifest.files,
     }
+
+
+def _find_age(manifest: Manifest) -> float:
+    """When the results of a run were written [s]; 0 if that is not known."""
+    try:
+        return (manifest.folder.parent / MANIFEST).stat().st_mtime
+    except OSError:
+        return 0.0
 
 
 def _cut_all(of: Mapping[str, object], name: str, keys: tuple[str, ...]) -> list[dict[str, object]]:

@@ -103,7 +103,7 @@ class _Part:
         verdicts = [judge_pair(row) for row in self.pairs.values()]
         decided = [verdict for verdict in verdicts if verdict != UNTESTED]
         if not decided:
-            return "no pair can be tested" if verdicts else "nothing to compare it with"
+            return "no pair can be tested"
         if OF_TWO_RUNS in decided and DIFFERENT not in decided:
             return (
                 f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs only"
@@ -241,7 +241,7 @@ def _find_extremes(part: _Part) -> tuple[str, str] | None:
 def _describe_driven(part: _Part, labels: Mapping[str, str]) -> str:
     (first, largest), *others = part.levels
     if not others:
-        return f"{labels[first]} {_format_two(largest)} m/s; {part.count()}"
+        return f"{labels[first]} {_format_two(largest)} m/s"
     hard = [first, *(name for name, value in others[:-1] if value >= (1.0 - _AS_HARD) * largest)]
     values = dict(part.levels)
     numbers = [f"{labels[name]} ({_format_two(values[name])}{' m/s' * (name == first)})" for name in hard]

@@ -10,7 +10,6 @@ from itertools import pairwise
 from pipeline.core import (
     INPUT_WORDS,
     format_angle,
-    format_length,
     format_part,
     format_share,
     mark_finding,
@@ -58,6 +57,7 @@ from pipeline.words.errors import (
     describe_need,
     describe_regions,
     describe_unexplained,
+    format_fall,
     format_remaining_error,
     format_step,
 )
@@ -188,7 +188,11 @@ def _format_largest_fall(before: Step, after: Step) -> str:
     """The error over 2 s that falls most, before and after a step."""
     shares = {key: getattr(after, key) / old for key in ERRORS_OVER_2S if (old := getattr(before, key)) > 0.0}
     largest = min(shares, key=shares.__getitem__, default=None)
-    return "" if largest is None else _format_fall(before, after, largest) or _UNCHANGED
+    return (
+        ""
+        if largest is None
+        else format_fall(getattr(before, largest), getattr(after, largest), largest) or _UNCHANGED
+    )
 
 
 def _list_rest(run: RunDiagnosis) -> list[str]:
@@ -435,26 +439,16 @@ def _list_falls(run: RunDiagnosis) -> dict[str, str]:
     """Changes of the errors at the ladder step of each effect, and by how much one of them rises."""
     falls: dict[str, str] = {}
     for before, after in pairwise(run.ladder):
-        falling = [text for key in ERRORS_OVER_2S if (text := _format_fall(before, after, key)) is not None]
+        falling = [
+            text
+            for key in ERRORS_OVER_2S
+            if (text := format_fall(getattr(before, key), getattr(after, key), key)) is not None
+        ]
         visible, rises = ", ".join(filter(None, falling)), format_rises(before, after, CHANCE)
         text = f"{visible} ({rises})" if visible and rises else visible or rises
         for name in list_added(before, after):
             falls[name] = text or (_UNCHANGED if falling else "")
     return falls
-
-
-def _format_fall(before: Step, after: Step, key: str) -> str | None:
-    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
-    old, new = getattr(before, key), getattr(after, key)
-    if not math.isfinite(old + new):
-        return None
-    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
-    texts = [render(value) for value in (old, new)]
-    if texts[0] == texts[1]:
-        return ""
-    (number, unit), (_, other) = (text.split() for text in texts)
-    same = unit.rstrip("s") == other.rstrip("s")
-    return f"{number if same else texts[0]} -> {texts[1]}"
 
 
 def _format_unobservable(run: RunDiagnosis) -> list[str]:

@@ -7,18 +7,26 @@ from typing import TYPE_CHECKING
 
 from pipeline.core import (
     enumerate_texts,
+    format_angle,
     format_digits,
     format_errors,
     format_length,
     format_share,
 )
-from pipeline.results import ABOVE_FLOOR, BREVITY, INTERVAL_SHARE
+from pipeline.results import (
+    ABOVE_FLOOR,
+    BREVITY,
+    ERRORS_OVER_2S,
+    INTERVAL_SHARE,
+    RunDiagnosis,
+    list_excess,
+)
 from pipeline.run import HORIZON_S
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.results import Errors, Moments, Region, RunDiagnosis, Span, Unexplained
+    from pipeline.results import Errors, Moments, Region, Span, Step, Unexplained
 
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
 REGIONS = {
@@ -112,6 +120,38 @@ def format_excess(ratio: float) -> str:
     """A remaining error in times the noise floor: `at`, `1.6 times`."""
     text = format_digits(ratio)
     return f"{text} times" if float(text) >= _KNOWN_TO else "at"
+
+
+def format_fall(old: float, new: float, key: str) -> str | None:
+    """`1.73 -> 1.2 m`, with both units where they differ; empty where both texts agree, None if unknown."""
+    if not math.isfinite(old + new):
+        return None
+    render = format_length if ERRORS_OVER_2S[key][1] == "m" else format_angle
+    texts = [render(value) for value in (old, new)]
+    if texts[0] == texts[1]:
+        return ""
+    (number, unit), (_, other) = (text.split() for text in texts)
+    same = unit.rstrip("s") == other.rstrip("s")
+    return f"{number if same else texts[0]} -> {texts[1]}"
+
+
+def describe_end(last: Step, floor: Errors | None) -> tuple[bool, str]:
+    """Whether a model is done, and what remains with it, in one clause.
+
+    Args:
+        last: the model's errors.
+        floor: the noise floor; None if unknown.
+    """
+    excess = list_excess(RunDiagnosis(ladder=(last,), noise_floor=floor))
+    if not excess:
+        return False, f"{format_step(last)} remain; the noise floor of this run is not known"
+    most = max(excess, key=excess.__getitem__)
+    times = format_excess(excess[most])
+    if times == "at":
+        return True, "Done: at the noise floor"
+    of, unit = ERRORS_OVER_2S[most]
+    size = (format_length if unit == "m" else format_angle)(getattr(last, most))
+    return False, f"{size}{'' if unit == 'm' else f' in {of}'} remain, {times} the noise floor"
 
 
 def format_remaining_error(error_m: float, floor_m: float, explained: float) -> str:
@@ -208,13 +248,16 @@ def describe_need(run: RunDiagnosis) -> str:
     verb = "is" if known == 1 else "are"
     who = need.known[0] if known == count == 1 else f"{known} of {count} parameters"
     sentences = [f"{who} {verb} known within {_GOAL}"]
+    if known == 0 and count == 1:
+        sentences = [f"the one parameter is not known within {_GOAL}"]
     if known == count:
         sentences[0] += f", after {need.since_s:.0f} s of {need.driven_s:.0f} s"
+    others = "the others" if known else "it" if count == 1 else "them"
     if need.vague and not is_brief:
         sentences.append(
             f"{need.minutes} more minute{'s' * (need.minutes > 1)} of such driving for {_GOAL} of all"
             if need.minutes
-            else "more such driving does not narrow the others"
+            else f"more such driving does not narrow {others}"
         )
     if need.idle_share >= _LEAST_SHOWN and not is_brief:
         text = f"the last {format_share(need.idle_share)} of the drive"

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import re
 from typing import TYPE_CHECKING
 
-from pipeline.core import format_digits, format_length, format_share, split_interval
+from pipeline.core import format_angle, format_digits, format_length, format_share, number_in, split_interval
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer
 from pipeline.models import AT_BOUND, UNDETERMINED
-from pipeline.results import ERRORS_OVER_2S, format_rises
+from pipeline.results import CHANCE, ERRORS_OVER_2S, format_rises
+from pipeline.words.errors import format_fall
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -20,7 +22,9 @@ if TYPE_CHECKING:
     from pipeline.run import MotionRun
 
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
-_UNITS = ("m/s", "m/s", "deg/s", "m, 2 s", "deg, 2 s")
+_UNITS = ("m/s", "m/s", "deg/s", "over 2 s", "over 2 s")
+_WIDTH = 10
+"""Columns of an error, with a space before it."""
 
 
 def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
@@ -32,7 +36,7 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
         added = ", ".join(name for name in step.effects if name not in below.effects)
         removed = "" if share is None else f"{format_share(share, 0):>9}"
         lines.append(f"{'ideal' if number == 0 else f'+ {added}':<30}{_columns(step.errors)}{removed}")
-        rises = format_rises(below.errors, step.errors)
+        rises = format_rises(below.errors, step.errors, CHANCE)
         lines += [f"  ! {rises}"] if rises else []
     if floor is not None:
         lines.append(f"{'noise floor (estimated)':<30}{_columns(floor)}")
@@ -45,11 +49,13 @@ def format_ladder(ladder: Ladder, floor: Errors | None = None) -> list[str]:
 def describe_step(before: LadderStep, after: LadderStep, refusal: str = "") -> list[str]:
     """Change of the 2 s errors of the whole model, and the objection to it, if any."""
     old, new = before.errors, after.errors
-    position = f"{old.t_mrmse_m:.4f} -> {new.t_mrmse_m:.4f} m"
-    heading = " -> ".join(f"{math.degrees(one.r_mrmse_rad):.2f}" for one in (old, new)) + " degrees"
+    falls = {
+        of: format_fall(getattr(old, key), getattr(new, key), key) for key, (of, _) in ERRORS_OVER_2S.items()
+    }
+    said = [text or f"{of} unchanged" for of, text in falls.items() if text is not None]
     word = "added" if set(after.effects) > set(before.effects) else "changed"
-    line = f"{'all effects, before -> after':<30}{position}   {heading}"
-    note = refusal or format_rises(old, new)
+    line = f"{'all effects, before -> after':<30}{'   '.join(said)}"
+    note = refusal or format_rises(old, new, CHANCE)
     return [line, f"  ! {note}: {word} as requested"] if note else [line]
 
 
@@ -60,15 +66,20 @@ def format_measured_errors(name: str, errors: Errors) -> str:
 
 def format_heads(name: str) -> tuple[str, str]:
     """The headers of the error columns, and their units."""
-    heads, units = ("".join(f"{word:>9}" for word in words) for words in (_HEADS, _UNITS))
+    heads, units = ("".join(f"{word:>{_WIDTH}}" for word in words) for words in (_HEADS, _UNITS))
     return f"{name:<30}{heads}", f"{'':<30}{units}"
 
 
 def _columns(errors: Errors) -> str:
     x, y, turn = errors.velocity_rms
-    values = [(x, 4), (y, 4), (math.degrees(turn), 2), (errors.t_mrmse_m, 4)]
-    values.append((math.degrees(errors.r_mrmse_rad), 2))
-    return "".join(f"{'-' if math.isnan(value) else f'{value:.{digits}f}':>9}" for value, digits in values)
+    texts = [
+        *map(format_digits, (x, y, math.degrees(turn))),
+        format_length(errors.t_mrmse_m),
+        re.sub(r"degrees?", "deg", format_angle(errors.r_mrmse_rad)),
+    ]
+    values = (x, y, turn, errors.t_mrmse_m, errors.r_mrmse_rad)
+    shown = ("-" if math.isnan(value) else text for value, text in zip(values, texts, strict=True))
+    return "".join(f"{text:>{_WIDTH}}" for text in shown)
 
 
 def format_recordings(runs: Sequence[MotionRun]) -> list[str]:
@@ -90,9 +101,10 @@ def format_parameters(parameters: Mapping[str, Mapping[str, object]]) -> list[st
         rows = entry.get("runs")
         for row in rows if isinstance(rows, list) else [entry]:
             unit = "" if entry["unit"] == "1" else entry["unit"]
-            text = f"  {label:<32}{_show(row.get('value')):>12} {unit:<8}"
-            if row.get("low") is not None:
-                text += f"95 %: {_show(row['low'])} to {_show(row['high'])}"
+            value, *ends = _show_within(row)
+            text = f"  {label:<32}{value:>12} {unit:<8}"
+            if ends:
+                text += f"95 %: {' to '.join(ends)}"
             elif row.get("fitted"):
                 text += UNDETERMINED
             marks = [AT_BOUND] * bool(row.get("at_bound")) + list(filter(None, [row.get("doubt")]))
@@ -140,8 +152,12 @@ def _describe_limit(limit: SpeedLimit, terrain: str) -> str:
     return f"up to {reached[0]} m/s{where} (95 %: {reached[1]} to {reached[2]}); {held}"
 
 
-def _show(value: object) -> str:
-    return f"{value:.4g}" if isinstance(value, int | float) else "-"
+def _show_within(row: Mapping[str, object]) -> tuple[str, ...]:
+    """A value, and the ends of its interval where there is one, with the digits that this supports."""
+    value, low, high = (number_in(row, key) for key in ("value", "low", "high"))
+    if value is None:
+        return ("-",)
+    return (f"{value:.4g}",) if low is None or high is None else split_interval(value, low, high)
 
 
 def format_contest(contest: Contest) -> list[str]:

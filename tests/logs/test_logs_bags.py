@@ -179,7 +179,7 @@ def test_all_chunks_of_a_bag_together_inflate_to_no_more_than_their_budget(
     some = read_topics(open_log(path, max_inflated=2_000), [Wanted("/speed")])
     (loss,) = some.losses
     assert loss.kind == "max_inflated"
-    assert "more than 0.0 MB" in loss.text
+    assert "more than 2.0 kB" in loss.text
     assert "a larger --max-inflated reads more" in loss.text
     assert len(some.of("/speed")[0]) < len(whole.of("/speed")[0])
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import cast
 
 import pytest
+from verbs import run_slip
 from workbench_server import RUN, TRACK, Workbench
 
 from pipeline.models import read_model
@@ -42,6 +45,47 @@ def test_the_hidden_effect_makes_the_error_fall_and_undo_brings_it_back(workbenc
     assert errors(undone) == errors(opened)
     assert effects(undone) == []
     assert errors(workbench.session(RUN, "redo")) == errors(added)
+
+
+def test_what_remains_is_one_sentence_and_done_is_said_at_the_noise_floor_alone(workbench: Workbench) -> None:
+    opened = workbench.session(RUN)["session"]
+    assert isinstance(opened, dict)
+    assert opened["done"] is False
+    assert re.fullmatch(r"[\d.]+ degrees in heading remain, [\d.]+ times the noise floor", opened["remains"])
+    added = workbench.session(RUN, "add", effect="effective_track")["session"]
+    assert isinstance(added, dict)
+    assert (added["done"], added["remains"]) == (True, "Done: at the noise floor")
+    # Where to look first is a span of the run, of the error that is furthest above its floor.
+    start, end = cast("list[float]", workbench.post("/api/figures", run=RUN, tab="first")["largest"])
+    assert 0.0 <= start < end <= 92.0
+
+
+def test_the_signature_of_every_effect_is_a_figure_with_its_name(workbench: Workbench) -> None:
+    workbench.session(RUN, "add", effect="effective_track")
+    workbench.session(RUN, "add", effect="drive_lag", anyway=True)
+    shown = cast("list[dict[str, str]]", workbench.post("/api/figures", run=RUN, tab="effects")["shown"])
+    titles = {one["id"]: (one["title"], one["width"]) for one in shown}
+    assert titles["signature-effective_track"] == ("Effective track", "half")
+    assert "signature" not in titles
+
+
+def test_the_workbench_opens_with_a_run_that_is_named(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    served: list[Path] = []
+
+    def serve(folder: Path, *, notify: Callable[[str, str], None], **_: object) -> None:
+        served.append(folder)
+        notify("http://127.0.0.1:1/", "secret")
+
+    monkeypatch.setattr("pipeline.web.server.serve", serve)
+    for words in (["hidden"], [RUN], [str(results)], []):
+        code, out, _ = run_slip("serve", *words, "--results", results)
+        assert code == 0
+        where = "#a=field%2Fhidden" if words in (["hidden"], [RUN]) else ""
+        assert f"http://127.0.0.1:1/?token=secret{where} " in out
+    assert served == [results] * 4
+    code, _, said = run_slip("serve", "hiden", "--results", results)
+    assert code == 1
+    assert "there is no run 'hiden'" in said
 
 
 def test_an_effect_that_is_switched_off_and_on_again_has_the_same_errors(workbench: Workbench) -> None:

@@ -94,7 +94,7 @@ def test_a_region_of_two_errors_is_said_once() -> None:
             DataNeed(("a.k",) * 4, 286.0, 424.0, vague="b.k", half_width=0.3, others=11, minutes=7),
             "4 of 16 parameters are known within 5 %; 7 more minutes of such driving for 5 % of all",
         ),
-        (DataNeed(open=1), "0 of 1 parameters are known within 5 %"),
+        (DataNeed(open=1), "the one parameter is not known within 5 %"),
     ],
 )
 def test_how_much_is_known_is_one_sentence(need: DataNeed, said: str) -> None:
