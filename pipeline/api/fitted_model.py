@@ -339,15 +339,23 @@ class Model:
         with threadpool_limits(1):
             return problem, fit_as_it_is(problem, file.model, file.per_run).state
 
-    def export(self, to: str, *, current: str | Path | None = None) -> str:
+    def export(
+        self,
+        to: str,
+        *,
+        current: str | Path | None = None,
+        gate: Literal["off", "on", "auto"] | None = None,
+    ) -> str:
         """Its values as parameters of what people run, as `slip model export` writes them.
 
         Args:
-            to: ros2_control, nav2, autoware, vesc, px4, robot_localization, gazebo, json or
-                python.
-            current: for vesc and px4 the robot's file of parameters, which is corrected.
+            to: ros2_control, nav2, nav2_amcl, autoware, vesc, px4, robot_localization, gazebo, simulator,
+                json or python.
+            current: for vesc and px4 the robot's file of parameters, which is corrected; for simulator the
+                simulator's own export.
+            gate: for autoware whether the steering offset is applied: off, on, or on and learned on.
         """
-        return export_model(self.file, to, None if current is None else read_current(Path(current), to))
+        return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)
 
     def _read(self, runs: Run | Sequence[Run], owner: Owner | None) -> tuple[ModelFile, list[MotionRun]]:
         vehicle, read = read_runs(_list_manifests(runs), self.file.model.vehicle, owner)

@@ -238,6 +238,7 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     """
     from pipeline.estimation.comparison import Input  # noqa: PLC0415 - heavy
     from pipeline.estimation.ladder import judge_model, note_fit  # noqa: PLC0415
+    from pipeline.estimation.odometry_noise import measure_alphas  # noqa: PLC0415
     from pipeline.estimation.problem import Problem  # noqa: PLC0415
     from pipeline.export import require_errors  # noqa: PLC0415
 
@@ -245,7 +246,11 @@ def judge_measured(file: ModelFile, target: str, names: Sequence[str], out: Path
     vehicle, runs = gather_runs(names, file.model.vehicle, None, out, quiet=False)
     file = replace(file, model=replace(file.model, vehicle=vehicle))
     problem = Problem(runs, vehicle, Input.MEASURED)
-    return note_fit(file, judge_model(problem, file.model, per_run=file.per_run))
+    judgement = judge_model(problem, file.model, per_run=file.per_run)
+    noted = note_fit(file, judgement)
+    steps = zip(noted.list_fitted("ladder"), judgement.ladder.steps, strict=True)
+    ladder = [{**row, "odometry_alphas": measure_alphas(problem, step.fitted)} for row, step in steps]
+    return replace(noted, fit={**noted.fit, "ladder": ladder})
 
 
 _SECONDS = re.compile(r"(\d+(?:\.\d+)?)\s*s?")

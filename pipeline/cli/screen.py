@@ -381,7 +381,8 @@ def _format_model_error(seen: Seen) -> str:
 
 
 def _format_knowledge(knowledge: Seen) -> list[tuple[str, str]]:
-    rows: list[tuple[str, str]] = []
+    alarms = cast("Sequence[Seen]", knowledge.get("alarms") or [])
+    rows = [("alarm", str(alarm["text"])) for alarm in alarms]
     for stated in cast("Sequence[Seen]", knowledge.get("stated") or []):
         numbers = cast("Mapping[str, Seen]", stated["parameters"])
         known = ", ".join(f"{name} {_format_parameter(one)}" for name, one in numbers.items())

@@ -324,11 +324,21 @@ def export(  # noqa: D417 - the options document themselves
     *,
     to: str,
     current: Annotated[
-        Path | None, Parameter(help="vesc, px4: the robot's file of parameters, which is corrected")
+        Path | None,
+        Parameter(
+            help="vesc, px4: the robot's file of parameters, which is corrected; "
+            "simulator: the simulator's own export"
+        ),
     ] = None,
     on: Annotated[
         list[str] | None,
-        Parameter(help="robot_localization: logs or runs for the held-out errors", consume_multiple=True),
+        Parameter(
+            help="robot_localization, nav2_amcl: logs or runs for the held-out errors", consume_multiple=True
+        ),
+    ] = None,
+    gate: Annotated[
+        Literal["off", "on", "auto"] | None,
+        Parameter(help="autoware: the steering offset is not applied, applied, or applied and learned on"),
     ] = None,
     results: Results = Path("results"),
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
@@ -340,15 +350,15 @@ def export(  # noqa: D417 - the options document themselves
 
     Args:
         model: the model file.
-        to: ros2_control, nav2, nav2_traction, autoware, vesc, px4, robot_localization, gazebo,
-            traction, json or python.
+        to: ros2_control, nav2, nav2_amcl, nav2_traction, autoware, vesc, px4, robot_localization, gazebo,
+            simulator, traction, json or python.
     """
     from pipeline.export import export_model, read_current  # noqa: PLC0415 - heavy
     from pipeline.models import write_text  # noqa: PLC0415
 
     used = None if current is None else read_current(current, to)
     opened = open_model(model, trust_code=trust_code)
-    text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used)
+    text = export_model(judge_measured(opened, to, on, results) if on else opened, to, used, gate)
     if file is None:
         sys.stdout.write(text)
     else:

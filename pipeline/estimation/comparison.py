@@ -300,6 +300,22 @@ class Comparison:
         wrapped = np.abs(np.remainder(yaw + np.pi, 2.0 * np.pi) - np.pi)
         return HorizonErrors(np.abs(predicted - self._path[node]), wrapped, np.abs(yaw))
 
+    def trace_horizons(
+        self, effects: Sequence[Effect], timing: Timing
+    ) -> tuple[Complex, Floats, Complex, Floats]:
+        """Motion since the start of every prediction, predicted and measured.
+
+        Returns:
+            Predicted displacement [m] in the frame of the start, predicted turn [rad], and both as measured,
+            shape (n,) each.
+        """
+        delay = self._find_delay(effects)
+        moved, turned = self._predict_horizons(effects, timing, delay)
+        heading = self._node_headings(delay)
+        origin, node = self.horizons.origin, self.horizons.node
+        back: Complex = np.exp(-1j * heading[self._begins])[self.horizons.number]
+        return moved, turned, back * (self._path[node] - self._path[origin]), heading[node] - heading[origin]
+
     def find_horizon_shifts(
         self, effects: Sequence[Effect], others: Sequence[Effect], timing: Timing
     ) -> tuple[Floats, Floats, Floats]:

@@ -17,8 +17,10 @@ from pipeline.estimation.intervals import Estimates, estimate_intervals
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.window_residuals import average_windows, locate_windows
+from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED
 from pipeline.models import Model, ModelFile, Timing
 from pipeline.results import CHANCE, ERRORS_OVER_2S, as_written, list_rises
+from pipeline.run import STILL_MPS
 
 _LEAST_ROOM = 0.02
 """Minimum removable error, from the ideal model's to the floor, as a share of the ideal model's error."""
@@ -318,14 +320,19 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
 
 
 def _measure_driven(problem: Problem) -> list[dict[str, float]]:
-    """Driven speed and yaw rate of each run: the 99th percentile over windows of half a second."""
+    """Driven speed and yaw rate of each run over windows of half a second: the 99th percentile.
+
+    Of the speed also the lower quartile of the windows in which it drives.
+    """
     part, driven = problem.whole, []
     for run, comparison in enumerate(problem.comparisons):
         velocity = comparison.predict_velocity((), Timing())
         ideal = average_windows(comparison, velocity, locate_windows(comparison))
         measured = np.abs(part.find_run_residuals(problem.start_state(), run) + ideal)
         speed, _, turn = np.quantile(measured, _DRIVEN_QUANTILE, axis=0).tolist()
-        driven.append({"driven_speed_mps": round(speed, 4), "driven_yaw_rate_radps": round(turn, 4)})
+        moving = measured[:, 0][measured[:, 0] > STILL_MPS]
+        lower = {LOWER_SPEED: round(float(np.quantile(moving, 0.25)), 4)} if moving.size else {}
+        driven.append({DRIVEN_SPEED: round(speed, 4), DRIVEN_TURN: round(turn, 4), **lower})
     return driven
 
 

@@ -131,20 +131,33 @@ def _list_powers(speed: Floats) -> Floats:
     return np.column_stack((np.ones_like(speed), speed**2, speed**4))
 
 
-def _fit_band(speed: Floats, error: Floats) -> _Band:
+def fit_mean_squares(columns: Floats, squares: Floats) -> Floats:
+    """Coefficients, none negative, of a mean square as a sum of columns; by weighted least squares.
+
+    The weights are those of normal errors, whose squares scatter as their mean.
+
+    Args:
+        columns: shape (n, p).
+        squares: squared errors, shape (n,).
+    """
     from scipy.optimize import nnls  # noqa: PLC0415 - heavy
 
-    powers, squares = _list_powers(speed), error**2
-    # An error of zero has no scale: a thousandth of the typical one keeps the weights finite.
-    least = 1e-6 * max(float(squares.mean()), 1e-24)
-    expected: Floats = np.full(speed.size, max(float(squares.mean()), 1e-24))
-    size = np.maximum(powers.max(axis=0), 1e-12)
-    fitted = np.zeros(powers.shape[1])
+    mean = max(float(squares.mean()), 1e-24)
+    expected: Floats = np.full(squares.size, mean)
+    size = np.maximum(columns.max(axis=0), 1e-12)
+    fitted = np.zeros(columns.shape[1])
     for _ in range(_ROUNDS):
-        weight = 1.0 / np.maximum(expected, least)
-        fitted = nnls(powers / size * weight[:, None], squares * weight)[0] / size
-        expected = powers @ fitted
-    ratio = np.sort(error / np.sqrt(np.maximum(expected, least)))
+        # A mean square of zero has no scale: a thousandth of the typical error keeps the weights finite.
+        weight = 1.0 / np.maximum(expected, 1e-6 * mean)
+        fitted = nnls(columns / size * weight[:, None], squares * weight)[0] / size
+        expected = columns @ fitted
+    return fitted
+
+
+def _fit_band(speed: Floats, error: Floats) -> _Band:
+    powers, squares = _list_powers(speed), error**2
+    fitted = fit_mean_squares(powers, squares)
+    ratio = np.sort(error / np.sqrt(np.maximum(powers @ fitted, 1e-6 * max(float(squares.mean()), 1e-24))))
     index = math.ceil(CONFIDENCE * (ratio.size + 1)) - 1
     return _Band(fitted, float(ratio[min(index, ratio.size - 1)]))
 

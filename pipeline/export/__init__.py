@@ -19,8 +19,9 @@ from typing import TYPE_CHECKING
 
 from ruamel.yaml import YAML
 from ruamel.yaml.comments import CommentedMap, CommentedSeq
+from ruamel.yaml.scalarstring import DoubleQuotedScalarString
 
-from pipeline.core import INPUT_WORDS, guess_names, make_plain, read_bounded_text, suffix_unit
+from pipeline.core import INPUT_WORDS, NORMAL_95, guess_names, make_plain, read_bounded_text, suffix_unit
 from pipeline.models import Effect, FormulaEffect, Model, ModelFile, Parameter, Quantity, is_own
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, check_geometry
@@ -44,15 +45,17 @@ class Target:
         corrects: names of the current parameters it reads; empty if all its values are absolute.
         read_current: reads them from the text of the robot's file.
         has_errors: whether it writes held-out errors, for which a log may be given.
+        gates: words that say whether a measured offset is applied, its third argument; empty without one.
     """
 
     name: str
     about: str
     source: str
-    write: Callable[[ModelFile, Current], str]
+    write: Callable[..., str]
     corrects: tuple[str, ...] = ()
     read_current: Callable[[str], Current] | None = None
     has_errors: bool = False
+    gates: tuple[str, ...] = ()
 
 
 @functools.cache
@@ -119,24 +122,32 @@ def require_errors(name: str) -> None:
         raise MotionError("no_errors_written", what, where="--on", hint=hint)
 
 
-def export_model(file: ModelFile, name: str, current: Current | None = None) -> str:
+def export_model(file: ModelFile, name: str, current: Current | None = None, gate: str | None = None) -> str:
     """Text of a target's file.
 
     Args:
         file: a fitted model.
         name: name of the target.
         current: current parameters of the robot, by name; see `read_current`.
+        gate: whether a measured offset is applied, one of the target's `gates`; None for its default.
 
     Raises:
         MotionError: ``unknown_target``; ``wrong_vehicle``, the target has no parameters for its kind;
-            ``absurd_number``, a value that no robot can have; others, see the target.
+            ``absurd_number``, a value that no robot can have; ``no_gate``; others, see the target.
         ConfigurationError: ``implausible_geometry``.
     """
     target = find_target(name)
     used = dict(current or {})
     check_geometry(file.model.vehicle, file.model.vehicle.id)
     _check_numbers(file, {key: value for key, value in used.items() if key in target.corrects})
-    return target.write(file, used)
+    if gate is None:
+        return target.write(file, used)
+    if gate not in target.gates:
+        what = f"{name} has no gate {gate!r}"
+        gated = " and ".join(one.name for one in list_targets() if one.gates)
+        hint = f"Give --gate {' or '.join(target.gates)}." if target.gates else f"Omit it; it is for {gated}."
+        raise MotionError("no_gate", what, where="--gate", hint=hint)
+    return target.write(file, used, gate)
 
 
 LARGEST = 1e9
@@ -144,6 +155,8 @@ LARGEST = 1e9
 large."""
 DRIVEN_SPEED, DRIVEN_TURN = "driven_speed_mps", "driven_yaw_rate_radps"
 """Keys of the largest driven values in the runs of a fit."""
+LOWER_SPEED = "lower_speed_mps"
+"""Key of the speed below which a quarter of the driving was slower, in the runs of a fit."""
 
 
 def require_plausible(label: str, *values: float, least: float = -LARGEST) -> None:
@@ -188,7 +201,7 @@ def _check_numbers(file: ModelFile, current: Current) -> None:
             if math.isfinite(value) or math.isfinite(parameter.neutral):
                 require_plausible(f"{effect.id}.{parameter.name}", value)
     for row in file.list_fitted("runs"):
-        for key in (DRIVEN_SPEED, DRIVEN_TURN):
+        for key in (DRIVEN_SPEED, DRIVEN_TURN, LOWER_SPEED):
             if isinstance(driven := row.get(key), float):
                 require_plausible(f"fit.runs.{key}", driven, least=0.0)
     for name, value in current.items():
@@ -249,13 +262,13 @@ class Setting:
 
     Attributes:
         path: names of the parent nodes and groups and of the parameter, separated by dots.
-        value: value as written: a number, or several in a row.
+        value: value as written: a number, a switch or a word, or several in a row.
         sources: sources of the value.
         effects: ids of the effects that it covers.
     """
 
     path: str
-    value: float | bool | tuple[float, ...] | tuple[bool, ...]
+    value: float | bool | str | tuple[float, ...] | tuple[bool, ...]
     sources: tuple[str, ...] = ()
     effects: frozenset[str] = frozenset()
 
@@ -318,6 +331,16 @@ class Facts:
                 effects.append(effect.id)
         return Amount(_join(quantity, values), tuple(sources), frozenset(effects))
 
+    def find_variance(self, quantity: Quantity) -> Amount:
+        """Variance of a quantity whose values add up, from their intervals; unknown if one has none."""
+        taken, variances = self.take(quantity), list[float]()
+        for effect, parameter in self._list_numbers():
+            interval = self.file.intervals.get(f"{effect.id}.{parameter.name}")
+            if effect.id in taken.effects and quantity in parameter.quantities and interval is not None:
+                variances.append((0.5 * (interval[1] - interval[0]) / NORMAL_95) ** 2)
+        value = math.fsum(variances) if len(variances) == len(taken.effects) else math.nan
+        return Amount(value, taken.sources, taken.effects)
+
     def measure(self, name: str) -> Amount:
         """Return a vehicle dimension by its field name; unknown if it is not given (NaN) or a stand-in."""
         value = getattr(self.vehicle, name)
@@ -359,7 +382,7 @@ class Facts:
 
     def find_turn_delay(self) -> Amount:
         """Delay of the yaw rate behind a smooth command [s]; on a car it comes from the steering."""
-        lag = Quantity.TURN_LAG if self.vehicle.kind == "differential" else Quantity.STEERING_LAG
+        lag = Quantity.STEERING_LAG if self.vehicle.kind == "ackermann" else Quantity.TURN_LAG
         return combine(operator.add, self.take(Quantity.COMMAND_DELAY), self.take(lag))
 
     def find_speed_limit(self) -> Amount:
@@ -421,6 +444,10 @@ class Facts:
             if missing or not texts:
                 lines.append("; ".join(missing) or effect.id)
         return lines
+
+    def list_sources(self, effect: Effect) -> list[str]:
+        """A line for each parameter of an effect that is in use."""
+        return [self._format_source(effect, one) for one in effect.parameters if effect.is_used(one)]
 
     def format_fit(self) -> str:
         """Data that the model was fitted to; empty before a fit."""
@@ -543,6 +570,9 @@ def write_yaml(facts: Facts, sheet: Sheet) -> str:
 
 
 def _make_value(value: object) -> object:
+    if isinstance(value, str):
+        # `off` without quotes is a boolean to the parser of ROS 2.
+        return DoubleQuotedScalarString(value)
     if not isinstance(value, tuple):
         return value
     row = CommentedSeq(value)

@@ -1,20 +1,18 @@
-"""Parameters of controllers and filters.
-
-Nav2, ros2_control's wheeled controllers, robot_localization, Autoware, PX4 rovers and VESC nodes.
-"""
+"""Parameters of controllers: Nav2, ros2_control's wheeled ones, Autoware, PX4 rovers and VESC nodes."""
 
 import csv
 import io
 import math
 import operator
 import re
-from collections.abc import Collection
 
-import msgspec
 import yaml
 
 from pipeline.core import make_plain
 from pipeline.export import (
+    DRIVEN_SPEED,
+    DRIVEN_TURN,
+    LOWER_SPEED,
     Amount,
     Current,
     Facts,
@@ -24,11 +22,12 @@ from pipeline.export import (
     combine,
     list_comments,
     name_entity,
-    require_plausible,
+    quote_name,
     start_sheet,
     write_yaml,
 )
-from pipeline.models import Effect, ModelFile, Place, Quantity
+from pipeline.export.simulator import describe_spread
+from pipeline.models import ModelFile, Quantity
 from pipeline.run import MotionError
 
 _CONTROLLER = "controller_server.ros__parameters.FollowPath"
@@ -39,22 +38,27 @@ _DELAY = "MPPI: the sum of dead times and time constants, the delay behind a smo
 def write_nav2(file: ModelFile, current: Current) -> str:
     """Write the parameters as YAML; rename the group if the plugin is not called FollowPath.
 
-    Limits are the largest that were reached: smaller ones that are set on purpose remain valid.
+    Limits are the largest that were reached: smaller ones that are set on purpose remain valid. A vehicle
+    that moves sideways gets delays only: its limits depend on the direction, which these parameters do not.
 
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, NAV2, "differential", "ackermann")
+    facts, sheet = start_sheet(file, NAV2, "differential", "ackermann", "mecanum", "omni")
+    moves_sideways = facts.vehicle.kinematics.has_inputs("sideways")
     sheet.add(f"{_CONTROLLER}.model_delay_vx", facts.find_speed_delay(), _DELAY)
+    if moves_sideways:
+        sheet.add(f"{_CONTROLLER}.model_delay_vy", facts.find_speed_delay(), _DELAY)
     sheet.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
-    _add_smoother(facts, sheet)
+    if not moves_sideways:
+        _add_limits_of_nav2(facts, sheet)
     if facts.vehicle.kind == "ackermann":
         key = f"{_CONTROLLER}.ackermann.min_turning_r"
         sheet.add(key, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
     return write_yaml(facts, sheet)
 
 
-def _add_smoother(facts: Facts, sheet: Sheet) -> None:
+def _add_limits_of_nav2(facts: Facts, sheet: Sheet) -> None:
     speed, turn = facts.find_speed_limit(), facts.find_turn_limit()
     acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
     sheet.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
@@ -126,6 +130,7 @@ def _add_differential(facts: Facts, sheet: Sheet) -> None:
         sheet.add(f"{node}.{axis}.min_velocity", -limit)
         sheet.add(f"{node}.{axis}.max_acceleration", acceleration)
         sheet.add(f"{node}.{axis}.max_deceleration", -acceleration)
+    sheet.head += describe_spread(facts)
     sheet.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
 
 
@@ -147,113 +152,22 @@ ROS2_CONTROL = Target(
     write_ros2_control,
 )
 
-_FILTER = "ekf_filter_node.ros__parameters"
-_CONTROLLERS = {
-    "differential": ("diff_drive_controller", {Quantity.RADIUS, Quantity.RADIUS_DIFFERENCE, Quantity.TRACK}),
-    "ackermann": ("ackermann_steering_controller", {Quantity.RADIUS, Quantity.WHEELBASE}),
-}
-_UNSEEN = {Quantity.STEERING_GAIN, Quantity.STEERING_OFFSET}
-"""Quantities that encoders on the steering do not measure: their own offset and scale."""
-
-_POSE = ("x", "y", "z", "roll", "pitch", "yaw")
-_STATE = (*_POSE, *(f"v{name}" for name in _POSE), "ax", "ay", "az")
-_FUSED = tuple(name in {"vx", "vy", "vyaw"} for name in _STATE)
-_INDEPENDENT = (
-    "z, roll and pitch are neither measured nor fused; errors are correlated over about half a second, so "
-    "multiply the covariance by 0.5 s * f for a filter that takes f messages a second as independent"
-)
-
-
-def write_robot_localization(file: ModelFile, current: Current) -> str:
-    """Write the parameters as YAML.
-
-    The filter has no parameter for the covariance of a measurement: it comes with the odometry messages,
-    whose controller gets it here. Variances are the squares of the held-out errors over half a second, from
-    the last step of the ladder whose effects are all known to wheel odometry. They include the localization's
-    own noise, so they are too large rather than too small.
-
-    Raises:
-        MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
-    """
-    facts, sheet = start_sheet(file, ROBOT_LOCALIZATION, *_CONTROLLERS)
-    controller, known = _CONTROLLERS[facts.vehicle.kind]
-    step = _find_step(file, known)
-    sources = (
-        f"squares of the held-out errors over half a second with {', '.join(step.effects) or 'no effect'}",
-        "for odometry that is corrected first: --to ros2_control",
-        *_warn(file, step, known),
-    )
-    # The error is known to some per cent; more digits would only reflect the starting values of the fit.
-    x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
-    sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
-    acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
-    for name in ("acceleration_limits", "deceleration_limits"):
-        limits = (acceleration, 0.0, 0.0, 0.0, 0.0, turning)
-        sheet.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
-    key = f"{controller}.ros__parameters.twist_covariance_diagonal"
-    sheet.add_row(key, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
-    return write_yaml(facts, sheet)
-
-
-class _Step(msgspec.Struct):
-    """Errors of a step of the ladder in a model file, x and y in m/s, w in rad/s."""
-
-    effects: list[str]
-    velocity_rms: tuple[float, float, float]
-
-
-def _find_step(file: ModelFile, known: Collection[Quantity]) -> _Step:
-    """The last step of the ladder whose effects wheel odometry can follow."""
-    try:
-        steps = msgspec.convert(file.fit.get("ladder", []), list[_Step])
-    except msgspec.ValidationError:
-        steps = []
-    for step in reversed(steps):
-        require_plausible("fit.ladder.velocity_rms", *step.velocity_rms, least=0.0)
-        if all(name in file.model and _is_seen(file.model.effect(name), known) for name in step.effects):
-            return step
-    what = "the model was never fitted: it has no held-out errors to make a covariance of"
-    hint = "Name a log: --on LOG, or fit it first: slip model fit MODEL --on LOG --input measured."
-    raise MotionError("not_fitted", what, where="fit.ladder", hint=hint)
-
-
-def _is_seen(effect: Effect, known: Collection[Quantity]) -> bool:
-    """Whether wheel odometry includes an effect: encoders measure it, or the controller models it."""
-    quantities = {quantity for parameter in effect.parameters for quantity in parameter.quantities}
-    if effect.place <= Place.DRIVE:
-        return not quantities & _UNSEEN
-    return bool(quantities) and quantities <= set(known)
-
-
-def _warn(file: ModelFile, step: _Step, known: Collection[Quantity]) -> list[str]:
-    """Reasons why the variances are larger than necessary."""
-    lines = []
-    if file.fit.get("input") != "measured":
-        lines.append("fitted from commands; for wheel odometry give --on LOG, which fits from wheel encoders")
-    unseen = " ".join(effect.id for effect in file.model if not _is_seen(effect, known))
-    if unseen and len(step.effects) < len(file.model.effects):
-        lines.append(f"odometry does not follow {unseen}; sharper: slip model drop MODEL {unseen} --on LOG")
-    return lines
-
-
-ROBOT_LOCALIZATION = Target(
-    "robot_localization",
-    "the covariance of wheel odometry for robot_localization",
-    "cra-ros-pkg/robot_localization 3.6, params/ekf.yaml and preparing_sensor_data.rst; the filter takes "
-    "covariances from the messages, which ros-controls/ros2_controllers fills from twist_covariance_diagonal",
-    write_robot_localization,
-    has_errors=True,
-)
-
 _ALL = "/**.ros__parameters"
 _INFO = "vehicle_info.param.yaml"
 _MPC = "mpc_lateral_controller"
+_ESTIMATOR = "steer_offset_estimator"
 _PID = "pid_longitudinal_controller"
 _SIMULATOR = "simple_planning_simulator with vehicle_model_type: DELAY_STEER_VEL"
 
 
-def write_autoware(file: ModelFile, current: Current) -> str:
+def write_autoware(file: ModelFile, current: Current, gate: str = "auto") -> str:
     """Write the parameters as YAML: one file for all nodes; each reads those that it declares.
+
+    Args:
+        file: a fitted model.
+        current: not used.
+        gate: `off`, the steering offset is not applied; `on`, it is applied as measured; `auto`, applied
+            and learned on by Autoware, where it drives as when the offset was measured.
 
     Raises:
         MotionError: ``wrong_vehicle``.
@@ -273,28 +187,63 @@ def write_autoware(file: ModelFile, current: Current) -> str:
     sheet.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
     sheet.add(f"{_ALL}.vel_lim", facts.find_speed_limit(), _SIMULATOR)
     sheet.add(f"{_ALL}.vel_rate_lim", facts.find_speed_acceleration(), _SIMULATOR)
-    _add_offset(facts, sheet)
+    _add_offset(facts, sheet, gate)
     return write_yaml(facts, sheet)
 
 
-def _add_offset(facts: Facts, sheet: Sheet) -> None:
+def _add_offset(facts: Facts, sheet: Sheet, gate: str) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
     sign = "measured minus true angle: an offset to the left is a negative bias"
     sheet.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
-    if offset.is_known:
-        sheet.head.append(
-            f"steer_offset = {offset.value:.5g} rad, true less measured angle as in steer_offset_estimator; "
-            "the vehicle interface keeps it in a file of its vendor."
-        )
+    if not offset.is_known:
+        return
+    condition, lower, turn = _find_condition(facts)
+    sheet.head.append(
+        f"steer_offset = {offset.value:.5g} rad with gate {gate}: true less measured angle as in "
+        f"steer_offset_estimator{condition}; another load, tyre or ground may change it."
+    )
+    is_applied = gate != "off"
+    sources = (*offset.sources, f"{_MPC}; gate {gate}: the offset is {'' if is_applied else 'not '}applied")
+    switch = f"{_ALL}.steering_offset.enable_auto_steering_offset_removal"
+    sheet.settings.append(Setting(switch, is_applied, sources, offset.effects))
+    if is_applied:
+        sheet.add(f"{_ALL}.steer_offset", offset, "steer_offset.param.yaml, where the controller begins")
+    learned = gate == "auto"
+    note = f"{_ESTIMATOR}; {'goes on learning' if learned else 'learns nothing'}"
+    sheet.settings.append(Setting(f"{_ALL}.calibration.mode", "auto" if learned else "off", (note,)))
+    if not learned:
+        return
+    sheet.add(f"{_ALL}.initial_offset", offset, _ESTIMATOR)
+    sheet.add(f"{_ALL}.initial_covariance", facts.find_variance(Quantity.STEERING_OFFSET), _ESTIMATOR)
+    as_here = f"{_ESTIMATOR}; where the offset was measured"
+    sheet.add(f"{_ALL}.min_velocity", lower, as_here)
+    sheet.add(f"{_ALL}.max_ang_velocity", turn, as_here)
+
+
+def _find_condition(facts: Facts) -> tuple[str, Amount, Amount]:
+    """How the runs of the fit were driven: in words, lower speed [m/s] and largest yaw rate [rad/s]."""
+    rows = facts.file.list_fitted("runs")
+    slow, fast, turn = (
+        [value for row in rows if isinstance(value := row.get(key), float)]
+        for key in (LOWER_SPEED, DRIVEN_SPEED, DRIVEN_TURN)
+    )
+    if not (slow and fast and turn):
+        return "", Amount(math.nan), Amount(math.nan)
+    grounds = dict.fromkeys(str(row.get("terrain")) for row in rows)
+    where = " and ".join(quote_name(name) for name in grounds if name not in {"unknown", "None"})
+    words = f", learned mostly at {min(slow):.3g} to {max(fast):.3g} m/s, up to {max(turn):.3g} rad/s"
+    least, most = (Amount(value, ("driven in the runs of the fit",)) for value in (min(slow), max(turn)))
+    return f"{words}{f', on {where}' if where else ''}", least, most
 
 
 AUTOWARE = Target(
     "autoware",
     "parameters of Autoware's vehicle_info, controllers and planning simulator",
     "autowarefoundation/autoware_universe, README of autoware_simple_planning_simulator and of "
-    "autoware_steer_offset_estimator, lateral_controller_defaults.param.yaml; sample_vehicle_launch, "
-    "vehicle_info.param.yaml",
+    "autoware_steer_offset_estimator and its node.cpp, lateral_controller_defaults.param.yaml; "
+    "sample_vehicle_launch, vehicle_info.param.yaml",
     write_autoware,
+    gates=("off", "on", "auto"),
 )
 
 _REAL32 = 9

@@ -33,6 +33,7 @@ from pipeline.live import LiveError
 from pipeline.live.receiver import ReceiverOrder, ReceiverState
 from pipeline.logs.index import LISTING, GrowingLog, list_files
 from pipeline.logs.live_recording import lock_folder
+from pipeline.models import list_effects
 from pipeline.results import (
     ABOVE_FLOOR,
     INTERVAL_SHARE,
@@ -42,7 +43,14 @@ from pipeline.results import (
     find_refusal,
     measure_excess,
 )
-from pipeline.words import describe_clause, describe_need, describe_separation, format_step, suggest_drive
+from pipeline.words import (
+    describe_alarm,
+    describe_clause,
+    describe_need,
+    describe_separation,
+    format_step,
+    suggest_drive,
+)
 
 _SCHEME: Final = re.compile(r"(wss?):/+", re.IGNORECASE)
 _DEFAULT_PORT: Final = 8765
@@ -367,7 +375,7 @@ def summarize_knowledge(diagnosis: RunDiagnosis, before: Sequence[str]) -> dict[
         a second look must confirm; ``undecided``, ``unseen``: effects that are not separated or not
         observable; ``drive``: manoeuvres for them; ``enough``: whether more driving of this kind changes
         nothing, so that none is suggested; ``data``, ``error``, ``problem``: sentences; ``passing``: ids for
-        the next look.
+        the next look; ``alarms``: numbers beyond the range in which learners on board let them go.
     """
     passing = list_passing(diagnosis)
     stated = list_stated(diagnosis, before)
@@ -390,7 +398,20 @@ def summarize_knowledge(diagnosis: RunDiagnosis, before: Sequence[str]) -> dict[
         "error": format_step(ladder[-1]) if ladder else None,
         "problem": "" if ladder else next(iter(problems), find_refusal(diagnosis.findings)),
         "passing": passing,
+        "alarms": [alarm for one in stated for alarm in _list_alarms(one)],
     }
+
+
+def _list_alarms(stated: Stated) -> list[dict[str, object]]:
+    """Numbers of an effect that are beyond the range in which learners on board let them go."""
+    alarms = list[dict[str, object]]()
+    for parameter in (one for kind in list_effects() if kind.id == stated.id for one in kind.parameters):
+        within, value = parameter.learned_within, stated.numbers.get(parameter.name, {}).get("value")
+        if within is not None and isinstance(value, float) and not within.low <= value <= within.high:
+            text = describe_alarm(stated.id, parameter, value)
+            alarm = {"effect": stated.id, "parameter": parameter.name, "value": value}
+            alarms.append({**alarm, "low": within.low, "high": within.high, "text": text})
+    return alarms
 
 
 def _is_enough(diagnosis: RunDiagnosis, stated: Sequence[Stated], waiting: Sequence[str]) -> bool:

@@ -472,6 +472,17 @@ class _Stated(msgspec.Struct):
     parameters: dict[str, _Number]
 
 
+class _Alarm(msgspec.Struct):
+    """See `running_log.summarize_knowledge`."""
+
+    effect: str
+    parameter: str
+    value: float
+    low: float
+    high: float
+    text: str
+
+
 class _Noted(msgspec.Struct):
     """See `running_log.summarize_knowledge`."""
 
@@ -486,6 +497,7 @@ class _Noted(msgspec.Struct):
     error: str | None
     problem: str
     passing: list[str]
+    alarms: list[_Alarm] = []
 
 
 def _check_noted(noted: object) -> dict[str, object]:

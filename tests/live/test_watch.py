@@ -368,6 +368,40 @@ def test_it_asks_until_it_knows_enough() -> None:
     assert "drive on a slope" not in text
 
 
+@pytest.mark.parametrize(
+    ("effect", "parameter", "value", "is_alarm"),
+    [
+        ("steering_offset", "o", 0.05, False),
+        ("steering_offset", "o", -0.2, True),
+        ("steering_gain", "g", 0.45, True),
+        ("steering_gain", "g", 1.9, False),
+        ("understeer", "K", 0.03, False),
+        ("understeer", "K", 0.3, True),
+        ("effective_track", "k", 3.9, False),
+    ],
+)
+def test_numbers_beyond_what_learners_on_board_take_are_alarms(
+    effect: str,
+    parameter: str,
+    value: float,
+    is_alarm: bool,  # noqa: FBT001 - a case
+) -> None:
+    number = Value(value, value - 0.01, value + 0.01)
+    growth = Growth(Evidence((1.0, 2.0), (1.0, 2.0 * RUNNING_T)))
+    diagnosis = RunDiagnosis(effects=(Named(effect, {parameter: number}, growth=growth),))
+    assert summarize_knowledge(diagnosis, [])["alarms"] == []
+    known = summarize_knowledge(diagnosis, [effect])
+    alarms = known["alarms"]
+    assert [(one["effect"], one["value"]) for one in alarms] == [(effect, value)] * is_alarm  # type: ignore[attr-defined]
+    seen = {
+        "log": "run.mcap", "closed": True, "bytes": 1e6, "duration_s": 90.0, "distance_m": 40.0,
+        "events": [], "slip_mps": {}, "error_mps": {}, "problem": "", "knowledge": {"until_s": 80.0, **known},
+    }  # fmt: skip
+    shown = [line for line in format_watch(seen) if line.startswith("alarm")]
+    assert len(shown) == is_alarm
+    assert all("openpilot's paramsd" in line for line in shown)
+
+
 def test_looks_leave_more_than_half_a_core() -> None:
     assert LIGHT_SHARE + HEAVY_SHARE < 0.5
 
@@ -409,8 +443,10 @@ def test_a_log_whose_name_begins_with_a_dash_is_diagnosed(
 def test_notes_that_no_watch_wrote_are_forgotten(tmp_path: Path) -> None:
     log = make_log(tmp_path / "run.mcap", 3.0)
     notes = Store(tmp_path / "out").notes(NOTES)
-    diagnosis = RunDiagnosis(effects=(name("effective_track", 50.0),))
-    known = {"until_s": 30.0, **summarize_knowledge(diagnosis, ["effective_track"])}
+    offset = Named("steering_offset", {"o": Value(0.3, 0.29, 0.31)}, growth=Growth(Evidence((1.0,), (50.0,))))
+    diagnosis = RunDiagnosis(effects=(name("effective_track", 50.0), offset))
+    known = {"until_s": 30.0, **summarize_knowledge(diagnosis, ["effective_track", "steering_offset"])}
+    assert len(known["alarms"]) == 1  # type: ignore[arg-type]
     for noted, expected in ((known, known), (known | {"until_s": "30"}, {}), (known | {"stated": [5]}, {})):
         notes.write(str(log.resolve()), noted)
         assert Watch(log, Options(out=tmp_path / "out"), [], 5.0).knowledge == expected

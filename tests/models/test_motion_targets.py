@@ -17,9 +17,11 @@ from verbs import run_verb
 from pipeline import export
 from pipeline.export import export_model, list_targets
 from pipeline.models import find_effect
-from pipeline.sources import Vehicle
+from pipeline.run import MotionError
+from pipeline.sources import Vehicle, list_presets
 
 PARAMETERS = sorted(SCHEMAS)
+MECANUM = next(one for one in list_presets() if one.kind == "mecanum")
 CASES = [
     (name, vehicle)
     for name in PARAMETERS
@@ -46,6 +48,8 @@ def test_names_types_and_bounds_are_those_that_the_project_declares(name: str, v
             assert isinstance(value, list)
             assert len(value) == schema
             assert {type(item) for item in value} == {bool if path.endswith("config") else float}, path
+        elif isinstance(schema, frozenset):
+            assert value in schema, path
         else:
             assert type(value) is float, path
             assert schema[0] <= value <= schema[1], path
@@ -55,6 +59,7 @@ def test_every_parameter_of_the_schemas_is_written_for_some_vehicle() -> None:
     """So that no line of the tables above stands for nothing."""
     for name in PARAMETERS:
         vehicles = (CAR, F1TENTH) if name in {"autoware", "vesc"} else (HUSKY, CAR)
+        vehicles = (*vehicles, MECANUM) if name == "nav2" else vehicles
         written = set[str]()
         for vehicle in vehicles:
             if name != "vesc" or vehicle is F1TENTH:
@@ -79,8 +84,9 @@ def test_every_effect_stands_at_a_line_or_among_those_without_one(name: str, veh
         stands = any(f"{effect.id}.{p.name} = " in below for p in effect.parameters)
         assert stands or effect.id in unmapped, (effect.id, head)
     known = {e.id for e in file.model if any(p.quantities for p in e.parameters)}
-    assert unmapped >= {e.id for e in file.model} - known
-    assert unmapped != {e.id for e in file.model} or name == "robot_localization"
+    # A steady motion depends on effects that no parameter of a controller stands for.
+    assert unmapped >= {e.id for e in file.model} - known or name == "simulator"
+    assert unmapped != {e.id for e in file.model} or name in {"robot_localization", "nav2_amcl"}
 
 
 @pytest.mark.parametrize("known", [HUSKY, F1TENTH], ids=["robot", "car"])
@@ -148,6 +154,101 @@ def test_a_smooth_command_is_followed_as_late_as_mppi_is_told(name: str) -> None
         rows = predict(file, [(t, sign * t, t) for t in times], 5.0)
         late = 5.0 - rows[-1, column] / (np.gradient(rows[:, column], 0.005)[-1])
         assert late == pytest.approx(p[f"FollowPath.model_delay_{delay}"], abs=0.02), delay
+
+
+def test_a_vehicle_that_moves_sideways_is_late_in_three_directions() -> None:
+    p = take("nav2", make(find_effect("transport_delay")(d=0.1), vehicle=MECANUM))
+    assert {name.rpartition(".")[2]: value for name, value in p.items()} == {
+        "model_delay_vx": 0.1,
+        "model_delay_vy": 0.1,
+        "model_delay_wz": 0.1,
+    }
+
+
+SLIPPING = (
+    find_effect("effective_track")(k=1.8),
+    find_effect("speed_track")(k=0.1),
+    find_effect("speed_slip")(k=0.1),
+    find_effect("drive_lag")(tau=0.3),
+)
+
+
+def test_the_factors_of_a_simulator_are_what_the_exported_function_does() -> None:
+    p = take("simulator", make(*SLIPPING))
+    speeds, turn = p["speeds_mps"], 0.25
+    for n, speed in enumerate(speeds):  # type: ignore[arg-type, var-annotated]
+        half = turn * HUSKY.track_width_m / 2.0
+        left, right = (speed - half) / HUSKY.wheel_radius_m, (speed + half) / HUSKY.wheel_radius_m
+        rim = speed / HUSKY.wheel_radius_m
+        straight = predict(make(*SLIPPING), [(-9.0, rim, rim)], 5.0)[-1]
+        curved = predict(make(*SLIPPING), [(-9.0, left, right)], 5.0)[-1]
+        assert p["linear_factor"][n] == pytest.approx(straight[4] / speed, rel=1e-3)  # type: ignore[index]
+        assert p["angular_factor"][n] == pytest.approx(curved[6] / turn, rel=1e-3)  # type: ignore[index]
+    assert p["linear_lag_s"] == p["angular_lag_s"] == 0.3
+
+
+def test_a_multiplier_is_told_by_speed_where_one_does_not_fit() -> None:
+    one = export_model(make(find_effect("effective_track")(k=1.8)), "ros2_control")
+    assert "does not fit" not in one
+    several = export_model(make(*SLIPPING), "ros2_control")
+    table = take("simulator", make(*SLIPPING))
+    line = next(line for line in several.splitlines() if "wheel_separation_multiplier does not fit" in line)
+    pairs = re.findall(r"([\d.]+) at ([\d.]+) m/s", line)
+    told = [float(value) for value, _ in pairs]
+    assert told == pytest.approx(table["wheel_separation_multiplier"], abs=1e-3)
+    assert [float(speed) for _, speed in pairs] == table["speeds_mps"]
+    # The controller turns as it is asked with the multiplier of the speed, on radii of that speed.
+    gain = table["linear_factor"][1] / table["wheel_separation_multiplier"][1]  # type: ignore[index]
+    assert gain == pytest.approx(table["angular_factor"][1], rel=1e-3)  # type: ignore[index]
+
+
+def test_a_simulator_that_skids_by_itself_needs_the_rest_of_the_factor(tmp_path: Path) -> None:
+    own = tmp_path / "sim.yaml"
+    own.write_text(export_model(make(find_effect("effective_track")(k=1.2)), "simulator"), "utf-8")
+    robot = make(find_effect("effective_track")(k=1.8), find_effect("drive_lag")(tau=0.3))
+    text = export_model(robot, "simulator", export.read_current(own, "simulator"))
+    found = read("simulator", text)
+    assert found["simulated_base.ros__parameters.angular_factor"] == pytest.approx([1.2 / 1.8] * 4, rel=1e-3)
+    assert found["simulated_base.ros__parameters.linear_factor"] == pytest.approx([1.0] * 4)
+    own.write_text("simulated_base: {ros__parameters: {speeds_mps: [1, 2]}}", "utf-8")
+    with pytest.raises(MotionError, match="not an export of a simulator"):
+        export.read_current(own, "simulator")
+
+
+@pytest.mark.parametrize(
+    ("gate", "applied", "mode"), [("off", False, "off"), ("on", True, "off"), ("auto", True, "auto")]
+)
+def test_a_steering_offset_has_a_gate_and_the_condition_of_its_learning(
+    gate: str,
+    applied: bool,  # noqa: FBT001 - a case
+    mode: str,
+) -> None:
+    file = make(
+        find_effect("steering_offset")(o=0.03),
+        vehicle=CAR,
+        fit=FIT,
+        intervals={"steering_offset.o": (0.026, 0.034)},
+    )
+    text = export_model(file, "autoware", gate=gate)
+    found = {path.rpartition("ros__parameters.")[2]: value for path, value in read("autoware", text).items()}
+    assert found["steering_offset.enable_auto_steering_offset_removal"] is applied
+    assert found["calibration.mode"] == mode
+    assert found.get("steer_offset") == (0.03 if applied else None)
+    assert f"steer_offset = 0.03 rad with gate {gate}" in text
+    assert "learned mostly at 0.5 to 90 m/s, up to 90 rad/s, on 'gravel'" in text
+    learning = {"initial_offset": 0.03, "initial_covariance": (0.004 / 1.96) ** 2, "min_velocity": 0.5}
+    if gate == "auto":
+        assert {name: found[name] for name in learning} == pytest.approx(learning, rel=1e-3)
+        assert text == export_model(file, "autoware")
+    else:
+        assert not found.keys() & learning.keys()
+
+
+def test_a_gate_is_refused_where_there_is_none() -> None:
+    with pytest.raises(MotionError, match="nav2 has no gate 'on'"):
+        export_model(make(), "nav2", gate="on")
+    with pytest.raises(MotionError, match="no gate 'perhaps'"):
+        export_model(make(vehicle=CAR), "autoware", gate="perhaps")
 
 
 def test_a_car_that_steers_to_the_left_of_itself_is_sent_to_the_right() -> None:
