@@ -30,11 +30,6 @@ def wrap_angle(angle: Floats) -> Floats:
     return np.pi - np.mod(np.pi - angle, 2.0 * np.pi)
 
 
-def unwrap_yaw(yaw: Floats) -> Floats:
-    """Remove the 2 pi jumps of a yaw series [rad], shape (n,)."""
-    return np.unwrap(yaw)
-
-
 def multiply_quaternions(first: Floats, second: Floats) -> Floats:
     """Hamilton product of quaternions of shape (n, 4); apply ``second``, then ``first``."""
     ax, ay, az, aw = np.moveaxis(first, -1, 0)

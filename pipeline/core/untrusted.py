@@ -71,21 +71,6 @@ def resolve_inside(root: AnyPath, name: str, *, follow_links: bool = False) -> A
     return path
 
 
-def check_name(name: str, *, where: str) -> None:
-    """Reject the names that `resolve_inside` rejects independently of the files on disk.
-
-    Args:
-        name: as in `resolve_inside`.
-        where: location for the error message.
-
-    Raises:
-        PathError: ``path_outside``.
-    """
-    problem = _find_problem(name)
-    if problem:
-        raise _outside(where, name, problem)
-
-
 def _find_problem(name: str) -> str:
     """Reason to reject a name, as the end of a sentence; empty if there is none."""
     try:

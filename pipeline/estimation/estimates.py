@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,6 @@ from pipeline.models import (
     ModelFile,
     Parameter,
     cut_interval,
-    find_effect,
     is_of_one_run,
     list_effects,
     stands_at_bound,
@@ -153,11 +152,6 @@ def list_estimates(
 def _overlaps(effect: Effect, model: Model) -> bool:
     """Whether an effect is a special case of one of the model, or the other way round."""
     return any(effect.id in one.contains or one.id in effect.contains for one in model)
-
-
-def restore(name: str, values: Mapping[str, Value]) -> Effect:
-    """The effect with these values."""
-    return find_effect(name)().change(**{key: value.value for key, value in values.items()})
 
 
 # Eight steps of six seconds, and fifteen: with fewer, a delay or a terrain change imitates the true effect.

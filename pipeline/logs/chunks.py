@@ -2,7 +2,6 @@
 
 import bz2
 import threading
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -158,11 +157,6 @@ def inflate_prefix(stored: Buffer, compression: str, size: int, needed: int) -> 
     if len(prefix) != needed:
         raise InflateError(f"{len(prefix)} bytes came out in place of {needed}")
     return prefix
-
-
-def checksum(records: Buffer) -> int:
-    """CRC-32 as stored in MCAP files."""
-    return zlib.crc32(records)
 
 
 def holds_own_checksum(stored: Buffer, compression: str) -> bool:

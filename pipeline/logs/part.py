@@ -7,6 +7,7 @@ import hashlib
 import os
 import stat
 import struct
+import zlib
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import dataclass, replace
@@ -22,7 +23,6 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, MetadataIndex, Sc
 from pipeline.core import guess_names
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog, Cover, keep_within
-from pipeline.logs.chunks import checksum
 from pipeline.logs.compressed import COMPRESSED, open_inflated
 from pipeline.logs.records import (
     LONGEST_HEAD,
@@ -300,7 +300,7 @@ def _read_summary(source: ByteSource, catalog: Catalog) -> _Summary:
     if not len(rec.MAGIC) <= start <= footer_at or footer_at - start > _MAX_SUMMARY:
         raise _DamagedSummaryError("the footer is damaged")
     body = source.read_at(start, footer_at - start)
-    if crc and checksum(body + tail[: rec.HEAD_SIZE + 16]) != crc:
+    if crc and zlib.crc32(body + tail[: rec.HEAD_SIZE + 16]) != crc:
         raise _DamagedSummaryError("the summary is damaged")
     try:
         summary = _parse_summary(body, start, catalog, Cover.CHECKSUM if crc else Cover.SUMMARY)

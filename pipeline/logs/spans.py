@@ -213,7 +213,7 @@ def load_together(source: ByteSource, spans: Sequence[Span], size: int) -> Loade
             chunks.inflate_into(part[head.body : head.body + head.compressed_size], head.compression, target)
         except (_SpanError, chunks.InflateError, ValueError):
             return None
-        if losses or entries is None or head.crc == 0 or chunks.checksum(target) != head.crc:
+        if losses or entries is None or head.crc == 0 or zlib.crc32(target) != head.crc:
             return None
         shift = np.array([0, position], dtype=np.uint64)
         joined += [(channel, entry + shift) for channel, entry in entries]
@@ -285,7 +285,7 @@ def _inflate_checked(
         chunk = chunks.inflate(stored, head.compression, head.uncompressed_size)
     except chunks.InflateError as error:
         raise _SpanError("damaged_chunk", f"it cannot be decompressed: {error}") from None
-    computed = chunks.checksum(chunk) if head.crc else 0
+    computed = zlib.crc32(chunk) if head.crc else 0
     if computed == head.crc:
         return chunk
     reason = explain_checksum(head.crc, computed, stored, head.compression)
@@ -323,7 +323,7 @@ def explain_checksum(stored_crc: int, computed: int, stored: Buffer, compression
         return "it is stored inverted"
     if stored_crc == int.from_bytes(computed.to_bytes(4, "little"), "big"):
         return "it is stored in the other byte order"
-    if compression and stored_crc == chunks.checksum(stored):
+    if compression and stored_crc == zlib.crc32(stored):
         return "it was taken over the compressed bytes"
     return None
 

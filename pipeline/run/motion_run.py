@@ -431,7 +431,7 @@ def _unroll(piece: Mapping[str, NDArray[Any]], before: Track | None) -> Track:
         segment=piece["segment"].astype(np.int64),
         path=path,
         heading=heading,
-        attitude=np.column_stack((roll, pitch, rigid.unwrap_yaw(yaw))),
+        attitude=np.column_stack((roll, pitch, np.unwrap(yaw))),
         position=position[:, :2],
         active=piece["active"],
     )

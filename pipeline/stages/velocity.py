@@ -246,7 +246,7 @@ def _differentiate_segment(
         **{name: at[:, i] for i, name in enumerate("xyz")},
         "roll": roll,
         "pitch": pitch,
-        "yaw": rigid.unwrap_yaw(yaw),
+        "yaw": np.unwrap(yaw),
         **{name: velocity[:, i] for i, name in enumerate(("v_x", "v_y", "v_w"))},
         "recorded_t": stamped,
         **{f"recorded_{axis}": before[:, i] for i, axis in enumerate("xyw")},
