@@ -13,6 +13,9 @@ export LOG LOGS OUT VEHICLE ARGS NAME MINUTES
 # Exit code 3 means done, but a log had losses or was refused: that is on the screen, and make has not failed.
 FORGIVE_LOSSES = || { code=$$?; [ $$code -eq 3 ] && echo "done, with losses or logs that were refused (see above)" >&2 || exit $$code; }
 
+# Python compiles what it imports, a quarter of what the packages hold.
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+
 # A benchmark has one core, and others come first.
 ONE_CORE = OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10
 
@@ -104,9 +107,9 @@ browser: ## install Debian's Chromium, for the tests that look at pages
 
 lock: $(VENV)/.ready-dev ## pin the dependencies of pyproject.toml again
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --output-file requirements.txt
+		--no-emit-index-url --no-header --no-annotate --extra build --extra serve --output-file requirements.txt
 	$(BIN)/uv pip compile pyproject.toml --quiet --universal --python-version 3.11 --generate-hashes \
-		--no-emit-index-url --no-header --no-annotate --extra build --extra dask --extra dev --extra docs --extra learn --extra live --extra pandas --extra s3 --extra sim \
+		--no-emit-index-url --no-header --no-annotate --extra all --extra build --extra dev --extra docs \
 		--constraint requirements.txt --output-file requirements-dev.txt
 
 $(VENV)/bin/python:
@@ -115,14 +118,14 @@ $(VENV)/bin/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(VENV)/.ready: requirements.txt pyproject.toml | $(VENV)/bin/python
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(PIP) --require-hashes --requirement requirements.txt
+	$(PIP) --no-deps --no-build-isolation --editable .
 	@# The program starts .2 s sooner where the environment forbids Python to keep what it compiled.
-	@$(BIN)/python -m compileall -q pipeline schemas slip
-	@# Loops are compiled once, here, and not at the first answer.
-	@$(BIN)/python -c "from pipeline.cli.verbs_machine import compile_every_loop; compile_every_loop()"
+	@$(BIN)/python -m compileall -q -j 0 pipeline schemas slip
+	@# Loops are compiled once, here, and not at the first answer; so is what they import of other packages.
+	@PYTHONDONTWRITEBYTECODE= $(BIN)/python -c "import pipeline.web.server; from pipeline.cli.verbs_machine import compile_every_loop; compile_every_loop()"
 	@touch $@
 
 $(VENV)/.ready-dev: requirements-dev.txt $(VENV)/.ready
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --require-hashes --requirement requirements-dev.txt
+	$(PIP) --require-hashes --requirement requirements-dev.txt
 	@touch $@

@@ -15,7 +15,15 @@ import msgspec
 from pipeline.analysis import STAGES, Options
 from pipeline.analysis.summary import diagnose_work, find_peers, judge_run, list_versions, summarize_run
 from pipeline.analysis.work import Progress, Work, hash_model, key_stages, read_wanted
-from pipeline.core import FIGURES, INPUTS, FigureFormat, SlipError, read_version
+from pipeline.core import (
+    FIGURES,
+    INPUTS,
+    FigureFormat,
+    SlipError,
+    read_version,
+    require_compiler,
+    require_package,
+)
 from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
@@ -90,6 +98,11 @@ def analyze_log(path: Path, options: Options, progress: Progress = _ignore) -> O
     Raises:
         SlipError: the log, the configuration or a stage fails; the stored run is then unchanged.
     """
+    # Before the work, which would be in vain.
+    if options.diagnosis:
+        require_compiler(otherwise="leave it out with --no-diagnosis")
+    if options.report or options.figures:
+        require_package("vl_convert", "report", "a report", otherwise="leave it out with --no-report")
     store = Store(options.out)
     setup = set_up_log(path, options)
     # The setup restores addresses that the command line altered.

@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from importlib import metadata
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 from urllib.parse import urlencode
@@ -29,7 +30,7 @@ from pipeline.cli.conventions import (
     print_note,
     print_result,
 )
-from pipeline.core import PACKAGE, measure_memory, read_version
+from pipeline.core import PACKAGE, measure_memory, read_version, require_package
 
 
 def serve(  # noqa: D417 - the results folder documents itself
@@ -62,6 +63,8 @@ def serve(  # noqa: D417 - the results folder documents itself
         json: print address and token as one JSON object.
         quiet: print nothing.
     """
+    for package in ("uvicorn", "starlette", "numba", "vl_convert"):
+        require_package(package, "serve", "the workbench")
     from pipeline.store import Store  # noqa: PLC0415 - heavy
     from pipeline.store.stored_runs import find_run  # noqa: PLC0415 - heavy
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
@@ -113,6 +116,8 @@ _LEAST_FREE_BYTES = 3_000_000_000
 """Smallest free space for a season of logs [bytes]: four minutes of the samples produce 2.2 MB of tables
 (`du` of their runs), so 100 hours need 3 GB."""
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome")
+_EXTRA = re.compile(r"extra == ['\"](\w+)['\"]")
+_NOT_FOR_USERS = {"all", "build", "dev", "docs"}
 _REQUIREMENT = re.compile(r"([\w.-]+)(?:\[[^\]]*\])?>=([\d.]+)")
 
 
@@ -162,6 +167,7 @@ def _look(results: Path) -> Iterator[Check]:
         "" if sys.version_info >= _PYTHON else "Install slip with Python 3.11 or newer",
     )
     yield _look_at_packages()
+    yield _look_at_extras()
     yield _look_at_loops()
     yield _look_for_browser()
     # A missing folder is created in its nearest existing parent.
@@ -195,6 +201,22 @@ def _look_at_packages() -> Check:
     return _judge("packages", what, "Install slip again, as its handbook says" if wrong else "")
 
 
+def _look_at_extras() -> Check:
+    lacking: dict[str, str] = {}
+    for text in metadata.requires(PACKAGE) or ():
+        extra, name = _EXTRA.search(text), _REQUIREMENT.match(text)
+        if extra is None or name is None or extra[1] in _NOT_FOR_USERS:
+            continue
+        try:
+            metadata.version(name[1])
+        except metadata.PackageNotFoundError:
+            lacking.setdefault(extra[1], name[1])
+    if not lacking:
+        return Check("extras", "ok", "all are installed")
+    what = f"not installed: {', '.join(f'{extra} ({name})' for extra, name in sorted(lacking.items()))}"
+    return Check("extras", "optional", what, f"For one of them: pip install '{PACKAGE}[{min(lacking)}]'")
+
+
 def _read_numbers(version: str) -> list[int]:
     return [int(part) for part in re.findall(r"\d+", version.partition("+")[0])]
 
@@ -217,6 +239,9 @@ def _look_at_loops() -> Check:
     name = "compiled loops"
     count = compile_every_loop()
     caches = list_caches()
+    if find_spec("numba") is None:
+        hint = f"For diagnoses: pip install '{PACKAGE}[diagnose]'"
+        return Check(name, "optional", "Numba is not installed; slip tables do without it", hint)
     if not caches:
         what = f"{count} loops run as Python, 100 times slower"
         return Check(name, "problem", what, "Unset NUMBA_DISABLE_JIT")

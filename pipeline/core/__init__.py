@@ -54,7 +54,14 @@ if TYPE_CHECKING:
         pick_finite,
         round_digits,
     )
-    from pipeline.core.machine_code import LANES, compiled, count_loops, deal_lanes, list_caches
+    from pipeline.core.machine_code import (
+        LANES,
+        compiled,
+        count_loops,
+        deal_lanes,
+        list_caches,
+        require_compiler,
+    )
     from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory
     from pipeline.core.processes import (
         PACKAGE,
@@ -63,6 +70,7 @@ if TYPE_CHECKING:
         keep_current_folder_out,
         python_command,
         read_version,
+        require_package,
         silence_warnings,
         slip_command,
     )

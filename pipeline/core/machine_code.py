@@ -1,19 +1,26 @@
 """Loops over signals, written as plain Python and compiled by Numba when their module is imported.
 
 The machine code is cached beside the source, or in the user's cache directory, or in ``NUMBA_CACHE_DIR``;
-`slip doctor` says where. ``NUMBA_DISABLE_JIT=1`` runs the Python source instead, with the same results.
-A loop allocates nothing: it writes into its array arguments.
+`slip doctor` says where. ``NUMBA_DISABLE_JIT=1`` runs the Python source instead, with the same results, as it
+is where Numba is not installed: slip tables take some seconds longer then, and fits are refused
+(`require_compiler`). A loop allocates nothing: it writes into its array arguments.
 """
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import importlib
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any, TypeVar
 
-import llvmlite.binding
-import numba
 import numpy as np
+
+from pipeline.core.processes import require_package
+
+numba: Any = None
+with contextlib.suppress(ImportError):  # the extra `diagnose` may not be installed
+    numba = importlib.import_module("numba")
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -37,6 +44,8 @@ def compiled(signature: str | None = None) -> Callable[[Function], Function]:
     """
 
     def decorate(function: Function) -> Function:
+        if numba is None:
+            return function
         compile_it: Any = numba.njit
         try:
             loop = compile_it(signature, cache=True, **_HOW)(function)
@@ -49,9 +58,21 @@ def compiled(signature: str | None = None) -> Callable[[Function], Function]:
     return decorate
 
 
+def require_compiler(*, otherwise: str = "") -> None:
+    """Refuse what takes hours where loops run as Python because Numba is not installed.
+
+    Args:
+        otherwise: how to do without it.
+
+    Raises:
+        SlipError: ``no_numba``.
+    """
+    require_package("numba", "diagnose", "a fit of effects", otherwise=otherwise)
+
+
 def list_caches() -> set[str | None]:
     """Directories with cached loops, None for loops that are not cached; empty if loops run as Python."""
-    if numba.config.DISABLE_JIT:  # type: ignore[attr-defined]
+    if numba is None or numba.config.DISABLE_JIT:
         return set()
     return {None if loop.stats.cache_path is None else str(loop.stats.cache_path) for loop in _loops}
 
@@ -82,4 +103,8 @@ def deal_lanes(count: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
 @functools.cache
 def _find_pack() -> int:
     """Walks that the processor computes at a time: a loop of another count does the rest one by one."""
+    if numba is None:
+        return 1
+    import llvmlite.binding  # noqa: PLC0415 - comes with Numba
+
     return 8 if llvmlite.binding.get_host_cpu_features().get("avx512f") else 4

@@ -7,7 +7,10 @@ import sys
 import threading
 import time
 import warnings
+from importlib.util import find_spec
 from pathlib import Path
+
+from pipeline.core.text import SlipError
 
 
 def silence_warnings() -> None:
@@ -39,6 +42,24 @@ def read_version() -> str:
         declared = Path(__file__).parents[2] / "pyproject.toml"
         content = tomllib.loads(declared.read_text(encoding="utf-8"))
         return str(content["project"]["version"])
+
+
+def require_package(name: str, extra: str, purpose: str, *, otherwise: str = "") -> None:
+    """Refuse what needs a package of an extra that is not installed.
+
+    Args:
+        name: the package, as it is imported.
+        extra: the extra of `slip-pipeline` that installs it.
+        purpose: what needs it, the beginning of a sentence.
+        otherwise: how to do without it.
+
+    Raises:
+        SlipError: ``no_`` and the name.
+    """
+    if find_spec(name) is None:
+        what = f"{purpose} needs {name}, which is not installed"
+        hint = f"Install the extra: pip install '{PACKAGE}[{extra}]'"
+        raise SlipError(f"no_{name}", what, hint=f"{hint}, or {otherwise}" if otherwise else hint)
 
 
 THREAD_VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "POLARS_MAX_THREADS")

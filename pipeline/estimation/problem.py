@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Newest, join_parts, turn_units
+from pipeline.core import Flags, Floats, Newest, join_parts, require_compiler, turn_units
 from pipeline.estimation.comparison import Comparison, Input, choose_rate
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.floor import estimate_floor
@@ -181,6 +181,7 @@ class Problem:
         *,
         heading: HeadingSource = HeadingSource.AUTO,
     ) -> None:
+        require_compiler()
         self.runs = tuple(run.anchored for run in runs)
         self.vehicle = runs[0].correct_vehicle(vehicle)
         self.source = source

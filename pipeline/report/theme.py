@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -18,7 +19,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import polars as pl
 
-from pipeline.core import python_command
+from pipeline.core import python_command, require_package
 
 if TYPE_CHECKING:
     from pipeline.report.figures import Drawing
@@ -382,6 +383,7 @@ _EXPOSE = "window.vegaEmbed = vegaEmbed;"
 
 def load_bundle() -> str:
     """Script that defines ``vegaEmbed`` on the window, suitable for a script element."""
+    require_package("vl_convert", "report", "a page with figures")
     path = cache_path()
     cached = _read_checked(path)
     if cached is not None:
@@ -400,8 +402,10 @@ def warm_bundle() -> None:
     """Bundle in a separate process, so that it overlaps with reading the log.
 
     The bundler holds the interpreter lock while it works, so a thread would not help. Returns immediately;
-    does nothing if the cache is filled or cannot be written.
+    does nothing if the cache is filled or cannot be written, or without the bundler.
     """
+    if find_spec("vl_convert") is None:
+        return
     path = cache_path()
     if path.is_file() or not _can_write(path.parent):
         return

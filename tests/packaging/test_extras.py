@@ -1,0 +1,95 @@
+"""The core without its extras: slip tables as ever, and one clear line for what needs one."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from pipeline.core import SlipError, require_package
+from pipeline.simulate import simulate_case
+
+ROOT = Path(__file__).parents[2]
+EXTRAS = ("distributed", "llvmlite", "mujoco", "numba", "pandas", "s3fs", "sklearn", "starlette", "uvicorn",
+          "vl_convert", "websockets")  # fmt: skip
+LEAN = f"""
+import sys
+
+class Hidden:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in {EXTRAS!r}:
+            raise ModuleNotFoundError(f"no module named {{name}}", name=name)
+
+sys.meta_path.insert(0, Hidden())
+for name in {EXTRAS!r}:
+    sys.modules[name] = None
+from pipeline.cli import main
+main(sys.argv[1:])
+"""
+"""The program where none of these packages is installed."""
+
+
+def run_lean(*words: object, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", LEAN, *map(str, words)]
+    around = {**os.environ, "XDG_CACHE_HOME": str(cwd / "cache")}
+    return subprocess.run(command, capture_output=True, text=True, check=False, cwd=cwd, env=around)
+
+
+def test_slip_tables_need_no_extra(tmp_path: Path) -> None:
+    simulate_case("husky_tile", out=tmp_path / "logs" / "a.mcap", duration_s=20.0)
+    done = run_lean("analyze", "logs/a.mcap", "--no-diagnosis", "--no-report", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "median slip modulus" in done.stdout
+    again = run_lean(
+        "batch", "logs", "--settle", 0, "--executor", "inline", "--results", "other", cwd=tmp_path
+    )
+    assert again.returncode == 0, again.stderr
+
+    whole = [sys.executable, "-m", "pipeline", "analyze", "logs/a.mcap", "--no-diagnosis", "--no-report"]
+    subprocess.run([*whole, "--results", "whole"], check=True, capture_output=True, cwd=tmp_path)
+    tables = [
+        next((tmp_path / name / "runs").glob("*/*/*/slip.parquet")).read_bytes()
+        for name in ("results", "whole")
+    ]
+    assert tables[0] == tables[1]
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (("analyze", "a.mcap"), "needs numba, which is not installed. Install the extra: pip install 'slip-"),
+        (("analyze", "a.mcap"), "[diagnose]', or leave it out with --no-diagnosis."),
+        (("analyze", "a.mcap", "--no-diagnosis"), "a report needs vl_convert, which is not installed."),
+        (("analyze", "a.mcap", "--no-diagnosis"), "[report]', or leave it out with --no-report."),
+        (("diagnose", "a.mcap"), "pip install 'slip-pipeline[diagnose]'"),
+        (("serve",), "the workbench needs uvicorn, which is not installed."),
+        (("serve",), "pip install 'slip-pipeline[serve]'."),
+    ],
+)
+def test_what_needs_an_extra_says_so_in_one_line(words: tuple[str, ...], line: str, tmp_path: Path) -> None:
+    simulate_case("husky_tile", out=tmp_path / "a.mcap", duration_s=10.0)
+    refused = run_lean(*words, cwd=tmp_path)
+    assert refused.returncode == 1
+    assert line in refused.stderr
+    assert "Traceback" not in refused.stderr
+
+
+def test_what_is_there_is_not_refused() -> None:
+    require_package("numpy", "diagnose", "this")
+    with pytest.raises(SlipError, match="this needs no_such_package"):
+        require_package("no_such_package", "diagnose", "this")
+
+
+def test_the_extras_of_the_handbook_are_those_of_the_wheel() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = project["optional-dependencies"]
+    (whole,) = extras["all"]
+    named = set(re.findall(r"\w+", whole.partition("[")[2]))
+    assert named == set(extras) - {"all", "build", "dev", "docs"}
+    page = (ROOT / "docs" / "pages" / "install.md").read_text()
+    assert {extra for extra in named if f"`[{extra}]`" in page} == named
