@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     Break = Callable[[pytest.MonkeyPatch], None]
 
 NAMES = [
-    "Python", "packages", "compiled loops", "Chromium", "disk", "permission", "locale", "time zone",
+    "Python", "packages", "extras", "compiled loops", "Chromium", "disk", "permission", "locale", "time zone",
 ]  # fmt: skip
 
 
@@ -52,7 +52,7 @@ def test_a_whole_installation_has_no_problem_and_a_line_for_each_look(tmp_path: 
     assert found["ok"]
     assert [check["name"] for check in found["checks"]] == NAMES
     assert {check["state"] for check in found["checks"]} <= {"ok", "optional"}
-    assert "kept in" in found["checks"][2]["text"]
+    assert "kept in" in found["checks"][3]["text"]
     assert list(tmp_path.iterdir()) == []
 
 
