@@ -15,9 +15,9 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core import Floats, join_parts
+from pipeline.core import Complex, Floats, join_parts
 from pipeline.recording.motion import Motion
-from pipeline.recording.readings import Reading
+from pipeline.recording.readings import Reading, fit_across
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
 from pipeline.sources import COMMANDED, MEASURED, convert_unit
 
@@ -25,6 +25,8 @@ from pipeline.sources import COMMANDED, MEASURED, convert_unit
 
 _USUAL_DEG = 12.0
 """Angle between heading and course within which it is that of a mounting, and not of another axis."""
+_NEARLY_BACK_DEG = 135.0
+"""Angle from which on half a turn is nearer than a quarter."""
 _CONCENTRATED = 0.6
 """Concentration of the course above which its angle means anything."""
 
@@ -49,13 +51,13 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     best = max(known, key=lambda one: one.explained.moves if one.explained else 0.0)
     explained = best.explained
     assert explained is not None  # noqa: S101 - chosen for it
-    course, concentration = motion.find_course_deg()
-    angles = {0.0, 90.0}
     part = explained.motion
     ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
     aside = best.columns_aside(part.steps, explained.lag, explained.delay)
     if aside.size:
-        course, concentration = _find_offset_deg(part, ahead, aside[:, 0]), 1.0
+        return _find_frame_across(motion, part, join_parts(ahead, aside[:, 0]))
+    course, concentration = motion.find_course_deg()
+    angles = {0.0, 90.0}
     if concentration > _CONCENTRATED and abs(course - 90.0 * round(course / 90.0)) > _USUAL_DEG:
         angles.add(course)
     scores: dict[tuple[bool, float], Floats] = {}
@@ -76,15 +78,34 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     return motion.turn(flip=likeliest[0], offset_deg=likeliest[1]), margin
 
 
-def _find_offset_deg(motion: Motion, ahead: Floats, aside: Floats) -> float:
-    """Angle from the heading to the course that is asked of a base that moves sideways, within half a turn.
+def _find_frame_across(motion: Motion, part: Motion, asked: Complex) -> tuple[Motion, float]:
+    """The same of a base that moves sideways, which moves as it is asked to in both directions.
 
-    Of both hands of the frame that one counts which explains more of the course.
+    Args:
+        motion: the motion as recorded.
+        part: where the reading is known.
+        asked: increments ahead + 1j * left over its steps, shape (n,).
     """
-    asked = join_parts(ahead, aside)
-    gains = [np.vdot(one, motion.body) for one in (asked, asked.conj())]
-    angle = float(np.degrees(np.angle(max(gains, key=abs))))
-    return (angle + 90.0) % 180.0 - 90.0
+    usual = fit_across(part, [asked], lever=True).blocks
+    chosen: tuple[bool, float, Floats] | None = None
+    for flip in (False, True):
+        body = part.turn(flip=flip, offset_deg=0.0).body
+        # Along one line, a mirrored frame is a turned one: the other hand is to be clearly better.
+        for one in (asked, np.conj(asked)):
+            angle = float(np.degrees(np.angle(np.vdot(one, body))))
+            # Half a turn reverses signs only.
+            angle -= 180.0 * np.sign(angle) if abs(angle) > _NEARLY_BACK_DEG else 0.0
+            blocks = fit_across(part.turn(flip=flip, offset_deg=angle), [one], lever=True).blocks
+            if chosen is None or compare(blocks, chosen[2]) > CLEAR:
+                chosen = flip, angle, blocks
+    assert chosen is not None  # noqa: S101 - the first one is
+    flip, angle, blocks = chosen
+    quarters = 90.0 * round(angle / 90.0)
+    angle = angle if abs(angle - quarters) > _USUAL_DEG else quarters
+    margin, gain = compare(blocks, usual), float((blocks - usual).sum()) / part.moved.size
+    if not (flip or angle) or margin < CLEAR or gain < LEAST_NATS:
+        return motion, 0.0
+    return motion.turn(flip=flip, offset_deg=angle), margin
 
 
 # Signs: the fewest faults that explain which signals go the other way.

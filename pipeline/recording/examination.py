@@ -302,7 +302,9 @@ class Examination:
             return None
         if source.form is DriveForm.BODY:
             names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
-            return Reading("body", str(source), *(Held(*_column(table, name)) for name in names))
+            stands = not is_measured
+            signals = (Held(*_column(table, name), may_stand=stands) for name in names)
+            return Reading("body", str(source), *signals)
         if unit.kind == "ackermann":
             speed = Held(*_column(table, "speed"))
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
@@ -404,7 +406,7 @@ class Examination:
         if self._is_still(drives):
             for one in drives:
                 one.reading.explained = None
-        sure = [one for one in drives if one.is_sure]
+        sure = [one for one in drives if one.is_sure and not one.reading.is_constant]
         earliest = min(
             (
                 one.reading.explained.lag + one.reading.explained.delay
@@ -636,7 +638,7 @@ class Examination:
             signs = {key: sign if key[1] == "turned" else -sign for key, sign in signs.items()}
         made = find_reversed(signs)
         if made.rivals:
-            self._report_either(made, signs)
+            self._report_either(made, signs, command, wheels)
         else:
             for fault in made.faults:
                 if fault == "pose_backward":
@@ -669,7 +671,9 @@ class Examination:
                 )
             self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
 
-    def _report_fault(self, fault: str, command: Candidate | None, wheels: Candidate | None) -> None:
+    def _report_fault(
+        self, fault: str, command: Candidate | None, wheels: Candidate | None, others: Sequence[str] = ()
+    ) -> None:
         """Correct or report a fault; the sign of a gyro is fitted by `stages.align`."""
         drive = wheels if fault.startswith("wheels") else command
         if fault == "gyro" or drive is None:
@@ -682,11 +686,22 @@ class Examination:
             self._correct("wheels", what, line, change)
             return
         role = "wheels" if drive is wheels else "command"
-        text = f"{drive.source} contradicts all other signals: {_FAULTS[fault]}"
+        faults = "; or ".join(_FAULTS[one] for one in (fault, *others))
+        text = f"{drive.source} contradicts all other signals: {faults}"
         self.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
 
-    def _report_either(self, made: Reversal, signs: dict[tuple[str, Axis], int]) -> None:
+    def _report_either(
+        self,
+        made: Reversal,
+        signs: dict[tuple[str, Axis], int],
+        command: Candidate | None,
+        wheels: Candidate | None,
+    ) -> None:
         """Two signals that contradict each other, with what mends the one and the other."""
+        ways = (made.faults, *made.rivals)
+        if all(len(names) == 1 and names[0].startswith("command") for names in ways):
+            self._report_fault(made.faults[0], command, wheels, [names[0] for names in made.rivals])
+            return
         against = sorted({name for (name, _), sign in signs.items() if sign < 0})
         verbs = {"ahead": "drive", "turned": "turn", "aside": "move sideways"}
         axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
@@ -738,6 +753,14 @@ class Examination:
                 abs(float(one.gains[0])) if is_seen else None
                 for is_seen, one in ((command.sign("ahead"), explained.ahead), (turns, explained.turned))
             ]
+            beside = None if wheels is None or not wheels.is_sure else wheels.reading.explained
+            if wheels is not None and beside is not None and wheels.reading.form == "body":
+                # What wheels do of a command is its unit on any ground.
+                fits = (("ahead", beside.ahead), ("turned", beside.turned))
+                gains = [
+                    gain / abs(float(one.gains[0])) if gain and wheels.sign(axis) else gain  # type: ignore[arg-type]
+                    for gain, (axis, one) in zip(gains, fits, strict=True)
+                ]
             units = find_body_units(gains, explained.shares, str(command.source))
             self._report_units("command", command, units, gains)
         if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):

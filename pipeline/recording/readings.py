@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, compiled
+from pipeline.core import Complex, Flags, Floats, compiled, join_parts
 from pipeline.recording.motion import Motion
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
 
@@ -35,14 +35,17 @@ class Held:
     Args:
         times: increasing [s], shape (n,).
         values: NaN where unknown, shape (n,).
+        may_stand: whether one value throughout says something, as that of a command does.
     """
 
-    def __init__(self, times: Floats, values: Floats) -> None:
+    def __init__(self, times: Floats, values: Floats, *, may_stand: bool = False) -> None:
         known = np.isfinite(values)
         if known.any():
             known &= np.abs(times - np.median(times[known])) < _LONGEST_S
         self.times, self.values = times[known], values[known]
-        self.moves = self.values.size >= FEWEST_STEPS and bool(np.ptp(self.values) > 0.0)
+        enough = self.values.size >= FEWEST_STEPS
+        self.is_constant = not (enough and bool(np.ptp(self.values) > 0.0))
+        self.moves = not self.is_constant or (enough and may_stand and bool(self.values.any()))
         self._sums: dict[float, Floats] = {}
         if self.values.size < FEWEST_STEPS:
             return
@@ -158,6 +161,7 @@ class Explained:
         other: likelihood with (or without) one side reversed; None where it was not tried.
         shares: of both channels, the part of their size that is explained, from 0 to 1.
         aside: fit of the motion to the left, and its likelihood without the reading; None if not asked.
+        across: the same of the motion in both directions, whatever the angle of its frame.
     """
 
     motion: Motion
@@ -170,21 +174,27 @@ class Explained:
     other: Floats | None
     shares: tuple[float, float] = (0.0, 0.0)
     aside: tuple[Fit, Floats] | None = None
+    across: tuple[Fit, Floats] | None = None
 
     @property
     def blocks(self) -> Floats:
         """Log-likelihood of every block."""
-        return self.ahead.blocks + self.turned.blocks
+        return self.turned.blocks + (self.ahead.blocks if self.across is None else self.across[0].blocks)
+
+    @property
+    def nothing(self) -> Floats:
+        """The same without the reading."""
+        return self.none[1] + (self.none[0] if self.across is None else self.across[1])
 
     @property
     def moves(self) -> float:
         """Vuong statistic of the reading against none."""
-        return compare(self.blocks, self.none[0] + self.none[1])
+        return compare(self.blocks, self.nothing)
 
     @property
     def nats(self) -> float:
         """Gain in log-likelihood per step."""
-        return float((self.blocks - self.none[0] - self.none[1]).sum()) / self.motion.moved.size
+        return float((self.blocks - self.nothing).sum()) / self.motion.moved.size
 
     @property
     def is_sure(self) -> bool:
@@ -229,7 +239,12 @@ class Reading:
     @property
     def inputs(self) -> Sequence[Held]:
         """Inputs that move."""
-        return [one for one in (self.first, self.second) if one is not None and one.moves]
+        return [one for one in (self.first, self.second, self.third) if one is not None and one.moves]
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it says one thing throughout, so that nothing tells when the motion follows it."""
+        return all(one.is_constant for one in self.inputs)
 
     @property
     def dead_side(self) -> str:
@@ -319,6 +334,10 @@ class Reading:
                 fit(across, np.column_stack([aside, beside]), motion.steps),
                 fit(across, beside, motion.steps).blocks,
             )
+            asked = join_parts(first, aside[:, 0])
+            hands = [fit_across(motion, [one, 1j * one], lever=lever) for one in (asked, np.conj(asked))]
+            best = max(hands, key=lambda one: float(one.blocks.sum()))
+            made.across = best, fit_across(motion, [], lever=lever).blocks
         made.shares = (
             measure_share(ahead, float(made.ahead.gains[0]) * first),
             measure_share(yaw, float(made.turned.gains[0]) * second),
@@ -333,19 +352,13 @@ class Reading:
             some = np.zeros(count, dtype=bool)
             some[np.linspace(0, count - 1, _MOST_ROWS).astype(np.int64)] = True
         part = motion.take(some)
-        channels = [(values, float(np.quantile(values**2, 0.97))) for values in (part.body.real, part.yaw)]
+        limits = [float(np.quantile(values**2, 0.97)) for values in (part.body.real, part.yaw)]
         scores: dict[tuple[float, float], float] = {}
 
         def score(lag: float, delay: float) -> float:
             key = (round(lag, 3), round(delay, 3))
             if key not in scores:
-                total = 0.0
-                columns = self.columns(part.steps, *key, crossed=crossed)
-                for (values, limit), column in zip(channels, columns, strict=True):
-                    power = float(column @ column)
-                    rest = values - column * (float(column @ values) / power if power > 0.0 else 0.0)
-                    total -= 0.5 * values.size * np.log(float(np.mean(np.minimum(rest**2, limit))) + 1e-14)
-                scores[key] = total
+                scores[key] = self._rate_delay(part, *key, limits, crossed=crossed)
             return scores[key]
 
         for lag in _LAGS_S:
@@ -357,6 +370,53 @@ class Reading:
                 for later in (-step, 0.0, step):
                     score(max(0.0, lag + longer), delay + later)
         return max(scores, key=lambda key: scores[key])
+
+    def _rate_delay(
+        self, part: Motion, lag: float, delay: float, limits: Sequence[float], *, crossed: bool
+    ) -> float:
+        """Log-likelihood of both channels, each with its own gain and its squares limited."""
+        columns = self.columns(part.steps, lag, delay, crossed=crossed)
+        channels = list(zip((part.body.real, part.yaw), columns, limits, strict=True))
+        total, aside = 0.0, self.columns_aside(part.steps, lag, delay)
+        if aside.size:
+            total -= part.moved.size * np.log(_miss_across(part, join_parts(columns[0], aside[:, 0])))
+            del channels[0]
+        for values, column, limit in channels:
+            power = float(column @ column)
+            rest = values - column * (float(column @ values) / power if power > 0.0 else 0.0)
+            total -= 0.5 * values.size * np.log(float(np.mean(np.minimum(rest**2, limit))) + 1e-14)
+        return total
+
+
+def _miss_across(motion: Motion, asked: Complex) -> float:
+    """Mean square of a motion beside what is asked for, in a frame of any angle and either hand."""
+    body = motion.body
+    squares = []
+    for one in (asked, np.conj(asked)):
+        gain = np.vdot(one, body) / max(float(np.vdot(one, one).real), 1e-30)
+        squares.append(np.abs(body - gain * one) ** 2)
+    widest = float(np.quantile(np.abs(body) ** 2, 0.97))
+    return min(float(np.mean(np.minimum(square, widest))) for square in squares) + 1e-14
+
+
+def stack(values: Complex) -> Floats:
+    """Parts of complex numbers one after the other, shape (2 n,)."""
+    return np.concatenate((values.real, values.imag))
+
+
+def fit_across(motion: Motion, columns: Sequence[Complex], *, lever: bool) -> Fit:
+    """Fit the motion in the plane, both directions alike.
+
+    Args:
+        motion: of the body.
+        columns: explaining increments ahead + 1j * left, shape (n,) each.
+        lever: whether the pose may be beside the middle.
+    """
+    steps = Steps(np.tile(motion.steps.start, 2), np.tile(motion.steps.end, 2))
+    arms = [motion.yaw + 0j, 1j * motion.yaw] if lever else []
+    parts = [stack(np.asarray(one, dtype=np.complex128)) for one in (*columns, *arms)]
+    design = np.column_stack(parts) if parts else np.zeros((steps.start.size, 0))
+    return fit(stack(motion.body), design, steps)
 
 
 def _is_large(values: Floats, share: float) -> Flags:
