@@ -19,14 +19,14 @@ def open_door(room: str, file: str) -> Callable[[str], object]:
         room: name of the package.
         file: path of its ``__init__``.
     """
-    homes: dict[str, str] = {}
+    files: dict[str, str] = {}
 
     def load(name: str) -> object:
-        if not homes:
-            for home, several, one in _IMPORT.findall(Path(file).read_text(encoding="utf-8")):
-                homes.update(dict.fromkeys(re.findall(r"\w+", several or one), home))
-        if name not in homes:
+        if not files:
+            for module, several, one in _IMPORT.findall(Path(file).read_text(encoding="utf-8")):
+                files.update(dict.fromkeys(re.findall(r"\w+", several or one), module))
+        if name not in files:
             raise AttributeError(f"module {room!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(homes[name]), name)
+        return getattr(importlib.import_module(files[name]), name)
 
     return load

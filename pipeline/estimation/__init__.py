@@ -132,8 +132,8 @@ def diagnose_runs(
         if misread is None:
             return judged
         again = search(members, misread.correct([one.run for one in members]))
-        found = misread.report()
-        runs = (msgspec.structs.replace(run, findings=(found, *run.findings)) for run in again.runs)
+        finding = misread.report()
+        runs = (msgspec.structs.replace(run, findings=(finding, *run.findings)) for run in again.runs)
         return replace(again, runs=tuple(runs))
 
     def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:

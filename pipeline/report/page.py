@@ -290,12 +290,12 @@ def sum_up_slip(page: Page) -> str:
     if report.is_refused:
         return ""
     medians = {name: number_in(_numbers_of(report, name), "median_modulus") for name in report.inputs}
-    told = [
+    texts = [
         f"{format_number(one, digits=2)} m/s {INPUT_WORDS[name]}"
         for name, one in medians.items()
         if one is not None
     ]
-    return f"median slip modulus {', '.join(told)}" if told else ""
+    return f"median slip modulus {', '.join(texts)}" if texts else ""
 
 
 def sum_up_health(page: Page) -> str:

@@ -289,9 +289,9 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
     if diagnosis.unexplained is not None:
         rest = diagnosis.unexplained
         terms = list_terms(rest)
-        told = [describe_unexplained(rest), *terms, format_suggestion(rest)]
+        texts = [describe_unexplained(rest), *terms, format_suggestion(rest)]
         # A formula that is too long for a line is nothing that anybody reads.
-        yield "unexplained", "; ".join(filter(None, told)), (rest.formula or "") if terms else ""
+        yield "unexplained", "; ".join(filter(None, texts)), (rest.formula or "") if terms else ""
     if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
         yield "beyond the effects", beyond, ""
     if diagnosis.unobservable_why:

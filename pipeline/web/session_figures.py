@@ -89,8 +89,8 @@ class FigureCache:
         if scene.track is not None:
             rows["track"] = scene.track.frame
         words = {name: format_words(scene) for name, format_words in _COLOURED.items()}
-        told = {"where": shown.where, "largest": shown.largest, "words": words}
-        return {"rows": pack_rows(rows), **told}
+        summary = {"where": shown.where, "largest": shown.largest, "words": words}
+        return {"rows": pack_rows(rows), **summary}
 
     def _scene(self, shown: Shown, stretch: int, *, with_budget: bool = False) -> Scene:
         """Data of the figures of the run, with the input of the model."""
