@@ -33,7 +33,7 @@ from pipeline.results import read_result
 from pipeline.sources import Vehicle
 from pipeline.store import locate_beside, make_folder, replace_file
 from pipeline.web import WorkbenchError
-from pipeline.words.errors import describe_end
+from pipeline.words import describe_end
 
 SLOTS = ("a", "b")
 

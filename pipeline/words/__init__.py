@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         suggest_drive,
     )
     from pipeline.words.errors import (
+        describe_end,
         describe_need,
         describe_region,
         describe_regions,

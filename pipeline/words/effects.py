@@ -22,8 +22,7 @@ from pipeline.results import read_model
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.models import Effect
-    from pipeline.models.parameter import Parameter
+    from pipeline.models import Effect, Parameter
     from pipeline.results import Named, RunDiagnosis, Undecided, Value
 
 CAUSE = ". Cause: "
