@@ -19,6 +19,8 @@ from pipeline.sources import RANGES, find_alike
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _ROUGH = 2e-3
 """Relative standard error from which on it is stated."""
+_SAME_TRACK = 0.1
+"""Share by which a fitted track may differ from that of a platform without skidding."""
 
 _METHOD = 1.5e-3
 """Relative error of a length beyond that of its fit: of delays on a grid and of what happens between samples.
@@ -215,11 +217,19 @@ def describe_vehicle(
             f"{text} (wheelbase_m under [vehicle] gives another)",
         )
     radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
-    alike = None if track is None else find_alike(radius, track)
-    guess = (
-        f"a {alike.name} has about these: confirm with --vehicle {alike.id}"
-        if alike
-        else "--wheel-radius and --track-width give others"
-    )
-    name = alike.id if alike else f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
+    name, guess = _guess_platform(radius, track)
     return f"fitted_{name}", f"{text} ({guess})"
+
+
+def _guess_platform(radius: float, track: float | None) -> tuple[str, str]:
+    """Id of the platform with these lengths [m], or digits of them; and what to confirm."""
+    name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
+    alike = {} if track is None else find_alike(radius, track)
+    if not alike:
+        return name, "--wheel-radius and --track-width give others"
+    first, (called, share) = next(iter(alike.items()))
+    if abs(share - 1.0) < _SAME_TRACK:
+        return first, f"a {called} has about these: confirm with --vehicle {first}"
+    names = " or ".join(called for called, _ in alike.values())
+    turns = f"turns at {format_share(share)} of the ideal rate"
+    return name, f"a {names} has such wheels, and then {turns}: confirm with --vehicle {' or '.join(alike)}"

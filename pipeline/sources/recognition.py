@@ -206,6 +206,8 @@ VehicleSource = Literal[
     "fitted",
 ]
 _DIFFERS = 0.1
+_SAME_WHEEL = 0.02
+"""Share by which a wheel radius may differ from that of its platform: tyres give way as much under a load."""
 _OTHER_TRACK = 0.25
 _GEOMETRY = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 
@@ -310,15 +312,21 @@ def make_vehicle(name: str, kind: str, geometry: Mapping[str, float | None]) -> 
     return vehicle if all(getattr(vehicle, each) is not None for each in required) else None
 
 
-def find_alike(radius_m: float, track_m: float) -> Vehicle | None:
-    """The platform whose radius and track width agree within a tenth; None if there is none."""
-    alike = [
-        (abs(vehicle.wheel_radius_m / radius_m - 1.0) + abs(vehicle.track_width_m / track_m - 1.0), vehicle)
+def find_alike(radius_m: float, track_m: float) -> dict[str, tuple[str, float]]:
+    """Platforms with wheels of this radius that may turn as if these stood so far apart, the nearest first.
+
+    A skid-steered platform turns less than its wheels ask for, as if its track were wider; none turns more.
+
+    Returns:
+        By id of the platform: its name, and the share of its ideal yaw rate at which it then turns.
+    """
+    shares = {
+        vehicle.id: (vehicle.name, (vehicle.track_width_m or 0.0) / track_m)
         for vehicle in list_presets()
-        if vehicle.kind == "differential" and vehicle.track_width_m
-    ]
-    near = [(off, vehicle) for off, vehicle in alike if off < 2.0 * _DIFFERS]
-    return min(near, key=lambda one: one[0])[1] if near else None
+        if vehicle.kind == "differential" and abs(vehicle.wheel_radius_m / radius_m - 1.0) < _SAME_WHEEL
+    }
+    alike = [(one, found) for one, found in shares.items() if 0.0 < found[1] < 1.0 + _DIFFERS]
+    return dict(sorted(alike, key=lambda item: abs(item[1][1] - 1.0)))
 
 
 def list_contradictions(recognized: Vehicle, chosen: Vehicle) -> list[str]:

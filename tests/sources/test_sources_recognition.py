@@ -145,10 +145,12 @@ def test_where_description_and_preset_differ_both_are_said() -> None:
 
 
 def test_a_fitted_geometry_is_compared_with_the_platforms() -> None:
-    alike = find_alike(0.0331, 0.286)
-    assert alike is not None
-    assert alike.id == "turtlebot3_waffle"
-    assert find_alike(0.5, 0.1) is None
+    assert list(find_alike(0.0331, 0.286)) == ["turtlebot3_waffle", "turtlebot3_burger"]
+    assert find_alike(0.5, 0.1) == {}
+    # A skid-steered platform turns as if its track were wider; other wheels are no guess.
+    alike = find_alike(0.165, 1.01)
+    assert alike["husky_a200"] == ("Clearpath Husky A200", pytest.approx(0.55 / 1.01))
+    assert "warthog_tracks" not in alike
 
 
 def test_four_described_wheels_contradict_a_car_and_no_mecanum_vehicle() -> None:
