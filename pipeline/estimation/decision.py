@@ -13,6 +13,7 @@ from itertools import combinations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.special import stdtr
 
 from pipeline.core import Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
@@ -47,8 +48,8 @@ _UNUSUAL = 8.0
 a wrong track, a lag or a limit."""
 SHOWN = 0.05
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
-_RISEN = 2.0
-"""Standard errors beyond which a rise of a held-out error is no chance: no fall may be smaller than it."""
+_RISEN = 0.02
+"""Probability below which a rise of any of the held-out errors by more than `SHOWN` is no chance."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
 _MOST_EFFECTS = 8
@@ -189,7 +190,7 @@ class Search:
     ) -> SearchResult:
         rivals = list[Rival]()
         for name, one in judged.items():
-            for other in self._list_rivals(current, one.base, [name]):
+            for other in self.list_rivals(current, one.base, [name]):
                 behind = other.cost - find_cost(current)
                 if behind < EQUAL and not set(other.added) & set(current.ids):
                     rivals.append(Rival(name, other, behind))
@@ -309,7 +310,7 @@ class Search:
             if self.budget.is_spent():
                 return None
             without = self._drop(current, names)
-            best = _choose([one for one in self._list_rivals(current, without, names) if not one.refusal])
+            best = _choose([one for one in self.list_rivals(current, without, names) if not one.refusal])
             if best is not None and best.cost < find_cost(current) - EQUAL:
                 return self._prune(best.fit)
         for candidate in self.candidates:
@@ -329,7 +330,7 @@ class Search:
         }
         return [*((name,) for name in free), *(two for two in combinations(sorted(free), 2) if two in pairs)]
 
-    def _list_rivals(self, current: PartFit, without: PartFit, names: Sequence[str]) -> list[Judged]:
+    def list_rivals(self, current: PartFit, without: PartFit, names: Sequence[str]) -> list[Judged]:
         """Models with other effects in the place of some, judged against the one with neither."""
         screen = self.screen(without, names)
         own = without.score - current.score
@@ -435,7 +436,7 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif rise > most:
+    elif rise > SHOWN:
         refusal = f"the error {risen} rises"
     elif most < SHOWN:
         refusal = f"no error falls by more than {format_share(most)}"
@@ -469,21 +470,23 @@ def _compare_horizons(
 ) -> tuple[Floats, float, str]:
     """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where it is."""
     falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
+    least_p = _RISEN / falls.size
     for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
         for channel, name in enumerate(("position", "heading")):
             one, other = getattr(old, name), getattr(new, name)
             if not one.size or not one.mean() > 0.0:
                 continue
             fall = falls[index, channel] = 1.0 - math.sqrt(float(other.mean() / one.mean()))
-            if -fall > rise and _measure_block_t(other - one, old.block) > _RISEN:
+            if -fall > rise and _find_chance(other - one, old.block) < least_p:
                 length = "a whole stretch" if math.isinf(horizon) else f"{horizon:g} s"
                 rise, risen = -fall, f"in {name} over {length}"
     return falls, rise, risen
 
 
-def _measure_block_t(values: Floats, block: Ints) -> float:
-    """Student's t of the sums over blocks."""
-    sums = np.bincount(np.unique(block, return_inverse=True)[1], values)
-    if sums.size <= 2:  # noqa: PLR2004 - two blocks say nothing of chance
-        return math.inf
-    return float(sums.sum() / (math.sqrt(sums.size) * sums.std() + 1e-300))
+def _find_chance(rises: Floats, block: Ints) -> float:
+    """Probability that the sums over blocks are as large as they are by chance, by Student's t."""
+    sums = np.bincount(np.unique(block, return_inverse=True)[1], rises)
+    if sums.size == 1:
+        return 1.0
+    t = float(sums.mean()) * math.sqrt(sums.size) / max(float(sums.std(ddof=1)), 1e-300)
+    return float(stdtr(sums.size - 1, -t))

@@ -213,7 +213,7 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        most: steps.
+        most: times that derivatives are computed anew.
     """
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
@@ -241,9 +241,11 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
 def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
     """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way."""
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
-    damping, is_fresh, is_learned = _LOOSEST, True, True
+    damping, is_fresh, fallen = _LOOSEST, True, 0.0
+    # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
+    most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-    for _ in range(most if fit.smooth else 0):
+    while fit.smooth and most > 0:
         moving, step, promised = _solve(fit, damping)
         fall = 0.0
         if promised >= enough:
@@ -252,21 +254,21 @@ def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
             fall = cost - measure_cost(part, fit.noise, state, free, residual)
         if fall > 0.0:
             fit, cost = replace(fit, state=state, residual=residual), cost - fall
-            damping, is_fresh, is_learned = max(damping / 30.0, 1e-9), False, False
+            damping, is_fresh, fallen = max(damping / 30.0, 1e-9), False, fallen + fall
             if fall <= _NEWS and not exact:
                 continue
         elif is_fresh and promised >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
             continue
-        elif is_fresh and is_learned:
+        elif is_fresh and fallen <= most_fallen:
             break
         if not is_fresh:
             columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
-            fit, is_fresh = replace(fit, columns=columns), True
-        if not is_learned and not 0.0 < fall <= _NEWS:
+            fit, is_fresh, most = replace(fit, columns=columns), True, most - 1
+        if fallen > most_fallen and not 0.0 < fall <= _NEWS:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-            damping, is_learned = _LOOSEST, True
+            damping, fallen = _LOOSEST, 0.0
     if not is_fresh:
         fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit

@@ -55,27 +55,31 @@ def search_formula(
         The effects that stay, and the formula; None where none is accepted.
     """
     terms = list_terms(sideways=sideways)
-    best, least = outcome, find_cost(outcome.final)
-    starts = [outcome.final, *(outcome.judged[name].base for name in outcome.new)]
+    final, least, kept = outcome.final, find_cost(outcome.final), outcome.final
+    wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
     added: list[FormulaEffect] = []
-    for start in starts:
-        wide = replace(search, candidates=terms, given=frozenset(start.ids), shapes=_SHAPES)
-        promised = wide.screen(start).list_singles()
-        gained = start.score - outcome.final.score
-        if not promised or promised[0].net <= gained:
-            continue
-        beyond = wide.run(start.state)
-        new = [cast("FormulaEffect", one) for one in beyond.final.state.effects if is_term(one.id)]
-        cost = find_cost(beyond.final) + 2.0 * math.log(_SHAPES) * len(new)
-        # It displaces an effect only where it is far better than beside it.
-        if new and cost < least - (EQUAL if start is outcome.final else 2.0 * PRICE):
-            best, least, added = replace(outcome, final=start), cost, new
+
+    def consider(fit: PartFit, without: PartFit, worth: float) -> None:
+        nonlocal least, kept, added
+        new = [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
+        cost = find_cost(fit) + 2.0 * math.log(_SHAPES) * len(new)
+        if new and cost < least - worth:
+            least, kept, added = cost, without, new
+
+    if wide.screen(final).list_singles():
+        consider(wide.run(final.state).final, final, EQUAL)
+    for name in outcome.new:
+        # In the place of an effect it must be far better than beside it.
+        for rival in wide.list_rivals(final, outcome.judged[name].base, [name]):
+            if not rival.refusal:
+                consider(rival.fit, rival.base, 2.0 * PRICE)
     if not added:
         return outcome, None
-    gained = best.final.score - least
-    if best is outcome and any(one.gain > _SAME * gained for one in outcome.screen.list_singles()):
+    if kept is final and any(
+        one.gain > _SAME * (final.score - least) for one in outcome.screen.list_singles()
+    ):
         return outcome, None
-    return best, join_formula(added)
+    return replace(outcome, final=kept), join_formula(added)
 
 
 def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:

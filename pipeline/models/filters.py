@@ -58,13 +58,20 @@ def _approach(goal: float, state: float, most: float) -> tuple[float, float]:
 
 
 @compiled()
-def _pull(goal: float, state: float, tau: float, limit: float, time: float) -> tuple[float, float]:
-    """Integral and last value of a state that approaches its goal for some time: a ramp, then a lag."""
+def _pull(
+    goal: float, state: float, tau: float, limit: float, time: float, lagged: float
+) -> tuple[float, float]:
+    """Integral and last value of a state that approaches its goal for some time: a ramp, then a lag.
+
+    ``lagged`` is the share of its way that a lag goes in this time: most cells are no ramp.
+    """
     gap = state - goal
-    ramp = min(max(abs(gap) / limit - tau, 0.0), time)
+    if abs(gap) <= limit * tau:
+        return goal * time + tau * gap * lagged, goal + gap * (1.0 - lagged)
+    ramp = min(abs(gap) / limit - tau, time)
     gone = limit * ramp if gap > 0.0 else -limit * ramp
     rest = gap - gone
-    grown = -math.expm1((ramp - time) / tau)
+    grown = -math.expm1((ramp - time) / tau) if ramp < time else 0.0
     return goal * time + ramp * (gap - 0.5 * gone) + tau * rest * grown, goal + rest * (1.0 - grown)
 
 
@@ -161,7 +168,7 @@ def _lag_within(
     signal: Floats, states: Floats, tau: float, limit: float, step_s: float, lagged: Floats
 ) -> None:
     """See `lag_within`; ``states`` as in `_lag`. The time of a step within a cell is that of `_limit`."""
-    state, last = signal[0], signal.size - 1
+    state, last, whole = signal[0], signal.size - 1, -math.expm1(-step_s / tau)
     for cell in range(signal.size):
         asked = signal[cell]
         if not math.isnan(states[cell]):
@@ -170,11 +177,12 @@ def _lag_within(
             before, after = signal[cell - 1], signal[cell + 1]
             if (asked - before) * (after - asked) > 0.0:
                 until = (after - asked) / (after - before) * step_s
-                first, state = _pull(before, state, tau, limit, until)
-                second, state = _pull(after, state, tau, limit, step_s - until)
+                beyond = step_s - until
+                first, state = _pull(before, state, tau, limit, until, -math.expm1(-until / tau))
+                second, state = _pull(after, state, tau, limit, beyond, -math.expm1(-beyond / tau))
                 lagged[cell] = (first + second) / step_s
                 continue
-        passed, state = _pull(asked, state, tau, limit, step_s)
+        passed, state = _pull(asked, state, tau, limit, step_s, whole)
         lagged[cell] = passed / step_s
         if abs(state) < _TINY:
             state = 0.0
