@@ -49,7 +49,8 @@ a wrong track, a lag or a limit."""
 SHOWN = 0.05
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
 _RISEN = 0.02
-"""Probability below which a rise of any of the held-out errors by more than `SHOWN` is no chance."""
+"""Probability below which a rise of any of the held-out errors by more than `SHOWN` is no chance. Where few
+blocks tell nothing of chance, none may rise by more than the largest fall."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
 _MOST_EFFECTS = 8
@@ -436,7 +437,7 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif rise > SHOWN:
+    elif rise > SHOWN or float(np.nanmin(falls, initial=0.0)) < -most:
         refusal = f"the error {risen} rises"
     elif most < SHOWN:
         refusal = f"no error falls by more than {format_share(most)}"
@@ -468,18 +469,20 @@ def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
 def _compare_horizons(
     before: Sequence[HorizonError], after: Sequence[HorizonError]
 ) -> tuple[Floats, float, str]:
-    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where it is."""
+    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where one is largest."""
     falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
-    least_p = _RISEN / falls.size
+    least_p, largest = _RISEN / falls.size, 0.0
     for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
         for channel, name in enumerate(("position", "heading")):
             one, other = getattr(old, name), getattr(new, name)
             if not one.size or not one.mean() > 0.0:
                 continue
             fall = falls[index, channel] = 1.0 - math.sqrt(float(other.mean() / one.mean()))
-            if -fall > rise and _find_chance(other - one, old.block) < least_p:
+            if -fall > largest:
                 length = "a whole stretch" if math.isinf(horizon) else f"{horizon:g} s"
-                rise, risen = -fall, f"in {name} over {length}"
+                largest, risen = -fall, f"in {name} over {length}"
+            if -fall > rise and _find_chance(other - one, old.block) < least_p:
+                rise = -fall
     return falls, rise, risen
 
 
