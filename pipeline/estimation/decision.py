@@ -469,7 +469,7 @@ def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
 def _compare_horizons(
     before: Sequence[HorizonError], after: Sequence[HorizonError]
 ) -> tuple[Floats, float, str]:
-    """Relative falls of the errors, shape (4, 2), the largest rise beyond chance, and where one is largest."""
+    """Relative falls of errors, shape (4, 2), the largest rise beyond chance, and where one rises most."""
     falls, rise, risen = np.full((len(HORIZONS_S), 2), math.nan), 0.0, ""
     least_p, largest = _RISEN / falls.size, 0.0
     for index, (old, new, horizon) in enumerate(zip(before, after, HORIZONS_S, strict=True)):
