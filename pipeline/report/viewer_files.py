@@ -20,8 +20,10 @@ from pipeline.report import theme, writing_export
 from pipeline.report.export_source import (
     FINDING_MARKERS,
     FINDINGS,
+    IDEAL_POSE,
     MEASURED,
     MODEL,
+    MODEL_POSE,
     PATH,
     POSE,
     PREDICTED_PATH,
@@ -45,6 +47,8 @@ _BODY = "base_link"
 _TWIST = "geometry_msgs/msg/TwistStamped"
 _PATH_POSES = 5000
 _PREDICTIONS_HZ = 5.0
+_FOLLOWED_S = 1.7
+"""Time [s] that a prediction is followed: the next may begin 0.3 s before it ends, where poses are rare."""
 _VELOCITIES = ("t", "stamp", "segment", "x", "y", "z", "yaw", "v_x", "v_y", "v_w")
 _SLIP = ("stamp", "f_x", "f_y", "f_w", "g_x", "g_y", "g_w", "modulus")
 
@@ -69,6 +73,7 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
         velocities = source.feed("velocities", "stamp", _VELOCITIES)
         slip = {name: source.feed("slip", "stamp", _SLIP, name) for name in source.inputs}
         model = None if source.model is None else ModelFeed(source, source.model)
+        ideal = None if source.model is None else ModelFeed(source, source.model.ideal)
         for low, high in source.stretches:
             frame = velocities.take(low, high)
             if frame is not None:
@@ -79,6 +84,8 @@ def write_derived_log(source: ExportSource, path: Path) -> Path:
                     _write_slip(writer, source, name, rows)
             if model is not None and frame is not None:
                 _write_model(writer, source, model, frame, (low, high))
+            if ideal is not None and frame is not None:
+                _write_ideal(writer, source, ideal, (low, high))
             writer.write_before(high + source.shift_ns)
         if model is not None:
             model.check()
@@ -132,6 +139,30 @@ def _write_model(
     times = source.log_times(frame["stamp"].to_numpy()[known])
     writer.write_columns(RESIDUAL, "std_msgs/msg/Float64", times, {"data": modulus[known]})
     _write_predictions(writer, source, predicted.prediction)
+    _write_predicted_poses(writer, source, MODEL_POSE, predicted.prediction)
+
+
+def _write_ideal(writer: LogWriter, source: ExportSource, ideal: ModelFeed, stretch: tuple[int, int]) -> None:
+    low, high = (1e-9 * (edge - source.start_ns) for edge in stretch)
+    predicted = ideal.predict(low, high, np.zeros(0))
+    if predicted is not None:
+        _write_predicted_poses(writer, source, IDEAL_POSE, predicted.prediction)
+
+
+def _write_predicted_poses(
+    writer: LogWriter, source: ExportSource, topic: str, prediction: Prediction
+) -> None:
+    """Write the poses of consecutive predictions, which begin at measured poses."""
+    times = prediction.start_times[:, None] + prediction.horizon_times[None, :]
+    rows = np.broadcast_to(prediction.horizon_times < _FOLLOWED_S, times.shape)
+    stamps = source.start_ns + np.round(times[rows] * 1e9).astype(np.int64)
+    x, y, yaw = prediction.poses[rows].T
+    fields: dict[str, Given] = {
+        "pose.position.x": x,
+        "pose.position.y": y,
+        **_turn(yaw, "pose.orientation."),
+    }
+    source.write_stamped(writer, topic, "geometry_msgs/msg/PoseStamped", stamps, fields)
 
 
 def _write_poses(writer: LogWriter, source: ExportSource, frame: pl.DataFrame) -> None:
@@ -284,6 +315,7 @@ def _build_map(source: ExportSource) -> dict[str, object]:
         },
         FINDING_MARKERS: {"visible": True},
         POSE: {"visible": True},
+        **({} if source.model is None else {MODEL_POSE: {"visible": True}, IDEAL_POSE: {"visible": True}}),
     }
     middle, extent = _find_extent(source)
     panel = _read_constants()["map"]

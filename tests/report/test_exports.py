@@ -10,6 +10,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import polars as pl
@@ -29,6 +30,7 @@ from pipeline.report.viewer_files import (
     write_csv,
     write_derived_log,
     write_foxglove_layout,
+    write_plotjuggler_layout,
 )
 from pipeline.simulate import simulate_case
 from pipeline.sources.one_vehicle import load_vehicle
@@ -102,6 +104,54 @@ def test_predictions_begin_at_the_measured_pose_and_last_two_seconds(derived: Pa
         pose = poses[int(np.argmin(np.abs(times - time)))][1].pose.position  # type: ignore[attr-defined]
         assert np.hypot(first.pose.position.x - pose.x, first.pose.position.y - pose.y) < 0.15
         assert last.header.stamp.sec - first.header.stamp.sec == 2
+
+
+def test_measured_ideal_and_model_are_poses_that_part_within_two_seconds(derived: Path) -> None:
+    """As poses they are opened by viewers that know no path: Rerun, and PlotJuggler as curves over time."""
+    found = read_officially(derived)
+    measured = found["/slip/pose"]
+    at = np.array([time for time, _ in measured])
+    places = np.array([(one.pose.position.x, one.pose.position.y) for _, one in measured])  # type: ignore[attr-defined]
+    gaps = {}
+    for name in ("ideal", "model"):
+        poses = found[f"/slip/pose_{name}"]
+        times = np.array([time for time, _ in poses])
+        assert np.all(np.diff(times) > 0)
+        assert {message.header.frame_id for _, message in poses} == {"map"}  # type: ignore[attr-defined]
+        own = np.array([(one.pose.position.x, one.pose.position.y) for _, one in poses])  # type: ignore[attr-defined]
+        known = np.column_stack([np.interp(times, at, places[:, axis]) for axis in range(2)])
+        gaps[name] = np.linalg.norm(own - known, axis=1)
+        # Every two seconds they begin at the measured pose again.
+        assert np.quantile(gaps[name], 0.02) < 0.02
+        assert gaps[name].max() < 2.0
+    assert np.mean(gaps["model"]) < np.mean(gaps["ideal"])
+
+
+def read_field(message: object, path: list[str]) -> object:
+    for name in path:
+        message = getattr(message, name)
+    return message
+
+
+def test_layouts_name_topics_and_numbers_that_the_log_holds(
+    source: ExportSource, derived: Path, tmp_path: Path
+) -> None:
+    messages = {topic: rows[0][1] for topic, rows in read_officially(derived).items()}
+    layout = json.loads(write_foxglove_layout(source, tmp_path / "layout.json").read_text("utf-8"))
+    panels = layout["configById"]
+    lines = [
+        line["value"] for name, panel in panels.items() if name.startswith("Plot") for line in panel["paths"]
+    ]
+    tree = ET.parse(write_plotjuggler_layout(source, tmp_path / "layout.xml"))  # noqa: S314 - our own
+    curves = [curve.attrib["name"] for curve in tree.iter("curve")]
+    assert len(lines) == len(curves) > 10
+    for text, separator in [*((line, ".") for line in lines), *((curve, "/") for curve in curves)]:
+        topic = max((one for one in messages if text.startswith(f"{one}{separator}")), key=len, default="")
+        assert topic, text
+        value = read_field(messages[topic], text.removeprefix(f"{topic}{separator}").split(separator))
+        assert isinstance(value, float), text
+    topics = {*panels["3D!map"]["topics"], panels["RosOut!findings"]["topicToRender"]}
+    assert topics - messages.keys() <= {"/slip/findings", "/slip/finding_markers"}
 
 
 def test_a_long_run_is_exported_in_stretches_that_nobody_sees(

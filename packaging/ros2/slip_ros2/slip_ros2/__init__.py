@@ -1,0 +1,1 @@
+"""The verbs of slip as a command of ROS 2."""
