@@ -36,6 +36,7 @@ from pipeline.estimation.problem import (
     predict_at_from,
     predict_from,
 )
+from pipeline.estimation.recordings import Recording, load_recording
 from pipeline.estimation.state import Free, State
 from pipeline.estimation.together import Member, judge_together
 from pipeline.estimation.unexplained import search_formula
@@ -64,36 +65,6 @@ def parse_budget(text: str) -> float:
         what, hint = f"{text!r} is not a duration above zero", "Write it like 60s or 5min."
         raise DiagnosisError("bad_budget", what, where="--budget", hint=hint)
     return float(match[1]) * _UNITS[match[2]]
-
-
-@dataclass(frozen=True)
-class Recording:
-    """One run as processed by the stages.
-
-    Attributes:
-        name: of the run.
-        tables: `poses`, `alignments`, `commands`, `wheels`, `imu`, `slip`, `findings`; those that the log
-            lacks may be absent.
-        sha256: of the recording.
-        path: of the log.
-        length_scale_m: of the slip modulus [m].
-    """
-
-    name: str
-    tables: Mapping[str, pl.DataFrame] = field(repr=False)
-    sha256: str = ""
-    path: str = ""
-    length_scale_m: float = 1.0
-
-    def list_findings(self) -> tuple[Finding, ...]:
-        """Findings of the stages."""
-        table = self.tables.get("findings")
-        return () if table is None else read_findings({"findings": table.to_dicts()})
-
-
-def load_recording(recording: Recording, vehicle: Vehicle) -> MotionRun:
-    """The run as arrays."""
-    return load_run(recording.tables, vehicle, name=recording.name, sha256=recording.sha256)
 
 
 def diagnose_runs(

@@ -56,11 +56,11 @@ from pipeline.run import MotionError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from pipeline.estimation import Recording
     from pipeline.estimation.context import Context
     from pipeline.estimation.decision import Judged, Search, SearchResult
     from pipeline.estimation.learned_step import LearnedStep
     from pipeline.estimation.problem import Problem
+    from pipeline.estimation.recordings import Recording
     from pipeline.models import FormulaEffect
 
 _CLOCKS = frozenset({Late.POSES, Late.HEADING})

@@ -34,7 +34,7 @@ from pipeline.store import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.estimation import Recording
+    from pipeline.estimation.recordings import Recording
     from pipeline.models import Model, ModelFile
 
 
@@ -234,7 +234,7 @@ def _make_recording(
     length_scale_m: float,
 ) -> Recording:
     """Tables for a diagnosis, with their origin."""
-    from pipeline.estimation import Recording  # noqa: PLC0415 - heavy
+    from pipeline.estimation.recordings import Recording  # noqa: PLC0415 - heavy
 
     names, read = tables
     return Recording(

@@ -17,7 +17,7 @@ from pipeline.stages import WRONG_RADIUS, find_gain_of, is_grip
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
-    from pipeline.estimation import Recording
+    from pipeline.estimation.recordings import Recording
     from pipeline.sources import Vehicle
 
 

@@ -41,7 +41,7 @@ from pipeline.store import LOG_NOTES, Manifest, Store, date_runs, scan_table
 if TYPE_CHECKING:
     from jinja2 import Environment
 
-    from pipeline.report.figures import Drawing
+    from pipeline.report.theme import Drawing
 
 
 class ReportError(SlipError):

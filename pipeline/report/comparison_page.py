@@ -39,10 +39,9 @@ from pipeline.report import (
     label_names,
     theme,
 )
-from pipeline.report.figures import Drawing
 from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
-from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis, stack
+from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis, stack
 from pipeline.store import Store
 from pipeline.words import Line, list_pairs, list_shown_notes, title_line
 from pipeline.words.comparison import list_lines

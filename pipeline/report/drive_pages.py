@@ -14,10 +14,10 @@ import polars as pl
 from pipeline.core import PathError, read_bounded, read_bounded_text, resolve_inside
 from pipeline.plan import SAFETY, Plan
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, theme
-from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
     Chart,
+    Drawing,
     build_spec,
     encode_column,
     layer,

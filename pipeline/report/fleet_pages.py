@@ -56,11 +56,11 @@ from pipeline.report import (
     theme,
 )
 from pipeline.report.comparison_page import write_tables
-from pipeline.report.figures import Drawing
 from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import CAP_QUANTILE, format_ends
 from pipeline.report.theme import (
     Chart,
+    Drawing,
     encode_column,
     find_extent,
     fit_equal_aspect,

@@ -13,9 +13,8 @@ import polars as pl
 from pipeline.core import INPUT_WORDS, FigureFormat
 from pipeline.datasets import ZONES, DeploymentMap, Measure
 from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
-from pipeline.report.figures import Drawing
 from pipeline.report.page import add_figures, render_figures
-from pipeline.report.theme import Channel, Chart, encode_column, layer, make_axis
+from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis
 from pipeline.store import Store
 
 _LETTER, _LINE = 6.7, 13.0

@@ -14,16 +14,11 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import python_command, require_package
-
-if TYPE_CHECKING:
-    from pipeline.report.figures import Drawing
-
 
 SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 """Schema of the specifications."""
@@ -483,3 +478,20 @@ def find_extent(values: pl.Series) -> list[float]:
     low, high = float(values.min() or 0.0), float(values.max() or 0.0)  # type: ignore[arg-type]
     span = max(high - low, _SMALLEST_SPAN_M) * (1.0 + 2.0 * _MARGIN)
     return [round(value, 4) for value in _widen([low, high], span)]
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """Figure of one run.
+
+    Attributes:
+        chart: chart that refers to rows by name.
+        rows: rows by the name used in the chart; the same name means the same rows in every figure.
+        note: remark on the interpretation, for example on omitted points; may be empty.
+        words: the same in a sentence or two, as alternative text.
+    """
+
+    chart: Chart
+    rows: Mapping[str, pl.DataFrame]
+    note: str = ""
+    words: str = ""

@@ -30,9 +30,8 @@ from pipeline.datasets import (
 )
 from pipeline.models import name_parameter
 from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme
-from pipeline.report.figures import Drawing
 from pipeline.report.page import render_figures
-from pipeline.report.theme import Channel, Chart, encode_column, layer
+from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer
 from pipeline.store import NoRunsError, Store
 
 _FEWEST_POINTS = 3

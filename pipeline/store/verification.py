@@ -65,7 +65,7 @@ class Files(Protocol):
     """The files of results, on disk or in an object store."""
 
     def names(self, skip: Callable[[Path, str], None]) -> Collection[str]:
-        """Every name in the results; ``skip`` is told of what is left out, and why."""
+        """Every name in the results; ``skip`` is told of each folder that is not read, and why."""
 
     def read(self, name: str) -> bytes | None:
         """The content of a file; None when there is none."""

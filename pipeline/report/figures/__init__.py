@@ -20,7 +20,7 @@ from pipeline.core import INPUT_WORDS, suffix_unit
 from pipeline.models import name_effect
 from pipeline.report import Picture, format_number, theme
 from pipeline.report.scene import Scene, Thinned
-from pipeline.report.theme import Channel, Chart, Range, encode_column, layer, make_axis
+from pipeline.report.theme import Channel, Chart, Drawing, Range, encode_column, layer, make_axis
 
 
 class Section(Enum):
@@ -32,23 +32,6 @@ class Section(Enum):
     WHERE = "where"
     HOW_BAD = "how-bad"
     REST = "rest"
-
-
-@dataclass(frozen=True)
-class Drawing:
-    """Figure of one run.
-
-    Attributes:
-        chart: chart that refers to rows by name.
-        rows: rows by the name used in the chart; the same name means the same rows in every figure.
-        note: remark on the interpretation, for example on omitted points; may be empty.
-        words: the same in a sentence or two, as alternative text.
-    """
-
-    chart: Chart
-    rows: Mapping[str, pl.DataFrame]
-    note: str = ""
-    words: str = ""
 
 
 @dataclass(frozen=True)

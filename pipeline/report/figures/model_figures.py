@@ -11,7 +11,7 @@ from pipeline.core import INPUT_WORDS, finite_or_none, format_angle, format_leng
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.driving_need import find_goal
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
-from pipeline.report.figures import Drawing, Figure, Section
+from pipeline.report.figures import Figure, Section
 from pipeline.report.scene import (
     COMPONENTS,
     LINE_BINS,
@@ -21,7 +21,7 @@ from pipeline.report.scene import (
     drop_flat_rows,
     thin_series,
 )
-from pipeline.report.theme import Channel, Chart, encode_column, find_range, layer, make_axis, stack
+from pipeline.report.theme import Channel, Chart, Drawing, encode_column, find_range, layer, make_axis, stack
 from pipeline.results import CAUSE_NAMES, INTERVAL_SHARE, Errors, Growth, SlipBudget, Step, format_rises
 from pipeline.words import describe_need
 

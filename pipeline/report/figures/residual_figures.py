@@ -18,10 +18,19 @@ from pipeline.estimation.effect_signature import (
     cross_correlate,
 )
 from pipeline.report import figures, format_known_share, format_number, theme
-from pipeline.report.figures import Drawing, Figure, Section
+from pipeline.report.figures import Figure, Section
 from pipeline.report.motion_view import COMPONENTS, SIGNALS, MotionView
 from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series
-from pipeline.report.theme import Chart, encode_column, find_range, layer, make_axis, stack, usual_ends
+from pipeline.report.theme import (
+    Chart,
+    Drawing,
+    encode_column,
+    find_range,
+    layer,
+    make_axis,
+    stack,
+    usual_ends,
+)
 
 
 def draw_horizon_errors(scene: Scene) -> Drawing | None:

@@ -7,7 +7,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, Floats, format_length, format_share
 from pipeline.report import figures, format_number, theme
-from pipeline.report.figures import Drawing, Figure, Section, draw_shares, format_events, list_events
+from pipeline.report.figures import Figure, Section, draw_shares, format_events, list_events
 from pipeline.report.scene import LINE_BINS, Scene, break_lines, thin_series, thin_to_peaks
 from pipeline.report.theme import (
     MAP_HIGHEST,
@@ -15,6 +15,7 @@ from pipeline.report.theme import (
     MAP_WIDTH,
     Channel,
     Chart,
+    Drawing,
     encode_column,
     find_extent,
     find_range,

@@ -8,9 +8,9 @@ import numpy as np
 import polars as pl
 
 from pipeline.report import figures, theme
-from pipeline.report.figures import Drawing, Figure, Section
+from pipeline.report.figures import Figure, Section
 from pipeline.report.scene import Scene, break_lines
-from pipeline.report.theme import Channel, Chart, layer, make_axis, stack
+from pipeline.report.theme import Channel, Chart, Drawing, layer, make_axis, stack
 
 _ROOM = 0.15
 """Free margin above and below, as a fraction of a panel's height."""
