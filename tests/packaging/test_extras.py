@@ -10,6 +10,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 
 from pipeline.core import SlipError, require_package
 from pipeline.simulate import simulate_case
@@ -93,3 +94,16 @@ def test_the_extras_of_the_handbook_are_those_of_the_wheel() -> None:
     assert named == set(extras) - {"all", "build", "dev", "docs"}
     page = (ROOT / "docs" / "pages" / "install.md").read_text()
     assert {extra for extra in named if f"`[{extra}]`" in page} == named
+
+
+def test_the_recipe_of_conda_needs_what_the_wheel_needs() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    recipe = yaml.safe_load((ROOT / "packaging" / "conda.yaml").read_text())
+    extras = project["optional-dependencies"]
+    wanted = [*project["dependencies"], *extras["diagnose"], *extras["report"], *extras["serve"]]
+    wanted = [one.replace(">=", " >=") for one in wanted if not one.startswith("slip-pipeline")]
+    assert sorted(recipe["requirements"]["run"]) == sorted([*wanted, f"python {project['requires-python']}"])
+    assert recipe["context"]["version"] == project["version"]
+    name, _, target = recipe["build"]["python"]["entry_points"][0].partition(" = ")
+    assert project["scripts"] == {name: target}
+    assert (ROOT / "packaging" / recipe["source"]["path"] / recipe["about"]["license_file"]).is_file()
