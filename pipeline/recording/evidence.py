@@ -19,7 +19,7 @@ from pipeline.core import Complex, Floats, join_parts
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Reading, fit_across
 from pipeline.recording.score import CLEAR, LEAST_NATS, compare, fit
-from pipeline.sources import COMMANDED, MEASURED, convert_unit
+from pipeline.sources import COMMANDED, LENGTH_UNITS, MEASURED, convert_unit
 
 # Frame of the pose.
 
@@ -191,6 +191,7 @@ USUAL = ("m/s", "rad/s", "rad")
 """Units of message types."""
 _STRANGE = {
     "rpm": 4.0, "deg/s": 4.0, "deg": 3.0, "km/h": 3.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0,
+    "mm": 3.0, "cm": 5.0,
 }  # fmt: skip
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""
 _NAMED = 4.0
@@ -225,23 +226,29 @@ def find_body_units(gains: Sequence[float | None], shares: Sequence[float], name
     """Units of a body command by its gains.
 
     Half of all robots move as they are commanded, to within a few percent: a gain that is a unit's factor is
-    rarely anything else. A poor fit attenuates a gain, and shows no unit.
+    rarely anything else. A poor fit attenuates a gain, which then counts as near to one as that allows.
 
     Args:
         gains: motion over command, ahead and turning; None where it is not excited.
         shares: part of the motion that is explained, of both.
         name: of the signals; a unit that it names is no surprise.
     """
-    gains = [gain if share > _GOOD else None for gain, share in zip(gains, shares, strict=True)]
     usual, costs, exact = ("m/s", "rad/s"), dict[tuple[str, str], float](), set[tuple[str, str]]()
     for pair in product(SPEEDS, RATES):
         # A gain is the motion in SI units over the command in its own unit.
         factors = (SPEEDS[pair[0]], RATES[pair[1]])
-        logs = [np.log(abs(gain) / of) if gain else None for gain, of in zip(gains, factors, strict=True)]
+        logs = [
+            _shrink(float(np.log(abs(gain) / of)), share) if gain else None
+            for gain, of, share in zip(gains, factors, shares, strict=True)
+        ]
         surprise = sum(0.0 if _is_named(unit, name) else _STRANGE.get(unit, 0.0) for unit in pair)
         costs[pair] = surprise - _rate_gains(logs)
-        strange = [log for log, unit, one in zip(logs, pair, usual, strict=True) if unit != one]
-        if all(log is not None and abs(log) < 4.0 * _EXACT for log in strange):
+        strange = [
+            abs(log or 0.0) < 4.0 * _EXACT and log is not None and share > _GOOD
+            for log, share, unit, one in zip(logs, shares, pair, usual, strict=True)
+            if unit != one
+        ]
+        if all(strange):
             exact.add(pair)
     best = min(costs, key=lambda key: costs[key])
     gain = costs[usual] - costs[best]
@@ -270,6 +277,29 @@ def _rate_gains(logs: Sequence[float | None]) -> float:
             quadratic = float(seen @ np.linalg.solve(spread, seen))
             total += np.exp(-0.5 * quadratic) / np.sqrt(np.linalg.det(spread)) / 2.0 ** (1 + len(known))
     return float(np.log(total + 1e-300))
+
+
+_RADIUS = (0.12, 0.7)
+"""Usual wheel radius [m], and the spread of its logarithm."""
+
+
+def find_pose_unit(commanded: float | None, rolled: float | None, radius: float | None) -> str:
+    """Unit of positions by how far the body moves: as far as commanded, and as wheels of some size roll.
+
+    Args:
+        commanded: motion over the speeds that are commanded; None if nothing tells.
+        rolled: motion over the angle of the wheels; None if nothing tells.
+        radius: of the wheels [m]; None if it is not known.
+    """
+    scores = {}
+    for unit, factor in LENGTH_UNITS.items():
+        logs = [(np.log(commanded * factor), _COMMON)] if commanded else []
+        if rolled:
+            middle, spread = (radius, 0.35) if radius else _RADIUS
+            logs.append((np.log(rolled * factor / middle), spread))
+        scores[unit] = -_STRANGE.get(unit, 0.0) - sum(0.5 * (log / spread) ** 2 for log, spread in logs)
+    best = max(scores, key=lambda unit: scores[unit])
+    return best if scores[best] > scores["m"] + _WIN else "m"
 
 
 _LENGTH = (0.8, 1.0)

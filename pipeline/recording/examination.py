@@ -22,6 +22,7 @@ from pipeline.recording.evidence import (
     Units,
     find_body_units,
     find_frame,
+    find_pose_unit,
     find_reversed,
     find_steering_unit,
     find_wheel_unit,
@@ -40,7 +41,7 @@ from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.outages import find_outages
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
-from pipeline.run import Alignment
+from pipeline.run import LIVE_SHARE, Alignment
 from pipeline.sources import (
     CONFIGURED,
     Configuration,
@@ -111,6 +112,10 @@ _EQUAL = 0.02
 """Deviation of both gains from one within which a signal measures the motion."""
 _MOST = 20
 """Candidates of a role that are compared, the likeliest by type and name: each costs a fit."""
+_BOTH_WAYS = 0.02
+"""Share of a drive in one direction from which on it goes that way."""
+_NEAR = 0.03
+"""Spread of the logarithm of a gyro's scale."""
 _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
@@ -220,16 +225,11 @@ class Examination:
         """See `examine`."""
         try:
             motion = measure_motion(self.extraction.poses())
-            imu = self.extraction.imu()
+            gyro = self._read_gyro()
         except SlipError:
             motion = None
         if motion is None:
             return Recording(self.sources, self.configuration)
-        gyro = (
-            Reading("gyro", str(self.sources.imu), None, Held(*_column(imu, "rate_z")))
-            if imu.height
-            else None
-        )
         drives = self._read_drives(motion)
         gyros = [] if gyro is None else [gyro]
         readings = [*(drive.reading for drive in drives), *gyros]
@@ -237,8 +237,11 @@ class Examination:
             one.explain(motion)
         for drive in drives:
             self._settle_steering(drive, motion)
+        drives = self._leave_out_sizes(drives)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
+        motion = self._settle_lengths(motion, readings, command, wheels)
+        self._report_gyro(gyro)
         if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
             self._read_again(wheels, motion)
         if wheels is not None and self.leave_out(wheels, command, motion):
@@ -270,6 +273,12 @@ class Examination:
         )
 
     # Signals.
+
+    def _read_gyro(self) -> Reading | None:
+        imu = self.extraction.imu()
+        if not imu.height:
+            return None
+        return Reading("gyro", str(self.sources.imu), None, Held(*_column(imu, "rate_z")))
 
     def _read_drives(self, motion: Motion) -> list[Candidate]:
         commands, wheels = (self.sources.rank_drives(role) for role in ("command", "wheels"))
@@ -495,6 +504,74 @@ class Examination:
         if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
         return "ackermann" if self._read_again(wheels, motion, kind) else ""
+
+    # Positions in other units, and signals that lack something.
+
+    def _settle_lengths(
+        self,
+        motion: Motion,
+        readings: Sequence[Reading],
+        command: Candidate | None,
+        wheels: Candidate | None,
+    ) -> Motion:
+        """The motion in metres, and the readings fitted to it."""
+        source = self.sources.pose
+        if source is None or source.content is not PoseContent.POSE or self.configuration.pose.unit:
+            return motion
+        gains: dict[str, float | None] = {"body": None, "sides": None, "steering": None}
+        for drive in (command, wheels):
+            made = None if drive is None else drive.reading.explained
+            if drive is not None and made is not None and drive.sign("ahead") and not is_crossed(drive):
+                gains[drive.reading.form] = abs(float(made.ahead.gains[0]))
+        radius = self.vehicle.wheel_radius_m if self.is_known else None
+        unit = find_pose_unit(gains["body"] or gains["steering"], gains["sides"], radius)
+        if unit == "m":
+            return motion
+        self._correct("pose", f"the positions of {source} are in {unit}", f'unit = "{unit}"', {"unit": unit})
+        self.extraction.configuration = self._complete()
+        scaled = measure_motion(self.extraction.poses())
+        if scaled is None:
+            return motion
+        scaled = scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)
+        for one in readings:
+            one.explain(scaled)
+        return scaled
+
+    def _leave_out_sizes(self, drives: Sequence[Candidate]) -> list[Candidate]:
+        """The candidates without wheel speeds that are sizes alone, as of sensors that know no direction."""
+        asked = [
+            one.reading.first.values
+            for one in drives
+            if one.reading.form == "body" and one.is_sure and one.reading.first is not None
+        ]
+        back = max((min(_share_back(one), _share_back(-one)) for one in asked), default=0.0)
+        kept = []
+        for one in drives:
+            sides = [] if one.reading.form != "sides" else one.reading.inputs
+            if back < _BOTH_WAYS or not sides or any(side.values.min() < 0.0 for side in sides):
+                kept.append(one)
+                continue
+            text = (
+                f"not used: {one.source}: its speeds have no sign: they are never below zero, though the "
+                "body is driven forward and backward"
+            )
+            self.findings.append(Finding("wheels_unsigned", "warning", text, where="wheels"))
+            for role in ("command", "wheels"):
+                if getattr(self.sources, role) == one.source:
+                    others = self.sources.rank_drives(role)
+                    left = next((other for other in others if other.signals != one.source.signals), None)
+                    self.sources = replace(self.sources, **{role: left})  # type: ignore[arg-type]
+        return kept
+
+    def _report_gyro(self, gyro: Reading | None) -> None:
+        """A gyro in degrees per second, whose scale is fitted."""
+        made = None if gyro is None else gyro.explained
+        if gyro is None or made is None or not made.sign("turned"):
+            return
+        apart = np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])
+        if abs(apart) < 4.0 * _NEAR:
+            text = f"the gyro of {gyro.name} is in degrees per second: its scale is fitted to the poses"
+            self.findings.append(Finding("gyro_unit", "info", text, where="imu"))
 
     # Sides and signs.
 
@@ -950,7 +1027,7 @@ class Examination:
 
 _HALF_TURN = 180.0
 _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
-    "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0"},
+    "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0", "unit": 'unit = "m"'},
     "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
     "command": {
         "unit": 'unit = "m/s"',
@@ -1025,6 +1102,13 @@ def is_crossed(drive: Candidate) -> bool:
         return False
     sizes = [abs(float(explained.ahead.t[0])), abs(float(explained.turned.t[0]))]
     return sizes[0] > CLEAR and (drive.reading.form == "sides" or sizes[1] > CLEAR)
+
+
+def _share_back(speeds: Floats) -> float:
+    """Share of the moving samples in which something goes backward."""
+    top = float(np.quantile(np.abs(speeds), 0.95)) if speeds.size else 0.0
+    moving = np.abs(speeds) > LIVE_SHARE * top
+    return float(np.mean(speeds[moving] < 0.0)) if moving.any() else 0.0
 
 
 def _scale(length: Length | None, factor: float) -> Length | None:

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
         Sources,
     )
     from pipeline.sources.configuration import (
+        LENGTH_UNITS,
         RANGES,
         Configuration,
         ConfigurationError,

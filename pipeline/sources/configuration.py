@@ -166,6 +166,10 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     hold_s: Positive | None = None
 
 
+LENGTH_UNITS: Final[Mapping[str, float]] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
+"""Units of positions [m]."""
+
+
 class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """``[pose]``: a pose topic, three fields of a topic, or a pair of frames of the transforms.
 
@@ -181,6 +185,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         up: axis of the poses' frames that points up, where it is not as ``axes`` says: ``y`` of motion
             capture, ``-y`` of a camera's optical frame.
         heading_deg: angle from the recorded heading to the vehicle's own [degrees], counterclockwise.
+        unit: of the positions; by default metres.
         time: which of the message's times to use.
     """
 
@@ -193,6 +198,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     axes: Literal["enu", "ned"] = "enu"
     up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None
     heading_deg: Annotated[float, msgspec.Meta(ge=-360.0, le=360.0)] | None = None
+    unit: Literal["m", "cm", "mm"] | None = None
     time: Clock | None = None
 
 

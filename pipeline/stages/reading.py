@@ -16,6 +16,7 @@ from pipeline.logs.index import LONGEST_NAME
 from pipeline.run import STILL_MPS
 from pipeline.sources import (
     DEFAULT_INTERVAL,
+    LENGTH_UNITS,
     DriveForm,
     DriveSource,
     IntervalSection,
@@ -383,10 +384,10 @@ def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Float
 
     Args:
         arrays: poses as recorded.
-        section: its ``axes``, ``up`` and ``heading_deg``.
+        section: its ``axes``, ``up``, ``heading_deg`` and ``unit``.
     """
     up = section.up or ("-z" if section.axes == "ned" else "z")
-    position, quaternion = arrays.position, arrays.quaternion
+    position, quaternion = LENGTH_UNITS[section.unit or "m"] * arrays.position, arrays.quaternion
     if up != "z":
         turn = _UPRIGHT[up.removeprefix("-")] * (_HALF_TURN[:, None] if up.startswith("-") else 1.0)
         position = position @ turn.T

@@ -13,6 +13,7 @@ from pipeline.recording.evidence import (
     Units,
     find_body_units,
     find_frame,
+    find_pose_unit,
     find_reversed,
     find_steering_unit,
     find_wheel_unit,
@@ -166,6 +167,23 @@ def test_of_two_readings_that_are_as_likely_both_are_told() -> None:
 
 def test_a_poor_fit_shows_no_unit() -> None:
     assert find_body_units((0.9, 0.076), (0.5, 0.1)) == Units(("m/s", "rad/s"))
+
+
+@pytest.mark.parametrize(
+    ("commanded", "rolled", "radius", "unit"),
+    [(0.9, 0.1, None, "m"), (865.0, 79.0, None, "mm"), (99.0, None, None, "cm"), (None, 300.0, 0.3, "mm"),
+     (None, 0.9, None, "m"), (0.3, 0.03, None, "m"), (3.0, 1.0, None, "m")],
+)  # fmt: skip
+def test_unit_of_positions(
+    commanded: float | None, rolled: float | None, radius: float | None, unit: str
+) -> None:
+    assert find_pose_unit(commanded, rolled, radius) == unit
+
+
+def test_a_poor_fit_of_a_strange_unit_is_known_by_its_size() -> None:
+    """On grass a turn is a third of what is asked for, and hardly explained: not a fifty-seventh."""
+    assert find_body_units((0.8, 0.3 * DEGREE), (0.8, 0.3)) == Units(("m/s", "deg/s"))
+    assert find_body_units((0.2, 0.2), (0.4, 0.4)) == Units(("m/s", "rad/s"))
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,93 @@
+"""Situations that robots are found in, each a drawn log: what is said of it, and which line settles it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from drawn_motion import Drive, draw, sides
+from written_logs import write_log
+
+from pipeline.analysis import Options
+from pipeline.core import Floats
+from pipeline.recording.log_setup import LogSetup, set_up_log
+from pipeline.recording.readings import Held, Reading
+
+
+def change(wheels: Reading, by: Callable[[Floats], Floats], *, exchanged: bool = False) -> Reading:
+    first, second = (Held(one.times, by(one.values)) for one in (wheels.first, wheels.second) if one)
+    return (
+        replace(wheels, first=second, second=first)
+        if exchanged
+        else replace(wheels, first=first, second=second)
+    )
+
+
+def in_millimetres(path: Path, drive: Drive) -> Path:
+    """Motion capture in millimetres."""
+    return write_log(path, replace(drive, place=1e3 * drive.place))
+
+
+def in_centimetres(path: Path, drive: Drive) -> Path:
+    """A camera above the table, in centimetres."""
+    return write_log(path, replace(drive, place=1e2 * drive.place))
+
+
+def without_signs(path: Path, drive: Drive) -> Path:
+    """Hall sensors that count whichever way a wheel turns."""
+    return write_log(path, drive, wheels=change(sides(drive), np.abs), wheel_topic="/{}_wheel/speed")
+
+
+def exchanged_in_rpm(path: Path, drive: Drive) -> Path:
+    """Two faults at once: plugs exchanged, and speeds in turns a minute."""
+    wheels = change(sides(drive), lambda speed: speed * 30.0 / np.pi, exchanged=True)
+    return write_log(path, drive, wheels=wheels, wheel_topic="/motor/{}/rpm")
+
+
+def beside_an_idle_joystick(path: Path, drive: Drive) -> Path:
+    """The usual topic belongs to a joystick that nobody touches."""
+    return write_log(path, drive, command_topic="/nav/twist_out", idle_topic="/cmd_vel")
+
+
+def backward_in_millimetres_per_second(path: Path, drive: Drive) -> Path:
+    """Both encoders count backward, and the command is in millimetres a second."""
+    wheels = change(sides(drive), np.negative)
+    return write_log(path, drive, wheels=wheels, asked=drive.asked * [1e3, 1.0])
+
+
+def turned_and_in_degrees(path: Path, drive: Drive) -> Path:
+    """A heading that is off by a quarter turn, and a yaw rate in degrees a second."""
+    asked = drive.asked * [1.0, 180.0 / np.pi]
+    return write_log(path, replace(drive, yaw=drive.yaw - 0.5 * np.pi), asked=asked)
+
+
+@pytest.mark.parametrize(
+    ("make", "said", "keys"),
+    [
+        (in_millimetres, ["are in mm"], {"pose.unit": "mm"}),
+        (in_centimetres, ["are in cm"], {"pose.unit": "cm"}),
+        (without_signs, ["have no sign"], {}),
+        (exchanged_in_rpm, ["exchanged", "rpm"], {"wheels.exchanged": True, "wheels.unit": "rpm"}),
+        (beside_an_idle_joystick, ["/nav/twist_out is taken for the command"], {}),
+        (backward_in_millimetres_per_second, ["backward"], {"wheels.sign": -1, "command.unit": "mm/s"}),
+        (turned_and_in_degrees, ["90 degrees"], {"pose.heading_deg": 90.0, "command.yaw_unit": "deg/s"}),
+    ],
+)
+def test_a_situation_is_told_and_corrected(
+    make: Callable[[Path, Drive], Path], said: list[str], keys: dict[str, object], tmp_path: Path
+) -> None:
+    setup: LogSetup = set_up_log(make(tmp_path / "log.mcap", draw(51)), Options(out=tmp_path))
+    told = " ".join(one.text for one in setup.choice.findings)
+    for text in said:
+        assert text in told
+    for key, value in keys.items():
+        section, name = key.split(".")
+        assert getattr(getattr(setup.configuration, section), name) == value
+    # Of a pose in metres, wheels of the right size follow.
+    if setup.sources.wheels is not None:
+        assert setup.vehicle.wheel_radius_m == pytest.approx(0.1, rel=0.03)
+        assert setup.vehicle.track_width_m == pytest.approx(0.5, rel=0.03)
+    assert not [one for one in setup.choice.findings if one.severity == "error"]
