@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[2]
 NOTEBOOKS = sorted((ROOT / "examples").glob("*.ipynb"))
 SAID = {
     "first_log": "wheel_separation_multiplier: 1.805",
-    "hidden_effect": "Wheel asymmetry: the right wheels are 5.3 % larger",
+    "hidden_effect": "Wheel asymmetry: the right wheels are 5.4 % larger",
     "own_effect": "mine.k",
 }
 
