@@ -499,20 +499,35 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
         replace_file(page, text.encode())
 
 
+def _find_alarms(answer: dict[str, object]) -> list[dict[str, object]]:
+    """Alarms of a finished diagnosis, the object of `slip diagnose --json`."""
+    from pipeline.live.running_log import list_alarms  # noqa: PLC0415
+    from pipeline.results import RunDiagnosis, read_result  # noqa: PLC0415 - heavy
+
+    runs = cast("list[Content]", answer.get("runs") or [])
+    return [alarm for run in runs for alarm in list_alarms(read_result(run, RunDiagnosis).effects)]
+
+
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
     """Diagnose the whole log with the command `slip diagnose`."""
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
     from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
     from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
-    taken = io.StringIO()
-    with contextlib.redirect_stdout(taken):
-        code = diagnose([str(watched.path)], choices=choices, json=json, quiet=False)
-    text = taken.getvalue()
+    def ask(*, json: bool) -> tuple[int, str]:
+        with contextlib.redirect_stdout(io.StringIO()) as taken:
+            code = diagnose([str(watched.path)], choices=choices, json=json, quiet=json and not asked_json)
+        return code, taken.getvalue()
+
+    asked_json = json
+    code, text = ask(json=json)
+    answer = cast("dict[str, object]", json_format.loads(text if json else ask(json=True)[1]))
+    alarms = _find_alarms(answer)
     if json:
-        answer = cast("dict[str, object]", json_format.loads(text))
+        answer = {"alarms": alarms, **answer}
         sys.stdout.write(json_format.dumps({"kind": "final", "stopped": stopped, **answer}) + "\n")
     else:
+        text += "".join(f"alarm     {alarm['text']}\n" for alarm in alarms)
         sys.stdout.write(text)
     if page is not None:
         _write_page(page, text.splitlines(), is_live=False)

@@ -16,7 +16,7 @@ import re
 import subprocess
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -398,19 +398,20 @@ def summarize_knowledge(diagnosis: RunDiagnosis, before: Sequence[str]) -> dict[
         "error": format_step(ladder[-1]) if ladder else None,
         "problem": "" if ladder else next(iter(problems), find_refusal(diagnosis.findings)),
         "passing": passing,
-        "alarms": [alarm for one in stated for alarm in _list_alarms(one)],
+        "alarms": list_alarms(one for one in diagnosis.effects if one.id in names),
     }
 
 
-def _list_alarms(stated: Stated) -> list[dict[str, object]]:
-    """Numbers of an effect that are beyond the range in which learners on board let them go."""
-    alarms = list[dict[str, object]]()
-    for parameter in (one for kind in list_effects() if kind.id == stated.id for one in kind.parameters):
-        within, value = parameter.learned_within, stated.numbers.get(parameter.name, {}).get("value")
-        if within is not None and isinstance(value, float) and not within.low <= value <= within.high:
-            text = describe_alarm(stated.id, parameter, value)
-            alarm = {"effect": stated.id, "parameter": parameter.name, "value": value}
-            alarms.append({**alarm, "low": within.low, "high": within.high, "text": text})
+def list_alarms(effects: Iterable[Named]) -> list[dict[str, object]]:
+    """Numbers of effects that are beyond the range in which learners on board let them go."""
+    kinds, alarms = {kind.id: kind for kind in list_effects()}, list[dict[str, object]]()
+    for effect in effects:
+        for parameter in kinds[effect.id].parameters if effect.id in kinds else ():
+            within, number = parameter.learned_within, effect.parameters.get(parameter.name)
+            if within is not None and number is not None and not within.low <= number.value <= within.high:
+                text = describe_alarm(effect.id, parameter, number.value)
+                alarm = {"effect": effect.id, "parameter": parameter.name, "value": number.value}
+                alarms.append({**alarm, "low": within.low, "high": within.high, "text": text})
     return alarms
 
 

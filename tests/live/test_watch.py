@@ -402,6 +402,18 @@ def test_numbers_beyond_what_learners_on_board_take_are_alarms(
     assert all("openpilot's paramsd" in line for line in shown)
 
 
+def test_a_finished_log_ends_with_its_alarms(tmp_path: Path) -> None:
+    log = tmp_path / "run.mcap"
+    drive = ("--vehicle", "ackermann_car", "--effect", "steering_offset=0.25", "--duration", "60")
+    assert run_verb("simulate", *drive, "--file", log).returncode == 0
+    watched = ("watch", log, "--results", tmp_path / "results")
+    told = run_verb(*watched)
+    (line,) = [line for line in told.stdout.splitlines() if line.startswith("alarm")]
+    assert "steering_offset: o = 0.25 rad is outside of -0.17 to 0.17 rad" in line
+    final = json.loads(run_verb(*watched, "--json").stdout.splitlines()[-1])
+    assert [(one["effect"], one["parameter"]) for one in final["alarms"]] == [("steering_offset", "o")]
+
+
 def test_looks_leave_more_than_half_a_core() -> None:
     assert LIGHT_SHARE + HEAVY_SHARE < 0.5
 
