@@ -61,6 +61,8 @@ def measure_command_scale(
     if abs(np.log(forward)) > _SCALED and not is_right:
         turning = _find_median(asked[1], got[1]) or forward
         return _explain_scale(neutral, (forward, turning), vehicle, body_commanded=body_commanded)
+    if abs(np.log(forward)) > _SCALED:
+        return neutral, (_report_wheels(forward, vehicle),)
     if turning is None or not body_commanded or not _is_multiplied(turning / forward, vehicle):
         return neutral, ()
     used = vehicle.controller_track_multiplier
@@ -72,6 +74,17 @@ def measure_command_scale(
     )
     finding = Finding("controller_multiplier", "warning", text, where="command", value=multiplier)
     return replace(neutral, track_multiplier=multiplier), (finding,)
+
+
+def _report_wheels(forward: float, vehicle: Vehicle) -> Finding:
+    """Wheels that turn at another speed than commanded where the body does as it is told."""
+    radius = vehicle.wheel_radius_m
+    text = (
+        f"in slow driving the wheels turn {forward:.2f} times as fast as commanded, and the body moves as "
+        f"commanded: their readings are {forward:.2f} times too large (scale = {1.0 / forward:.3g} under "
+        f"[wheels] in run.toml), or their radius is {radius / forward:.3g} m and not {radius:.3g} m"
+    )
+    return Finding("wheels_scaled", "warning", text, where="wheels", value=forward)
 
 
 def _explain_scale(

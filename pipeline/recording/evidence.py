@@ -190,7 +190,7 @@ WHEELS = _list_factors("rad/s", "rpm", "deg/s")
 USUAL = ("m/s", "rad/s", "rad")
 """Units of message types."""
 _STRANGE = {
-    "rpm": 4.0, "deg/s": 4.0, "deg": 3.0, "km/h": 3.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 8.0,
+    "rpm": 4.0, "deg/s": 4.0, "deg": 3.0, "km/h": 3.0, "mm/s": 5.0, "cm/s": 6.0, "mrad/s": 10.0,
     "mm": 3.0, "cm": 5.0,
 }  # fmt: skip
 """Surprise of a unit that a message type does not have [nats]: some are hardly ever met."""

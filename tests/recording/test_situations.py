@@ -91,3 +91,13 @@ def test_a_situation_is_told_and_corrected(
         assert setup.vehicle.wheel_radius_m == pytest.approx(0.1, rel=0.03)
         assert setup.vehicle.track_width_m == pytest.approx(0.5, rel=0.03)
     assert not [one for one in setup.choice.findings if one.severity == "error"]
+
+
+def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_path: Path) -> None:
+    drive = draw(52)
+    log = write_log(tmp_path / "log.mcap", drive, wheels=change(sides(drive), lambda speed: 3.0 * speed))
+    (tmp_path / "line.toml").write_text("[vehicle]\nwheel_radius_m = 0.1\ntrack_width_m = 0.5")
+    setup = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))
+    (told,) = [one for one in setup.choice.findings if one.id == "wheels_scaled"]
+    assert told.value == pytest.approx(3.0, rel=0.02)
+    assert "scale = 0.333 under [wheels]" in told.text
