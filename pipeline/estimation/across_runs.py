@@ -28,11 +28,10 @@ from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import PartFit, invert
 from pipeline.estimation.folds import HeldOut, number_predictions
-from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Prior, State
-from pipeline.models import LEAST_WAY_M, Bands, Model
+from pipeline.models import LEAST_WAY_M, Bands
 
 if TYPE_CHECKING:
     from pipeline.estimation.noise import Noise
@@ -169,17 +168,6 @@ def tie_to_prior(problem: Problem, numbers: Mapping[str, tuple[float, float]]) -
         The prepared runs, shared with `problem`, with the prior in every part.
     """
     return problem.with_parts(tuple(tie_prior(part, Prior(numbers)) for part in problem.parts))
-
-
-def fit_with_prior(problem: Problem, model: Model, numbers: Mapping[str, tuple[float, float]]) -> Fitted:
-    """Fit a model with a prior on its parameters; see `tie_to_prior`."""
-    return fit_model(tie_to_prior(problem, numbers), model, exact=True)
-
-
-# Estimates of effects that a model lacks, to first order.
-#
-# A comparison of runs also needs an estimate of effects not named in a run: it is that of one step of
-# the joint fit with the effect added, and its error includes the uncertainty of the other parameters.
 
 
 _ROUNDING = 1e-9

@@ -11,8 +11,8 @@ from motion_runs import simulate, vehicle_of
 from verbs import run_slip
 
 from pipeline.cli import main
-from pipeline.estimation import Input, Problem, estimate_intervals, fit_model, score
-from pipeline.estimation.across_runs import fit_with_prior, tie_to_prior
+from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model, score
+from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.models import Model, find_effect, read_model
 from pipeline.run import MotionError
 from pipeline.run.windows import cut_run, find_driven
@@ -37,6 +37,10 @@ def run() -> MotionRun:
 
 def problem_of(run: MotionRun) -> Problem:
     return Problem([run], HUSKY, Input.MEASURED)
+
+
+def fit_with_prior(problem: Problem, model: Model, numbers: dict[str, tuple[float, float]]) -> Fitted:
+    return fit_model(tie_to_prior(problem, numbers), model, exact=True)
 
 
 def test_a_run_is_cut_by_how_long_it_was_driven(run: MotionRun) -> None:
