@@ -64,7 +64,7 @@ MORE = (
     "turn_acceleration_limit", "grade_load", "wheel_speed_scaling", "contact_friction", "torque_limit",
     "effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play",
     "motor_imbalance", "slope_slip", "side_slope_slip", "side_slope_creep", "side_slope_turn",
-    "load_droop",
+    "load_droop", "tyre_torsion",
 )  # fmt: skip
 """Hidden alone: pools of several effects draw what they always drew."""
 EMPTY = ("plain", "jumps", "noisy", "tilted")

@@ -52,6 +52,7 @@ def draw_size(effect: str, scenario: Scenario, share: float, draw: np.random.Gen
         "deadband": {"d": 0.2 * size * small},
         "body_inertia": {"tau": 0.5 * size},
         "contact_friction": {"friction": 0.2 / size, "creep": 0.5, "k": 1.3 + 0.7 * size, "gyration": 1.2},
+        "tyre_torsion": {"tau": 0.14 * size, "damping": 0.2},
         "heading_skew": {"d": 0.12 * size},
         "yaw_misalignment": {"psi": sign * math.radians(3.5) * size},
         "lever_arm": {"l_x": 0.2 * size, "l_y": sign * 0.1 * size},

@@ -285,7 +285,14 @@ def _follow(signal: Floats, states: Floats, half: float, followed: Floats) -> No
 
 
 def swing_signal(
-    signal: Floats, tau: float, damping: float, step_s: float, resets: Resets, start: Floats
+    signal: Floats,
+    tau: float,
+    damping: float,
+    step_s: float,
+    resets: Resets,
+    start: Floats,
+    *,
+    from_base: bool = False,
 ) -> Floats:
     """Second-order lag tau^2 d2y/dt2 + 2 damping tau dy/dt = u - y; low damping overshoots.
 
@@ -296,6 +303,7 @@ def swing_signal(
         step_s: width of a cell [s].
         resets: where the state is reset, with a rate of zero.
         start: the state there; the input's own value where it is NaN, shape (k,).
+        from_base: whether the damper, too, stands on what moves: the output is y + 2 damping tau dy/dt.
 
     Returns:
         Cell means of the output, shape (n,).
@@ -303,13 +311,25 @@ def swing_signal(
     if tau <= 0.0:
         return signal
     states, swung = set_states(signal, resets, start), np.empty(signal.size)
-    _swing(np.ascontiguousarray(signal), states, tau, damping, step_s, swung)
+    damped = 0.0 if from_base else 2.0 * damping * tau
+    _swing(np.ascontiguousarray(signal), states, tau, damping, damped, step_s, swung)
     return swung
 
 
-@compiled("void(float64[::1], float64[::1], float64, float64, float64, float64[::1])")
-def _swing(signal: Floats, states: Floats, tau: float, damping: float, step_s: float, swung: Floats) -> None:
-    """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs constant in a cell."""
+@compiled("void(float64[::1], float64[::1], float64, float64, float64, float64, float64[::1])")
+def _swing(
+    signal: Floats,
+    states: Floats,
+    tau: float,
+    damping: float,
+    damped: float,
+    step_s: float,
+    swung: Floats,
+) -> None:
+    """See `swing_signal`; ``states`` as in `_lag`. Exact for inputs constant in a cell.
+
+    ``damped`` [s] is the factor of the rate that the output lacks.
+    """
     rate, turned = damping / tau, abs(damping * damping - 1.0) ** 0.5 / tau
     fade = math.exp(-rate * step_s)
     if turned * step_s < _INSTANT_S:
@@ -330,5 +350,5 @@ def _swing(signal: Floats, states: Floats, tau: float, damping: float, step_s: f
         end = (even + rate * odd) * gap + odd * pace
         then = (even - rate * odd) * pace - odd * gap / (tau * tau)
         # The integral of the equation over the cell.
-        swung[cell] = asked - (tau * tau * (then - pace) + 2.0 * damping * tau * (end - gap)) / step_s
+        swung[cell] = asked - (tau * tau * (then - pace) + damped * (end - gap)) / step_s
         state, pace = asked + end, then

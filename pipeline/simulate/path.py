@@ -66,6 +66,8 @@ def move_body(
         rim = vehicle.wheel_radius_m * np.max(np.abs(list(drive.corners.values())), axis=0)
     turning = (rim > TURNING_MPS).astype(np.float64)
     v_x, v_y, v_w = v0, s0, w0
+    if effects.is_active("tyre_torsion"):
+        v_w = _twist_tyres(w0, effects, drive.step_s)
     if effects.is_active("body_inertia"):
         v_x, v_y, v_w = _apply_inertia(v0, s0, w0, effects.value("body_inertia", "tau"), drive.step_s)
     if effects.is_active("contact_friction"):
@@ -149,6 +151,24 @@ def _apply_inertia(
     return turned.real, turned.imag, turning
 
 
+def _twist_tyres(w0: Floats, effects: Effects, step_s: float) -> Floats:
+    """Yaw rate of a body on the springs and dampers of its tyres, by short steps, rates first."""
+    tau, damping = (effects.value("tyre_torsion", name) for name in ("tau", "damping"))
+    stiffness = 1.0 / tau**2
+    friction = 2.0 * (0.2 if math.isnan(damping) else damping) / tau
+    short, rate, twist = step_s / _TWIST_STEPS, float(w0[0]), 0.0
+    yaw_rate = np.empty(w0.size)
+    for cell, wheels in enumerate(w0.tolist()):
+        total = 0.0
+        for _ in range(_TWIST_STEPS):
+            before = rate
+            rate += short * (stiffness * twist + friction * (wheels - rate))
+            twist += short * (wheels - rate)
+            total += 0.5 * (before + rate)
+        yaw_rate[cell] = total / _TWIST_STEPS
+    return yaw_rate
+
+
 def _slide_on_contacts(
     v0: Floats, w0: Floats, track_m: float, effects: Effects, step_s: float
 ) -> tuple[Floats, Floats, Floats]:
@@ -207,6 +227,8 @@ def _shake(
     return draw(disturbance.speed_mps), draw(disturbance.speed_mps), draw(disturbance.turn_radps)
 
 
+_TWIST_STEPS = 10
+"""Steps within a cell in which the yaw swings on its tyres: none is longer than a hundredth of a swing."""
 _SLOW_STEP_S = 0.005
 
 

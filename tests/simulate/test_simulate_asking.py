@@ -55,7 +55,7 @@ CATALOGUE_IDS = {
     *("body_acceleration_limit", "turn_acceleration_limit", "wheel_speed_scaling", "contact_friction"),
     *("steering_offset", "steering_gain", "steering_lag", "steering_sensor_offset", "understeer"),
     *("effective_wheelbase", "gain_drift", "steering_rate_limit", "steering_sensor_play"),
-    *("motor_imbalance", "load_droop"),
+    *("motor_imbalance", "load_droop", "tyre_torsion"),
 }
 
 

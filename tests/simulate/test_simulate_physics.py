@@ -71,6 +71,7 @@ INERTIA = 1.0 + (0.5 * W0) ** 2
         ({"difference_gain": 0.5}, (V0, 0, 0.5 * W0)),
         ({"side_gain": 0.1}, (V0 + 0.05 * W0 * 0.275, 0, W0 + 0.1 * V0 / 0.55)),
         ({"body_inertia": 0.5}, (V0 / INERTIA, -0.5 * W0 * V0 / INERTIA, W0)),
+        ({"tyre_torsion": {"tau": 0.1, "damping": 0.3}}, (V0, 0, W0)),
         # The order of a command's way: the track changes w0, and only then inertia and skid look at it.
         (
             {"effective_track": 1.5, "lateral_skid": 0.1, "icr_offset": 0.1},
