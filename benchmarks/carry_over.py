@@ -48,7 +48,9 @@ def run(given: argparse.Namespace) -> None:
     ]
     if not logs:
         print("there is no such recording here: nothing is compared")
-    manifests = [analyze_log(log, Options(out=store.root, report=False)).manifest for log in logs]
+    manifests = [
+        analyze_log(log, Options(out=store.root, report=False, diagnosis=True)).manifest for log in logs
+    ]
     for source, words in INPUTS.items():
         recordings = []
         for manifest in manifests:
