@@ -37,7 +37,7 @@ class TyreTorsion(BodyEffect):
             starts=(),
             search=Search.STARTS,
             least=Least(0.03, Least.STAMPS),
-            plausible=Plausible(0.0, 0.6, "slower than 0.3 Hz is no swing of tyres"),
+            plausible=Plausible(0.0, 0.6, "tyres swing faster than 0.3 Hz"),
         ),
         Parameter(
             "damping",
