@@ -46,10 +46,10 @@ _FELT_S = 2.0
 _UNUSUAL = 8.0
 """Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than
 a wrong track, a lag or a limit."""
-SHOWN = 0.05
+SHOWN = 0.1
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
 _RISEN = 0.02
-"""Probability below which a rise of any of the held-out errors by more than `SHOWN` is no chance. Where few
+"""Probability below which a rise of any of the held-out errors by half of `SHOWN` is no chance. Where few
 blocks tell nothing of chance, none may rise by more than the largest fall."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
@@ -437,7 +437,7 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif rise > SHOWN or float(np.nanmin(falls, initial=0.0)) < -most:
+    elif rise > SHOWN / 2.0 or float(np.nanmin(falls, initial=0.0)) < -most:
         refusal = f"the error {risen} rises"
     elif most < SHOWN:
         refusal = f"no error falls by more than {format_share(most)}"

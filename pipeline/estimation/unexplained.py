@@ -55,16 +55,16 @@ def search_formula(
         The effects that stay, and the formula; None where none is accepted.
     """
     terms = list_terms(sideways=sideways)
-    final, least, kept = outcome.final, find_cost(outcome.final), outcome.final
+    final, least, base = outcome.final, find_cost(outcome.final), outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
     added: list[FormulaEffect] = []
 
-    def consider(fit: PartFit, without: PartFit, worth: float) -> None:
-        nonlocal least, kept, added
+    def consider(fit: PartFit, without: PartFit, margin: float) -> None:
+        nonlocal least, base, added
         new = [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
         cost = find_cost(fit) + 2.0 * math.log(_SHAPES) * len(new)
-        if new and cost < least - worth:
-            least, kept, added = cost, without, new
+        if new and cost < least - margin:
+            least, base, added = cost, without, new
 
     if wide.screen(final).list_singles():
         consider(wide.run(final.state).final, final, EQUAL)
@@ -75,11 +75,11 @@ def search_formula(
                 consider(rival.fit, rival.base, 2.0 * PRICE)
     if not added:
         return outcome, None
-    if kept is final and any(
+    if base is final and any(
         one.gain > _SAME * (final.score - least) for one in outcome.screen.list_singles()
     ):
         return outcome, None
-    return replace(outcome, final=kept), join_formula(added)
+    return replace(outcome, final=base), join_formula(added)
 
 
 def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
