@@ -545,11 +545,11 @@ class Examination:
             if one.reading.form == "body" and one.is_sure and one.reading.first is not None
         ]
         back = max((min(_share_back(one), _share_back(-one)) for one in asked), default=0.0)
-        kept = []
+        signed = []
         for one in drives:
             sides = [] if one.reading.form != "sides" else one.reading.inputs
             if back < _BOTH_WAYS or not sides or any(side.values.min() < 0.0 for side in sides):
-                kept.append(one)
+                signed.append(one)
                 continue
             text = (
                 f"not used: {one.source}: its speeds have no sign: they are never below zero, though the "
@@ -561,7 +561,7 @@ class Examination:
                     others = self.sources.rank_drives(role)
                     left = next((other for other in others if other.signals != one.source.signals), None)
                     self.sources = replace(self.sources, **{role: left})  # type: ignore[arg-type]
-        return kept
+        return signed
 
     def _report_gyro(self, gyro: Reading | None) -> None:
         """A gyro in degrees per second, whose scale is fitted."""
@@ -624,15 +624,15 @@ class Examination:
     def leave_out(self, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
         """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""
         reading, section = wheels.reading, self._complete().wheels
-        if section.left_out is not None or reading.dead_side or not reading.inputs:
+        if section.ignore is not None or reading.dead_side or not reading.inputs:
             return False
         names = SIDES if reading.form == "sides" else ("both",)
         sides = {name: one for name, one in zip(names, (reading.first, reading.second), strict=False) if one}
         made = reading.explained
         late = (0.0, 0.0) if made is None else (made.lag, made.delay)
         asked = command.reading if command is not None and command.is_sure else None
-        found = find_outages(sides, late, asked, motion)
-        if not found:
+        outages = find_outages(sides, late, asked, motion)
+        if not outages:
             return False
         kind = "ackermann" if reading.form == "steering" else "differential"
         self.extraction.vehicle = self._make_unit(wheels.source, kind)
@@ -646,7 +646,7 @@ class Examination:
         }
         witnesses = [word for word, is_there in words.items() if is_there]
         texts, spans = [], []
-        for one in found:
+        for one in outages:
             inside = (stamps >= one.start) & (stamps < one.end)
             columns = [name for name in (*SIDES, "speed") if one.side in {name, "both"}]
             is_read = table.filter(pl.Series(inside)).filter(pl.any_horizontal(pl.col(columns).is_finite()))
@@ -671,14 +671,14 @@ class Examination:
             first = None if np.isinf(start) else float(np.floor(1e2 * start) / 1e2)
             last = None if np.isinf(end) else float(np.ceil(1e2 * end) / 1e2)
             spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
-        self.changes.setdefault("wheels", {})["left_out"] = spans
+        self.changes.setdefault("wheels", {})["ignore"] = spans
         text = (
-            f"{'; '.join(texts)}: left out, as left_out = {_write_spans(spans)} under [wheels] in run.toml "
-            "does; left_out = [] takes it as recorded"
+            f"{'; '.join(texts)}: left out, as ignore = {_write_spans(spans)} under [wheels] in run.toml "
+            "does; ignore = [] takes it as recorded"
         )
-        begun = None if np.isinf(found[0].start) else found[0].start
+        begin = None if np.isinf(outages[0].start) else outages[0].start
         self.findings.append(
-            Finding("encoder_dead", "warning", text, where="wheels", t_start=begun, count=len(found))
+            Finding("encoder_dead", "warning", text, where="wheels", t_start=begin, count=len(outages))
         )
         return True
 
@@ -981,8 +981,8 @@ class Examination:
 
     def _command_factors(self) -> tuple[float, float]:
         """Factors from a body command as it was read to m/s and rad/s."""
-        found = self.changes.get("command", {})
-        return SPEEDS[str(found.get("unit", "m/s"))], RATES[str(found.get("yaw_unit", "rad/s"))]
+        changes = self.changes.get("command", {})
+        return SPEEDS[str(changes.get("unit", "m/s"))], RATES[str(changes.get("yaw_unit", "rad/s"))]
 
     def _wheel_factor(self) -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""

@@ -155,20 +155,20 @@ def find_outages(
     goes_on = None
     if moved is not None and asked is not None:
         goes_on = _rate_going_on(moved, sources[1], known)
-    found: list[Outage] = []
+    outages: list[Outage] = []
     for name, side in sides.items():
         one, beside = read[name], goes_on
         if one is None:
             # Too little is read for a judgment of it, and silence needs none.
             size = np.abs(sources[0][:, :2]).sum(axis=1)
-            found += _list_silent(name, side, blocks, size, float(np.quantile(size, 0.95)))
+            outages += _list_silent(name, side, blocks, size, float(np.quantile(size, 0.95)))
             continue
         if beside is None:
             # With one witness alone the other side is the second one.
             others = [other for key, other in read.items() if key != name and other is not None]
             beside = others[0].usual - others[0].broad if others else np.zeros(known.size)
-        found += _list_dead(name, side, late[1], blocks, one, sources, beside)
-    return _join_sides(sorted(found, key=lambda one: one.start))
+        outages += _list_dead(name, side, late[1], blocks, one, sources, beside)
+    return _join_sides(sorted(outages, key=lambda one: one.start))
 
 
 @dataclass(frozen=True)
@@ -211,10 +211,10 @@ def _read_side(
     return _Side(values, there, fits, np.max([one.rate(values) for one in fits], axis=0), broad, top)
 
 
-def _join_sides(found: Sequence[Outage]) -> list[Outage]:
+def _join_sides(outages: Sequence[Outage]) -> list[Outage]:
     """Outages in order; those of two sides at once are one."""
     made = list[Outage]()
-    for one in found:
+    for one in outages:
         last = made[-1] if made else one
         apart = max(abs(last.start - one.start), abs(last.end - one.end) if one.end != last.end else 0.0)
         if last.side != one.side and not apart > _SILENT_S:

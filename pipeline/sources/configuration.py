@@ -101,7 +101,7 @@ class RunSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_onl
 
 
 class OutageSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``left_out`` of ``[wheels]``: readings that are none, of one side or of both.
+    """``ignore`` of ``[wheels]``: readings that are none, of one side or of both.
 
     Attributes:
         side: ``left``, ``right`` or ``both``.
@@ -138,7 +138,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         reversed: side that counts backward.
         exchanged: whether left and right are exchanged.
         scale: factor on recorded speeds, where an encoder counts low or high.
-        left_out: spans whose readings are none; empty: all are taken as recorded.
+        ignore: spans whose readings are none; empty: all are taken as recorded.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
     """
@@ -161,7 +161,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     reversed: Literal["left", "right"] | None = None
     exchanged: bool = False
     scale: Positive | None = None
-    left_out: list[OutageSection] | None = None
+    ignore: list[OutageSection] | None = None
     time: Clock | None = None
     hold_s: Positive | None = None
 

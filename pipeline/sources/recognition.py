@@ -325,7 +325,7 @@ def find_alike(radius_m: float, track_m: float) -> dict[str, tuple[str, float]]:
         for vehicle in list_presets()
         if vehicle.kind == "differential" and abs(vehicle.wheel_radius_m / radius_m - 1.0) < _SAME_WHEEL
     }
-    alike = [(one, found) for one, found in shares.items() if 0.0 < found[1] < 1.0 + _DIFFERS]
+    alike = [(one, named) for one, named in shares.items() if 0.0 < named[1] < 1.0 + _DIFFERS]
     return dict(sorted(alike, key=lambda item: abs(item[1][1] - 1.0)))
 
 

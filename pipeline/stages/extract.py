@@ -548,8 +548,8 @@ class Extraction:
         frame = pl.DataFrame(
             {**self._time_columns(times, stamp, log_time), **values, "active": is_inside(times, self._spans)}
         )
-        if section.left_out:
-            frame = self._leave_out(frame, section.left_out, held=held)
+        if section.ignore:
+            frame = self._leave_out(frame, section.ignore, held=held)
         return frame.with_columns(pl.lit(None, dtype=pl.Float64).alias(name) for name in absent)
 
     def _leave_out(self, frame: pl.DataFrame, spans: Sequence[OutageSection], *, held: bool) -> pl.DataFrame:

@@ -120,13 +120,13 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
     (told,) = [one for one in setup.choice.findings if one.id == "encoder_dead"]
     assert told.severity == "warning"
     assert "the left wheels' encoder reads nothing from 40 to 70 s" in told.text
-    (span,) = setup.configuration.wheels.left_out
-    line = f'left_out = [{{side = "left", start_s = {span.start_s:g}, end_s = {span.end_s:g}}}]'
+    (span,) = setup.configuration.wheels.ignore
+    line = f'ignore = [{{side = "left", start_s = {span.start_s:g}, end_s = {span.end_s:g}}}]'
     assert line in told.text
-    for given, left_out in ((line, [span]), ("left_out = []", [])):
+    for given, ignore in ((line, [span]), ("ignore = []", [])):
         (tmp_path / "line.toml").write_text(f"[wheels]\n{given}")
         settled = set_up_log(log, Options(out=tmp_path, config=tmp_path / "line.toml"))
-        assert settled.configuration.wheels.left_out == left_out
+        assert settled.configuration.wheels.ignore == ignore
         assert "encoder_dead" not in {one.id for one in settled.choice.findings}
 
 
