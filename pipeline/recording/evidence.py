@@ -29,6 +29,8 @@ _NEARLY_BACK_DEG = 135.0
 """Angle from which on half a turn is nearer than a quarter."""
 _CONCENTRATED = 0.6
 """Concentration of the course above which its angle means anything."""
+_ONE_LINE = 0.9
+"""Share of the motion asked for along one line, from which on it tells no direction from another."""
 
 
 def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, float]:
@@ -101,7 +103,11 @@ def _find_frame_across(motion: Motion, part: Motion, asked: Complex) -> tuple[Mo
     assert chosen is not None  # noqa: S101 - the first one is
     flip, angle, blocks = chosen
     quarters = 90.0 * round(angle / 90.0)
-    angle = angle if abs(angle - quarters) > _USUAL_DEG else quarters
+    if abs(angle - quarters) <= _USUAL_DEG:
+        angle = quarters
+    elif abs(np.sum(asked**2)) > _ONE_LINE * float(np.sum(np.abs(asked) ** 2)):
+        # Along one line, a heading that is off is a ground on which the body slips aside, too.
+        return motion, 0.0
     margin, gain = compare(blocks, usual), float((blocks - usual).sum()) / part.moved.size
     if not (flip or angle) or margin < CLEAR or gain < LEAST_NATS:
         return motion, 0.0

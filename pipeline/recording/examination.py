@@ -746,7 +746,7 @@ class Examination:
                     f"the poses of {source} look to the rear where {drivers} drive ahead (a sensor that is "
                     "mounted backward, or base_link points to the rear)"
                 )
-            self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": offset})
+            self._correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": float(f"{offset:g}")})
 
     def _report_fault(
         self, fault: str, command: Candidate | None, wheels: Candidate | None, others: Sequence[str] = ()

@@ -61,8 +61,10 @@ def test_the_angle_of_the_heading_is_found(degrees: float, *, line: bool) -> Non
     assert command.explained.is_sure
     turned, margin = find_frame(motion, [command])
     assert not turned.flip
-    assert turned.offset_deg == pytest.approx(degrees, abs=3.0)
-    assert (margin > 3.0) == bool(degrees)
+    # Along one line, a heading that is off cannot be told from a ground on which the body slips aside.
+    told = degrees if not line or degrees % 90.0 == 0.0 else 0.0
+    assert turned.offset_deg == pytest.approx(told, abs=3.0)
+    assert (margin > 3.0) == bool(told)
 
 
 @pytest.mark.parametrize(
