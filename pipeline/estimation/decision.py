@@ -202,8 +202,8 @@ class Search:
     def _least_t(self) -> float:
         return math.sqrt(LEAST_T**2 + 2.0 * math.log(self.shapes))
 
-    def _judge(self, base: PartFit, fit: PartFit) -> Judged:
-        return judge(base, fit, self.conditions, self._least_t)
+    def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool = False) -> Judged:
+        return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
 
     def _is_unnamed(self, judged: Judged) -> bool:
         """Whether a model was refused for the size of its new effects alone."""
@@ -298,7 +298,7 @@ class Search:
         """The model without effects that are not accepted beside its others, and how each was judged."""
         while True:
             free = [name for name in fit.ids if name not in self.given]
-            judged = {name: self._judge(self._drop(fit, [name]), fit) for name in free}
+            judged = {name: self._judge(self._drop(fit, [name]), fit, is_final=True) for name in free}
             refused = [(float(np.nan_to_num(one.gain)), name) for name, one in judged.items() if one.refusal]
             if not refused:
                 return fit, judged
@@ -400,7 +400,9 @@ def measure_t(fit: PartFit, effect: Effect, base: PartFit | None = None) -> floa
     return math.sqrt(max(total - (len(indices) - 1), 0.0))
 
 
-def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = LEAST_T) -> Judged:
+def judge(
+    base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = LEAST_T, *, is_final: bool = True
+) -> Judged:
     """Accept an extension of a model, or say why not.
 
     Both are judged by the noise of the larger model: that of the smaller one would hide what it lacks.
@@ -437,9 +439,9 @@ def judge(base: PartFit, fit: PartFit, conditions: Conditions, least_t: float = 
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif rise > SHOWN / 2.0 or float(np.nanmin(falls, initial=0.0)) < -most:
+    elif is_final and rise > SHOWN / 2.0 or float(np.nanmin(falls, initial=0.0)) < -most:
         refusal = f"the error {risen} rises"
-    elif most < SHOWN:
+    elif most < (SHOWN if is_final else SHOWN / 2.0):
         refusal = f"no error falls by more than {format_share(most)}"
     elif not _is_material(part, base.residual - fit.residual):
         refusal = "nobody would notice it"
