@@ -412,6 +412,8 @@ def judge(
         fit: the larger one.
         conditions: what the runs can show.
         least_t: standard errors that each new effect must be from none.
+        is_final: whether the larger model is the last one. On the way there, errors may rise until what comes
+            next is in, and a fall of half as much is enough.
     """
     added = tuple(name for name in fit.ids if name not in base.ids)
     new = [effect for effect in fit.state.effects if effect.id in added]
@@ -439,7 +441,7 @@ def judge(
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif is_final and rise > SHOWN / 2.0 or float(np.nanmin(falls, initial=0.0)) < -most:
+    elif (is_final and rise > SHOWN / 2.0) or float(np.nanmin(falls, initial=0.0)) < -most:
         refusal = f"the error {risen} rises"
     elif most < (SHOWN if is_final else SHOWN / 2.0):
         refusal = f"no error falls by more than {format_share(most)}"

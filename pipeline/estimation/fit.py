@@ -213,7 +213,7 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        most: times that derivatives are computed anew.
+        most: steps.
     """
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
@@ -245,7 +245,7 @@ def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
-    while fit.smooth and most > 0:
+    for _ in range(most if fit.smooth else 0):
         moving, step, promised = _solve(fit, damping)
         fall = 0.0
         if promised >= enough:
@@ -264,7 +264,7 @@ def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
             break
         if not is_fresh:
             columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
-            fit, is_fresh, most = replace(fit, columns=columns), True, most - 1
+            fit, is_fresh = replace(fit, columns=columns), True
         if fallen > most_fallen and not 0.0 < fall <= _NEWS:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)

@@ -33,7 +33,8 @@ def test_the_program_says_its_version(program: list[str], tmp_path: Path) -> Non
 
 def test_a_checkout_that_is_not_installed_says_its_version(tmp_path: Path) -> None:
     shutil.copytree(ROOT / "pipeline" / "core", tmp_path / "pipeline" / "core")
-    shutil.copyfile(ROOT / "pipeline" / "__init__.py", tmp_path / "pipeline" / "__init__.py")
+    for name in ("__init__.py", "door.py"):
+        shutil.copyfile(ROOT / "pipeline" / name, tmp_path / "pipeline" / name)
     (tmp_path / "pyproject.toml").write_text('[project]\nversion = "7.8.9"\n', encoding="utf-8")
     code = (
         "import importlib.metadata as m\n"

@@ -30,7 +30,7 @@ states[0] = 0.5
 lagged, limited, swung = np.empty(300), np.empty(300), np.empty(300)
 filters._lag(signal, states, 0.3, 0.02, lagged)
 filters._limit(signal, states, 0.2, limited)
-filters._swing(signal, states, 0.3, 0.7, 0.02, swung)
+filters._swing(signal, states, 0.3, 0.7, 0.0, 0.02, swung)
 asked, starts = np.stack([signal, -signal, np.zeros(300)])[None], np.zeros((1, 3, 1))
 numbers = [[3.0, 1.0, 0.2, 3.0, 3.0, 0.05, 0.01, 0.02, 0.3, 0.5]] * 3
 rolled = walk_each(numbers, [0, 0, 0], asked, np.zeros(1, dtype=np.int64), starts, 0.02)

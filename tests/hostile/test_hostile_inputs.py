@@ -89,6 +89,7 @@ WORDS: list[tuple[str, str]] = [
     ("model compare husky.toml missing.toml --on field/wide", "missing.toml"),
     ("model compare --on field/wide", "two model files are compared"),
     ("model literature nobody", "nobody"),
+    ("model speed no.toml --on nowhere --within 10cm", "no.toml"),
     ("model trust missing.toml", "missing.toml"),
     ("model export husky.toml --to ros_control", "Did you mean ros2_control"),
     ("model export husky.toml --to autoware", "husky_a200 is differential"),
