@@ -58,21 +58,17 @@ def search_formula(
     final, least, base = outcome.final, find_cost(outcome.final), outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
     added: list[FormulaEffect] = []
-
-    def consider(fit: PartFit, without: PartFit, margin: float) -> None:
-        nonlocal least, base, added
+    beside = [wide.run(final.state).final] if wide.screen(final).list_singles() else []
+    offers = [(fit, final, EQUAL) for fit in beside]
+    for name in outcome.new:
+        # In the place of an effect it must be far better than beside it.
+        rivals = wide.list_rivals(final, outcome.judged[name].base, [name])
+        offers += [(one.fit, one.base, 2.0 * PRICE) for one in rivals if not one.refusal]
+    for fit, without, margin in offers:
         new = [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
         cost = find_cost(fit) + 2.0 * math.log(_SHAPES) * len(new)
         if new and cost < least - margin:
             least, base, added = cost, without, new
-
-    if wide.screen(final).list_singles():
-        consider(wide.run(final.state).final, final, EQUAL)
-    for name in outcome.new:
-        # In the place of an effect it must be far better than beside it.
-        for rival in wide.list_rivals(final, outcome.judged[name].base, [name]):
-            if not rival.refusal:
-                consider(rival.fit, rival.base, 2.0 * PRICE)
     if not added:
         return outcome, None
     if base is final and any(
