@@ -202,7 +202,7 @@ class Search:
     def _least_t(self) -> float:
         return math.sqrt(LEAST_T**2 + 2.0 * math.log(self.shapes))
 
-    def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool = False) -> Judged:
+    def _judge(self, base: PartFit, fit: PartFit, *, is_final: bool) -> Judged:
         return judge(base, fit, self.conditions, self._least_t, is_final=is_final)
 
     def _is_unnamed(self, judged: Judged) -> bool:
@@ -264,7 +264,7 @@ class Search:
             fit = self._reduce(self._fit(start.state, start.noise), base)
             if set(fit.ids) == set(base.ids):
                 continue
-            one = self._judge(base, fit)
+            one = self._judge(base, fit, is_final=False)
             if fit.ids not in judged or one.cost < judged[fit.ids].cost:
                 judged[fit.ids] = one
             if not one.refusal:
@@ -354,7 +354,7 @@ class Search:
         fit = min(fits, key=find_cost, default=base)
         if find_cost(fit) > own - EQUAL:
             return None
-        judged = self._judge(base, fit)
+        judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self._prune(fit)
 
 
