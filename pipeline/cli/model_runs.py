@@ -271,7 +271,6 @@ def read_seconds(text: str, where: str = "--first") -> float:
 
 
 _METRES = re.compile(r"(\d+(?:\.\d+)?)\s*(mm|cm|m)")
-_PER_METRE = {"mm": 1000.0, "cm": 100.0, "m": 1.0}
 
 
 def read_metres(text: str) -> float:
@@ -281,12 +280,13 @@ def read_metres(text: str) -> float:
         MotionError: ``bad_tolerance``.
     """
     from pipeline.run import MotionError  # noqa: PLC0415 - heavy
+    from pipeline.sources import LENGTH_UNITS  # noqa: PLC0415
 
     match = _METRES.fullmatch(text.strip())
     if match is None or not float(match[1]) > 0.0:
         what = f"{text!r} is not a length above zero"
         raise MotionError("bad_tolerance", what, where="--within", hint="Write 10cm or 0.1m.")
-    return float(match[1]) / _PER_METRE[match[2]]
+    return float(match[1]) * LENGTH_UNITS[match[2]]
 
 
 def require_model(path: Path | None) -> Path:
