@@ -5,8 +5,6 @@ of its docstring says what it measures, `add_arguments(parser)` declares its opt
 listed: adding a benchmark is adding a file.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import sys

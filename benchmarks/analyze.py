@@ -4,8 +4,6 @@ Prints wall and CPU seconds and peak memory (medians over the runs). The peer in
 reader decoding the same topics and nothing more.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 import sys

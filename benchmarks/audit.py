@@ -6,8 +6,6 @@ Fails where a locked package has a licence that is not accepted, or a known advi
 database can be reached, the last line says so. The bill of materials is CycloneDX JSON.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -5,8 +5,6 @@ the same eight topics are read from each, on two threads, each time in a process
 values differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from pathlib import Path

@@ -5,8 +5,6 @@ two processes take turns, so that other load hits both, and the best of the roun
 in which no log is worked on: until the first is begun, and after the last is done.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ numbers as they are, and with the same effects fitted to that run and held out i
 both. Printed are the ratios of the errors over 2 s.
 """
 
-from __future__ import annotations
-
 import argparse
 import statistics
 from itertools import permutations

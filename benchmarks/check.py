@@ -10,8 +10,6 @@
   other, and recordings of one vehicle on one ground. Printed are alarms and how much errors differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import itertools
 import math

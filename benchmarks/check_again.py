@@ -9,8 +9,6 @@
   says of itself, for five causes at four sizes. No run is simulated: thousands of trials take minutes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections import Counter

@@ -7,8 +7,6 @@ effect or a finding) and how many a median. A number that is used only while mod
 compiled loops, keeps its value there: it is `same` whatever it is.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -5,8 +5,6 @@ Every seed draws a scene and an effect of one number (`game.draw`). The log with
 shares of that size, and diagnosed. Printed is how often it was named, left undecided, or not seen, by share.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

@@ -6,8 +6,6 @@ and the ratio. Then one diagnosis more, on one core, with its CPU seconds by sta
 a stage itself counts there alone. A machine that is busy otherwise makes all of them longer, ratios less so.
 """
 
-from __future__ import annotations
-
 import argparse
 import functools
 import os

@@ -5,8 +5,6 @@ take-overs, on vehicles that drive as drawn. Found is an event that begins withi
 the lead is the time from the first alarm of digging in until the vehicle stands.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from collections import Counter

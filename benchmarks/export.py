@@ -6,8 +6,6 @@ writes the same topics without the model, trail, path and findings: whole tables
 the official writer.
 """
 
-from __future__ import annotations
-
 import argparse
 import shutil
 import subprocess

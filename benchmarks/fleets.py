@@ -7,8 +7,6 @@ flat. With --drawn, estimates of N fleets are drawn in place of runs, by the siz
 scatters of a run: the size from which levels are told.
 """
 
-from __future__ import annotations
-
 import argparse
 import multiprocessing
 import sys

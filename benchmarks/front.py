@@ -5,8 +5,6 @@ Every log is analyzed as it is and with every change of `rewritten_logs.py` that
 the change is undone, the medians stay the same), `WRONG` otherwise.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import tempfile

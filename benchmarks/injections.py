@@ -5,8 +5,6 @@ polars alone: nothing here knows how the tool looks for what is injected. Faults
 found before tables are extracted, are written into logs (`front`).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

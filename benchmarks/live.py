@@ -6,8 +6,6 @@ follows it; its processes are sampled from /proc.
     make live-replay ARGS="--minutes 60 --speed 20"
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ of the diagnosis, so that none has been seen before. Recordings are those under 
 what needs them is left out, and it says so.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

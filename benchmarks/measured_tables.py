@@ -6,8 +6,6 @@ numbers depend on. A page has the place of a table between two comments, `<!-- m
 `<!-- /measured -->`; without --check what stands between them is written again. `make measure` measures.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import re

@@ -1,7 +1,5 @@
 """Shared by benchmarks: where recordings are, rows of results, what a command costs."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

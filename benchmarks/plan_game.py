@@ -6,8 +6,6 @@ of each plan, drawn at random, is tested at its own second too: the drive is end
 One line a draw, then the rates. A file of scores that exists is continued: its seeds are not played again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import tempfile

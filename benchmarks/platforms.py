@@ -3,8 +3,6 @@
 Every platform's log is simulated with hidden effects and handed to `slip diagnose` without any configuration.
 """
 
-from __future__ import annotations
-
 import argparse
 import tempfile
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ so. Every answer is read from the ids and numbers of a diagnosis, as `slip.analy
 `slip fleet fit` give it. A question that the program refuses counts as `refused`.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Write data_samples/recorded from a checkout of its public source: CHECKOUT is sousarbarb/optiodom."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

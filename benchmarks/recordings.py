@@ -6,8 +6,6 @@ effects over those of the ideal model, beside the table "On the real recordings"
 --ladders the effects are climbed one by one and every rung's 2 s error is printed: it falls, or it stops.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import tempfile

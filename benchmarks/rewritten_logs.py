@@ -4,8 +4,6 @@ What the change does to the answer is known beforehand: nothing, or it is to be 
 the program reads a log or what it looks for.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import re

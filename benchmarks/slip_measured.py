@@ -1,7 +1,5 @@
 """`slip` that ends with a line on stderr about what it cost itself and its children."""
 
-from __future__ import annotations
-
 import json
 import resource
 import sys

@@ -5,8 +5,6 @@
 - `real`: recordings of a folder, each mapped; printed is what is found of the number of passes.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

@@ -5,8 +5,6 @@ Each log is cut where a recorder would have been after shares of its length, and
 the finished log does not have, and the CPU time of a look.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 import tempfile

@@ -3,8 +3,6 @@
 slip analyze run.mcap && python examples/fit_by_hand.py results RUN effective_track drive_lag
 """
 
-from __future__ import annotations
-
 import sys
 
 import slip

@@ -3,8 +3,6 @@
 slip analyze run.mcap && python examples/where_it_turns.py results
 """
 
-from __future__ import annotations
-
 import sys
 
 import polars as pl

@@ -1,7 +1,5 @@
 """Doors of rooms: the names that a package offers, each loaded from its file when it is asked for."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from collections.abc import Callable

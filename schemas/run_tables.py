@@ -1,7 +1,5 @@
 """Tables of one run: what its log holds, and what is computed of it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import ClassVar
 

@@ -5,8 +5,6 @@
 Answers stand in <answers>/<player>/<task>.json; rings without their truths are answered and not scored.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -8,8 +8,6 @@ icr_asymmetric  three centres of rotation and two speed factors (Mandow et al. 2
                 is not at its neutral value
 """
 
-from __future__ import annotations
-
 import json
 import time
 from collections.abc import Callable

@@ -5,8 +5,6 @@ run at once, so that the two take turns: the controller asks for some seconds by
 this vehicle, random motion included, and the simulator says where hidden effects and slopes have brought it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -5,8 +5,6 @@ motion, drop-outs, jumps, decoys. The generator of the logs shares no code with 
 a seed give the same bytes in every version: drawn logs are what versions of the diagnosis are compared on.
 """
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable

@@ -13,8 +13,6 @@ diagnoses once more. It prints of each log the largest relative difference of al
 and all else that differs, with a summary of both where that differs, and the ratio of CPU times by category.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

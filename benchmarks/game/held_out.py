@@ -4,8 +4,6 @@ A window begins at a measured pose and ends `HORIZON_S` later. Its floor is the 
 physics exactly: what is left are the noise of the first pose and the random motion within the window.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -6,8 +6,6 @@
 The truth of `mystery_1.mcap` is in `mystery_1.spoiler.json`, for nobody to read by accident.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Mapping

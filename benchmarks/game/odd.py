@@ -1,7 +1,5 @@
 """Physics that no catalogue has: what `diagnose` must flag as unexplained, not name for something else."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -6,8 +6,6 @@ Only logs that both have played count. An answer is better when it names less th
 less, or leaves less open; the sign test's p says how often chance alone would tilt the changes that far.
 """
 
-from __future__ import annotations
-
 import argparse
 import math
 from collections.abc import Iterable, Mapping

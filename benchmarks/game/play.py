@@ -7,8 +7,6 @@ With --command-line the program itself is run for each log. Each log's score is 
 stopped at any moment, the same command with --resume goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import multiprocessing

@@ -3,8 +3,6 @@
 No setting but the vehicle sheet; `slip.analyze` and `Run.diagnose` as anybody has them.
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence

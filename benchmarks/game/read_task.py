@@ -1,7 +1,5 @@
 """Reading a task: log, vehicle sheet and held-out stretch as arrays, with numpy and mcap-ros2-support."""
 
-from __future__ import annotations
-
 import csv
 import tomllib
 from dataclasses import dataclass

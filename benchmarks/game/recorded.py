@@ -6,8 +6,6 @@ other task. What the vehicle does by itself is nobody's truth: other names count
 the injected effect has no number.
 """
 
-from __future__ import annotations
-
 import math
 import tempfile
 from collections.abc import Callable, Mapping

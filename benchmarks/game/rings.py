@@ -15,8 +15,6 @@ holds; a task has the SHA-256 of its truth, which is salted, so that no guess ca
 Without `--sealed` everything comes of `--seed`, and the same seed gives the same bytes.
 """
 
-from __future__ import annotations
-
 import argparse
 import csv
 import hashlib

@@ -9,8 +9,6 @@ broken counts as abstained, with one line on the error stream. Every score has i
 where there is nothing to score with.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Played riddles as text: rates with Wilson intervals, what was said of what, times, misses by seed."""
 
-from __future__ import annotations
-
 import math
 import statistics
 from collections import Counter, defaultdict

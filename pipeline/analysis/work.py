@@ -1,7 +1,5 @@
 """Execution of the stages of one run, and slip relative to a model."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Before and after a batch: which logs are done and what their runs are called; pages and pruning."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress

@@ -3,8 +3,6 @@
 Each is sent once, to a command of the user, and again only after a night without it.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """Recipes that run a batch every night: for systemd, cron, Airflow and the Actions of GitHub."""
 
-from __future__ import annotations
-
 import json
 import re
 import shlex

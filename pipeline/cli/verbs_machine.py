@@ -1,7 +1,5 @@
 """Commands about this machine: serve, and doctor, which says whether all that slip needs is there."""
 
-from __future__ import annotations
-
 import atexit
 import importlib
 import os

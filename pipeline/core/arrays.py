@@ -1,7 +1,5 @@
 """Arrays: types, sampling on uniform grids, robust regression, quantiles."""
 
-from __future__ import annotations
-
 import functools
 import math
 from typing import Any

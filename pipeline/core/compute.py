@@ -1,7 +1,5 @@
 """Work on several threads, the budget of a search, a cache of recent results, release of freed memory."""
 
-from __future__ import annotations
-
 import ctypes
 import math
 import os

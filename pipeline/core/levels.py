@@ -1,7 +1,5 @@
 """Levels of statistics that several rooms share, and numbers as they stand in JSON."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Memory of processes and of the machine, and its limits."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The program and its processes: version, warnings, how Python is started, and when it ends."""
 
-from __future__ import annotations
-
 import os
 import sys
 import threading

@@ -1,7 +1,5 @@
 """Student's t with four degrees of freedom: noise most of which is Gaussian, and some of which is far off."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Texts: errors, numbers with their digits, lengths, durations, and shares in words."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager

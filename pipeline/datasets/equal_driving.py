@@ -5,8 +5,6 @@ rate, and the logarithm of a bin's median slip modulus is the level of its run p
 levels of runs then compare grounds as if all runs had driven all bins.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 

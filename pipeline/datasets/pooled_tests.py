@@ -4,8 +4,6 @@ A run is the unit. Grounds of one vehicle differ in their means, and runs of one
 scatter is pooled over the grounds, so that a ground with a single run can be compared, too.
 """
 
-from __future__ import annotations
-
 import functools
 import math
 from collections.abc import Sequence

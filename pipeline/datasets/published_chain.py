@@ -6,8 +6,6 @@ powertrain model to it; their v comes from splines of held poses. Where the pape
 choice, the function that makes it documents it.
 """
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Mapping
 from dataclasses import dataclass

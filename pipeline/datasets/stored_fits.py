@@ -1,7 +1,5 @@
 """Models fitted to stored runs, and contests of models with those of the literature."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal

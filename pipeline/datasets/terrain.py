@@ -5,8 +5,6 @@ vehicle is two cells away, so that a path along an edge counts once. Passes are 
 of the ground between two runs are unknown.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Export of a model as JSON or as dependency-free Python, and of its traction thresholds."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

@@ -4,8 +4,6 @@ It returns the pose of the vehicle, not that reported by the localization. Steps
 their formulas; those of effects that have none stand in `steps.toml`.
 """
 
-from __future__ import annotations
-
 import ast
 import copy
 import functools

@@ -1,7 +1,5 @@
 """Export to Gazebo: its drive plugins with the parameters of the fitted model."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree as ET
 
 from pipeline.core import make_plain

@@ -7,8 +7,6 @@ Repeated tests of growing evidence exceed any threshold in the end by chance. An
 stricter test here than in a finished log, and passes it in two successive looks.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import math
 import os

@@ -4,8 +4,6 @@ A field with one number per message is a plain array; a fixed-size array is ``(n
 concatenated values with offsets. Strings are codes into the tuple of the distinct strings.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -9,8 +9,6 @@ advertisements, subscriptions and message data are the same in `foxglove.sdk.v1`
 (ROSBRIDGE_PROTOCOL.md of RobotWebTools/rosbridge_suite).
 """
 
-from __future__ import annotations
-
 import base64
 import binascii
 import fcntl

@@ -3,8 +3,6 @@
 After damage, the next record is searched for here.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 from collections.abc import Mapping, Sequence

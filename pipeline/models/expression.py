@@ -1,7 +1,5 @@
 """Arithmetic as text: a small parser that derives units and never runs what it is given."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Effects as text: from a formula, a page and parameters their physics, page and export are derived."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import re

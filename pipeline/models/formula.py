@@ -1,7 +1,5 @@
 """The effect that adds a formula of a model file to the velocity."""
 
-from __future__ import annotations
-
 import functools
 import keyword
 import math

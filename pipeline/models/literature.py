@@ -3,8 +3,6 @@
 A model is one entry of `MODELS`, which the screen, model files and comparisons use.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final

@@ -1,7 +1,5 @@
 """What effects are called and what a vehicle with one does: templates of `words.toml` and numbers."""
 
-from __future__ import annotations
-
 import functools
 import math
 import re

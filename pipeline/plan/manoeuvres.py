@@ -1,7 +1,5 @@
 """Manoeuvres of a vehicle within its limits and an area, and the choice of the fewest that decide."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Sequence

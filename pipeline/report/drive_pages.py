@@ -1,7 +1,5 @@
 """Page of a drive: the plan of `slip plan`."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Pages over runs: `slip fleet fit`, `slip fleet map --terrain`, and `slip compare --causes`."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import math

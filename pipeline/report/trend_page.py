@@ -1,7 +1,5 @@
 """Page of `slip fleet trend`: parameters of vehicles, slip and health of groups, over the dates of runs."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json

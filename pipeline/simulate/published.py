@@ -1,7 +1,5 @@
 """Topics of a platform: whose quantities they publish, and under which fields."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal

@@ -1,7 +1,5 @@
 """Signals of a simulated drive: body commands at their stamps, wheels on cells, and their integrals."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The configuration of a run, and vehicles from presets and configurations."""
 
-from __future__ import annotations
-
 import functools
 import math
 import re

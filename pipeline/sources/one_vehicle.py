@@ -1,7 +1,5 @@
 """The vehicle of stored runs, and the one whose geometry stands for several."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from typing import Literal

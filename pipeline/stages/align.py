@@ -4,8 +4,6 @@ They are estimated once, from commands, wheels, poses and gyro as extracted, and
 tables and as numbers, so that every reader of the run gets corrected data.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Faults of the localization: its latency, and half seconds and stretches of implausible motion."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

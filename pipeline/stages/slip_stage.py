@@ -1,7 +1,5 @@
 """The slip stage, g = f(u) - v after each command step, and the aggregates of a run."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

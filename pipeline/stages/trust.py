@@ -3,8 +3,6 @@
 And whether map scale depends on direction: ratio of pose path to wheel path by heading.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

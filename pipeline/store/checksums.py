@@ -1,7 +1,5 @@
 """Small JSON files with a checksum of their own: the manifest of a run, markers of generations, and notes."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Iterator, Mapping

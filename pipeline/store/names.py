@@ -1,7 +1,5 @@
 """Safe names of runs and folders, dates of runs, shares of many files, and what can go wrong with results."""
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """Runs of a results folder: their names, the logs that they are of, their keys and files."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,7 +1,5 @@
 """Are the results still what was written? The same examination for a folder and for an object store."""
 
-from __future__ import annotations
-
 import errno
 from bisect import bisect_left
 from collections.abc import Callable, Collection, Iterator, Mapping

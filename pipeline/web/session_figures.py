@@ -1,7 +1,5 @@
 """Figures of a session and of a stretch of its run, complete or only the rows that a change affects."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 
 import polars as pl

@@ -1,7 +1,5 @@
 """Text formats of a check: verdict, lines for a screen, Markdown, and JUnit for a build server."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterable, Sequence

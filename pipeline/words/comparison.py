@@ -1,7 +1,5 @@
 """The answer of a comparison in sentences: which ground is harder, as driven and at equal driving."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass

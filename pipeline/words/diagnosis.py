@@ -1,7 +1,5 @@
 """A diagnosis as lines of text: verdict, main effects and remaining error; then all other sections."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """One log through all stages: what is computed, what is reused, what is left behind."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shutil

@@ -1,7 +1,5 @@
 """A bag is analyzed as the MCAP of the same recording is."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

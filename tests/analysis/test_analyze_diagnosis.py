@@ -1,7 +1,5 @@
 """The diagnosis inside an analysis: what is missing is said, kept, and not looked for twice."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Logs without any pose: commands and measured wheels show the drivetrain, and nothing of the ground."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass, replace
 from pathlib import Path

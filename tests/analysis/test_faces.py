@@ -1,7 +1,5 @@
 """The verdict is one text on every face: screen, report, index page, JSON, Python, workbench."""
 
-from __future__ import annotations
-
 import html
 import json
 from pathlib import Path

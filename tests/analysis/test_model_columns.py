@@ -1,7 +1,5 @@
 """Model against measurement per time step: the model columns of table `slip` after a diagnosis."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

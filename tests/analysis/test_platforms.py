@@ -1,7 +1,5 @@
 """Logs as popular platforms publish them: chosen rightly and diagnosed without any configuration."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """What a result says about the program and the packages that computed it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

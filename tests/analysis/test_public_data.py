@@ -1,7 +1,5 @@
 """Public data sets, a few made-up rows of each in its own format: recognized, and analyzed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

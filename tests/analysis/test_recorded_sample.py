@@ -1,7 +1,5 @@
 """The real recording of data_samples: slip against the log's own numbers, read without the program."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

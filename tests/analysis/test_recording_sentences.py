@@ -5,8 +5,6 @@ measured wheels exceed a limit, read from the tables without any model. The last
 show the same errors.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The sample logs: what their README says, and that they are what the simulator makes."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Logs of vehicles that move sideways, from the file to the named effects."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path

@@ -5,8 +5,6 @@
 Every kind of entry is put beside one good log; the batch must do the good one, name the bad one, and end.
 """
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The catalogue in a real browser: columns sort, the box searches, nothing is blocked or broken."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Names of runs: the same for the same logs, whatever was done before and in which order."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from hypothesis import given

@@ -1,7 +1,5 @@
 """What a batch tells after its logs: what failed and what changed, once, to a command of the user."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """One bad entry never stops a season."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Which recordings a batch finds."""
 
-from __future__ import annotations
-
 import os
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """No path and no argument can add a line, a word or a setting to what `slip batch schedule` prints."""
 
-from __future__ import annotations
-
 import ast
 import re
 import shlex

@@ -1,7 +1,5 @@
 """`slip check`: exit codes, files, and a baseline that is kept and used, as a user calls it."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Logs that are unchecked, huge or absurd, through the command line: one clear answer each."""
 
-from __future__ import annotations
-
 import json
 import struct
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a verb imports: starting the program costs whoever asks for little no more than that."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

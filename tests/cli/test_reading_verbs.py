@@ -1,7 +1,5 @@
 """Verbs that read stored runs leave them as they are, and say what contradicts them."""
 
-from __future__ import annotations
-
 import hashlib
 import itertools
 import json

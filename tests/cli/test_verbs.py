@@ -1,7 +1,5 @@
 """The command line as scripts and people use it: output, exit codes, one clear line for every error."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

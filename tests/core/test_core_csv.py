@@ -1,7 +1,5 @@
 """CSV that no spreadsheet runs, and that says what it said when it is read again."""
 
-from __future__ import annotations
-
 import io
 from pathlib import Path
 

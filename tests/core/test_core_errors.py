@@ -1,7 +1,5 @@
 """Errors: one line, a code for scripts, whole across processes."""
 
-from __future__ import annotations
-
 import pickle
 
 from pipeline.core import SlipError

@@ -1,7 +1,5 @@
 """Loops that are compiled at set-up are not compiled again, and are what their Python source says."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

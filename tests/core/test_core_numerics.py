@@ -1,7 +1,5 @@
 """Quantiles, standard errors and banded systems."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

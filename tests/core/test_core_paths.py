@@ -1,7 +1,5 @@
 """A name from outside never leads out of its folder."""
 
-from __future__ import annotations
-
 import os
 import unicodedata
 from pathlib import Path, PureWindowsPath

@@ -1,7 +1,5 @@
 """Rigid motions: what goes there comes back, whatever the rotation."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Cutting poses into segments, and the increments between them."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

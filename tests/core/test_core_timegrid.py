@@ -1,7 +1,5 @@
 """Time grids, and the derivative that every velocity comes from."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Numbers in words: shares in percent, the same everywhere."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Numbers of two groups of runs: what is called a change, how seldom wrongly, and what would be found."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """The table of deployments and the map."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Names out of logs stay text on every page that many runs share."""
 
-from __future__ import annotations
-
 import json
 import re
 from html.parser import HTMLParser

@@ -1,7 +1,5 @@
 """The published chain: exact on motions whose answer is known, near the paper on the real recordings."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`slip compare` over results: what is said about good and bad input."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Features of deployments: what is shared, and what of a file of others is taken."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable

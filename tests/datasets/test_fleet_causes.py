@@ -1,7 +1,5 @@
 """Deployments compared by cause: parts add up, the unit is the run, and few runs are told so."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A clock is a number of one run: no forecast carries it, and poses that a gyro dated are not moved again."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """What the runs of a vehicle let expect of its numbers on a terrain."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Numbers of a fleet by level: the vehicle's, the ground's, a run's own, or open."""
 
-from __future__ import annotations
-
 import json
 import re
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A fleet of public recordings whose answers are published: a robot that drives straight on four floors."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import string

@@ -1,7 +1,5 @@
 """Parameters of a vehicle over dates: when they changed, whatever ground each run was on."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

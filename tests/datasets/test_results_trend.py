@@ -1,7 +1,5 @@
 """What a diagnosis finds in logs is what `slip fleet trend` follows over their dates."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The map of what to expect: passes are counted as driven, and their effect is told only beyond chance."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

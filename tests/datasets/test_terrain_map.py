@@ -1,7 +1,5 @@
 """`slip fleet map --terrain`: runs find their common places, and what cannot be placed is said."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

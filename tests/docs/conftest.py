@@ -1,7 +1,5 @@
 """The handbook, built once, and its tools."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Every link of README and handbook leads somewhere, in a checkout and in the built handbook."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 from pathlib import Path

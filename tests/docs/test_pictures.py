@@ -1,7 +1,5 @@
 """The moving picture: frames of one size, in order, as they were drawn, each with a checksum that holds."""
 
-from __future__ import annotations
-
 import struct
 import zlib
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Python of the handbook is run as one session; notebooks run from the first cell to the last."""
 
-from __future__ import annotations
-
 import ast
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """A process that runs cases of the command line: limited in memory, started anew when it hangs or dies."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import resource

@@ -8,8 +8,6 @@ runs in a worker process with a limit of memory; a case that takes longer than 6
 kept, and the run goes on: it ends with a table of verbs and exit codes, and with the finds by their place.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

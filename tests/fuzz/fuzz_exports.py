@@ -10,8 +10,6 @@ exception, a warning, a name that runs, a number that is not finite. A case that
 the run with a traceback. A case that fails is kept in the folder of finds.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import math

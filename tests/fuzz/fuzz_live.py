@@ -9,8 +9,6 @@ connections that break. What the server sent as a message must be in the recordi
 without a defect, and so must its analysis. Finds are kept, and the run goes on.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import random

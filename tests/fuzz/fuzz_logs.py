@@ -7,8 +7,6 @@ another log. Memory is limited, a warning is an error, and a case that takes lon
 with a traceback. A case that fails is kept in the folder of finds.
 """
 
-from __future__ import annotations
-
 import random
 import sys
 import tempfile

@@ -7,8 +7,6 @@ read again as it was written, an export that is no Python or YAML. A case that t
 run with a traceback. A case that fails is kept in the folder of finds.
 """
 
-from __future__ import annotations
-
 import ast
 import json
 import random

@@ -9,8 +9,6 @@ be a 500 or hold a traceback or a path of the server, none may take longer than 
 gets 403 only, and after each round the session can be opened, changed and undone.
 """
 
-from __future__ import annotations
-
 import argparse
 import http.client
 import json

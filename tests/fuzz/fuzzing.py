@@ -1,7 +1,5 @@
 """What the scripts that try odd files share: a case that is kept if it fails, and the command line."""
 
-from __future__ import annotations
-
 import argparse
 import faulthandler
 import resource

@@ -1,7 +1,5 @@
 """Drawn riddles: logs whose effect is drawn by seed, handed over, and scored only afterwards."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path

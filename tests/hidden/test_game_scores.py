@@ -1,7 +1,5 @@
 """The scorer of the game: what counts how, and hostile answers."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

@@ -1,7 +1,5 @@
 """The noise floor against what the true model leaves, on drawn logs: no model is asked for the floor."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What is injected into recordings is what its name says, and is judged as it should be."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A diagnosis must not change with where the map lies, or with when recording began."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The benchmark `published`: questions with published answers, read from ids and numbers of a diagnosis."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

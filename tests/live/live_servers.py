@@ -5,8 +5,6 @@ from the published specifications (docs/spec.md of foxglove/ws-protocol; ROSBRID
 rosbridge_suite): what implements them needs ROS.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 import struct

@@ -1,7 +1,5 @@
 """Definitions that somebody made to break a reader: one error, at once."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 

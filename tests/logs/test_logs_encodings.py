@@ -1,7 +1,5 @@
 """Every encoding of messages that is met is read as it was meant, or named."""
 
-from __future__ import annotations
-
 import json
 import struct
 from pathlib import Path

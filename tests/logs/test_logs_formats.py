@@ -1,7 +1,5 @@
 """Everything that is legal, and much that is not but met in the field, is read as it was meant."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

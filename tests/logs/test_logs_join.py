@@ -1,7 +1,5 @@
 """A topic on several channels is one series, in the order in which it was recorded."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

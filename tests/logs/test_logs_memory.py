@@ -1,7 +1,5 @@
 """What a file says of sizes never decides how much memory is taken."""
 
-from __future__ import annotations
-
 import struct
 import subprocess
 import sys

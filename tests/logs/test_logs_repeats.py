@@ -1,7 +1,5 @@
 """What stands in a file twice counts once; what only shares its time counts as often as it happened."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Definitions mean what rosidl says they mean."""
 
-from __future__ import annotations
-
 import pytest
 from mcap_files import is_ros2_name
 

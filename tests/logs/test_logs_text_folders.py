@@ -1,7 +1,5 @@
 """Folders of text tables, read as the recordings that they stand for."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from pathlib import Path

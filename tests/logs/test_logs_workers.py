@@ -1,7 +1,5 @@
 """Reading keeps busy what it may, and no more."""
 
-from __future__ import annotations
-
 import os
 import threading
 

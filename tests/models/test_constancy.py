@@ -1,7 +1,5 @@
 """A number of the model that changes during a run is found, with its time, and nothing where none changes."""
 
-from __future__ import annotations
-
 import re
 
 import polars as pl

@@ -1,7 +1,5 @@
 """Contact friction: its limits, its bound, and an integration that is made differently."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any, cast

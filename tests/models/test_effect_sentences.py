@@ -1,7 +1,5 @@
 """Every effect is said in one plain sentence: its name, its quantities with units."""
 
-from __future__ import annotations
-
 import msgspec
 import pytest
 

@@ -1,7 +1,5 @@
 """Limits agree with the measured wheels, and states of the drive begin where these are."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest

@@ -1,7 +1,5 @@
 """The budget: shares that are fair to the order and add up; and numbers of what was not named."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 from math import factorial

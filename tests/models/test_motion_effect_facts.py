@@ -1,7 +1,5 @@
 """What is known of an effect stands in its own file, and nowhere else."""
 
-from __future__ import annotations
-
 import ast
 import math
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Is the log long enough: curves end at what is stated, and say what a shorter log would have said."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A model file or a formula that nobody would write is one clear line that names its place, at once."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

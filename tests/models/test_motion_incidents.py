@@ -1,7 +1,5 @@
 """Incidents of seconds: found with their times, left out of fits, and not seen where there are none."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Runs fitted together, each weighed by its own misfit, and what each of them says of the numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An effect of one's own: a template that runs as it stands, in the place where a model file looks for it."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Limits that are exported are those that the vehicle of the model reaches."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is exported is what its project documents, says where each line came from, and drives as was asked."""
 
-from __future__ import annotations
-
 import json
 import math
 import re

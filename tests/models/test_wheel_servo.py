@@ -1,7 +1,5 @@
 """Wheel servo: its limiting cases, its steadiness in every number, and that it comes back of a log."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import cast

@@ -1,7 +1,5 @@
 """The audit of the dependencies says what it finds."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The runner of benchmarks: what it lists is there, says what it measures, and takes its options."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

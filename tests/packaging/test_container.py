@@ -1,7 +1,5 @@
 """The container file: its commands run here as a builder would run them, where there is no builder."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """The core without its extras: slip tables as ever, and one clear line for what needs one."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

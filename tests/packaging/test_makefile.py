@@ -1,7 +1,5 @@
 """The Makefile as people use it who know nothing else."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

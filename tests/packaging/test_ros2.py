@@ -1,7 +1,5 @@
 """The ROS 2 package without ROS: files by the rules of their formats, command and launch on stand-ins."""
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import re

@@ -1,7 +1,5 @@
 """SECURITY.md is short, and the tests and commands that it names are there."""
 
-from __future__ import annotations
-
 import ast
 import re
 from pathlib import Path

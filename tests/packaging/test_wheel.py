@@ -1,7 +1,5 @@
 """The wheel carries what the program needs, and works where nothing else is."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

@@ -1,7 +1,5 @@
 """A plan is checked on the log of its drive, and on no other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

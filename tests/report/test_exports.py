@@ -1,7 +1,5 @@
 """Exports: read back by the readers that others wrote, and by people's viewers' rules."""
 
-from __future__ import annotations
-
 import json
 import runpy
 import shutil

@@ -1,7 +1,5 @@
 """Figures of models: what they count, and what a diagnosis becomes."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A diagnosis is data: what is stored is read back as it was, also what an earlier version stored."""
 
-from __future__ import annotations
-
 import json
 import math
 from typing import Any

@@ -1,7 +1,5 @@
 """Contracts: every column says what it is, stored files say it too, and bad rows are told from good ones."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import dataframely as dy

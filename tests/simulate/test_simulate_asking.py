@@ -1,7 +1,5 @@
 """What may be asked for, and the one clear line that answers a wrong question."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 from itertools import product

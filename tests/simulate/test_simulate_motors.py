@@ -1,7 +1,5 @@
 """Motors under speed controllers, against closed forms and a general differential equation solver."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

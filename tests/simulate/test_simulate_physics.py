@@ -1,7 +1,5 @@
 """Every effect against numbers worked out by hand from its formula, on motions with a closed form."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Localization effects, noise and faults are as asked, and each source has random numbers of its own."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

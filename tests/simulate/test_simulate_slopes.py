@@ -1,7 +1,5 @@
 """What a slope does to a vehicle: it pulls the body downhill and loads the wheels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """All continuous effects at once: the vectorised physics against a general differential equation solver."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp

@@ -1,7 +1,5 @@
 """Configuration: which file wins, and that every mistake is one clear line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

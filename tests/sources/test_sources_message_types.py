@@ -1,7 +1,5 @@
 """What is known of message types: fields that exist, units that are known."""
 
-from __future__ import annotations
-
 import re
 
 import pytest

@@ -1,7 +1,5 @@
 """Presets, and the vehicle that a configuration and a log come to."""
 
-from __future__ import annotations
-
 import pytest
 
 from pipeline.sources import ConfigurationError, Vehicle, find_preset, list_presets, resolve_vehicle

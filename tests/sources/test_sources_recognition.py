@@ -1,7 +1,5 @@
 """The vehicle that a log tells: robot descriptions, words of names, message types."""
 
-from __future__ import annotations
-
 import pytest
 
 from pipeline.logs import ChannelInfo

@@ -1,7 +1,5 @@
 """Two robots in one log: the command of one never meets the pose of the other."""
 
-from __future__ import annotations
-
 import pytest
 from test_sources_topics import (
     CASES,

@@ -1,7 +1,5 @@
 """Which topics are chosen, on every layout that robots are known to have."""
 
-from __future__ import annotations
-
 import pytest
 
 from pipeline.logs import ChannelInfo

@@ -1,7 +1,5 @@
 """A stop under commands that a driver hesitates with is one stop."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest

@@ -1,7 +1,5 @@
 """Starts that the drive follows late, by a different delay each: marked, applied late, and reported."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 import pytest

@@ -1,7 +1,5 @@
 """A map whose axes have unequal scales is told of by the wheels, and only where the headings vary."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

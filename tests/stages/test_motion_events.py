@@ -1,7 +1,5 @@
 """Events in motion: what a user is promised of wheels that dig in or spin, and of a body that slides."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Short logs, slow topics and slow vehicles get the findings of long and fast ones."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The pose by frame and content; wheels in the units of their types; the scale of wheels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """What damage did to a log is told as damage, not as something the vehicle or its clocks did."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Currents and voltages: found by type or name, tabulated over time and way, and drawn."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The real recordings: numbers of an independent chain, and the faults they are known to have."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Poses of satellite navigation: places on a plane, and a heading that is never pretended."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

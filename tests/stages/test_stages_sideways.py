@@ -1,7 +1,5 @@
 """Vehicles that move sideways: commands with linear.y, four wheels, and who is told when it does not fit."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import polars as pl

@@ -1,7 +1,5 @@
 """Slip: f(u) - v, its modulus, and the published window norm."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

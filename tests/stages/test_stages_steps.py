@@ -1,7 +1,5 @@
 """Command steps and their transitory spans."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

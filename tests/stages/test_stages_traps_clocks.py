@@ -1,7 +1,5 @@
 """Traps of time: clocks, latencies, the gyro as the better clock."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Traps of commands and wheels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Traps on the way from poses to velocities; the numbers are those of the list of known traps."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Poses that are integrated wheels are told from a localization that sees how the wheels skid."""
 
-from __future__ import annotations
-
 import msgspec
 import numpy as np
 import polars as pl

@@ -1,7 +1,5 @@
 """Twist of a car whose angular.z is a steering angle, as some drivers of Ackermann vehicles take it."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Faults of the wiring: told before any effect is looked for, with the line that mends them."""
 
-from __future__ import annotations
-
 import shutil
 from dataclasses import replace
 from pathlib import Path

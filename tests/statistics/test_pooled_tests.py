@@ -1,7 +1,5 @@
 """Tests of means with a pooled spread, against scipy and by hand."""
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """Single statistics against textbooks, scipy, and brute force."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

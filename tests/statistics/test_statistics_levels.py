@@ -1,7 +1,5 @@
 """Levels of a number over runs: against closed forms, and how often what is said is so."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ Rejection rates are compared with binomial bounds of the number of repetitions: 
 correct test fails here once in two hundred seeds, and the seeds are fixed.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """What another run would show: intervals hold it, and are wide where little is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """A run may be called anything; its folder is safe, readable and its own."""
 
-from __future__ import annotations
-
 import shutil
 import unicodedata
 from pathlib import Path

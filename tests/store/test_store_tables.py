@@ -1,7 +1,5 @@
 """What is in the Parquet files: the same frame, units and frames, the same bytes; broken rows kept apart."""
 
-from __future__ import annotations
-
 import datetime as dt
 import subprocess
 import sys

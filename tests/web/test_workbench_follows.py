@@ -1,7 +1,5 @@
 """Everything that is shown is of the model that stands there: map, commands, where it fails, what to add."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any, cast

@@ -1,7 +1,5 @@
 """A model in the making: what each step does to the numbers, to the files, and how long it takes."""
 
-from __future__ import annotations
-
 import json
 import re
 import time

@@ -1,7 +1,5 @@
 """Lines of a diagnosis: few by default, each idea once."""
 
-from __future__ import annotations
-
 import pytest
 from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace

@@ -1,7 +1,5 @@
 """The verdict on a run: at most three sentences for people, of which every number is a stored one."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path

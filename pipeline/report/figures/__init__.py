@@ -3,8 +3,6 @@
 One file each; they are found by being in this folder.
 """
 
-from __future__ import annotations
-
 import functools
 import importlib
 import pkgutil

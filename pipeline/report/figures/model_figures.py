@@ -1,7 +1,5 @@
 """Figures of the model: velocities, ladder of steps, slip budget, drivetrain and ground, sufficiency."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

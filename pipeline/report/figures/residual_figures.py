@@ -1,7 +1,5 @@
 """Figures of residuals: against signals, their own past, the input, and each effect."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

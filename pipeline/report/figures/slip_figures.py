@@ -1,7 +1,5 @@
 """Figures of slip: over the path, the commands and time, its distributions; power, steps of commands."""
 
-from __future__ import annotations
-
 import numpy as np
 import polars as pl
 

@@ -1,7 +1,5 @@
 """Figures of the half minute in which the ideal model is worst: its path and its velocities."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
