@@ -171,6 +171,12 @@ def _number(content: Mapping[str, object], key: str, digits: int = 3, missing: s
     return missing if value is None else f"{value:.{digits}g}"
 
 
+def _size(content: Mapping[str, object], key: str) -> str:
+    """Two significant digits, zeros too: `2.0`."""
+    value = number_in(content, key)
+    return "-" if value is None else f"{value:#.2g}".removesuffix(".")
+
+
 def _row(label: str, text: str) -> str:
     return f"{label:<{_LABEL}}{text}"
 
@@ -180,8 +186,7 @@ def _format_head(summary: Summary) -> list[str]:
     seconds = float(cast("float", log.get("duration_s") or 0.0))
     distance = summary.get("distance_m")
     facts = [
-        str(summary["vehicle"]),
-        str(summary["terrain"]),
+        *(_name_known(summary, key) for key in ("vehicle", "terrain")),
         format_recorded(seconds, summary.get("duration_s")),
     ]
     if isinstance(distance, (int, float)):
@@ -196,6 +201,12 @@ def _format_head(summary: Summary) -> list[str]:
     holes = _format_gaps(gaps[0]) if gaps else ""
     head = [f"{summary['run']}    {' · '.join(facts)}    {state}{holes}"]
     return head + [_row("lost", _format_loss(loss)) for loss in losses[:_SHOWN]]
+
+
+def _name_known(summary: Summary, key: str) -> str:
+    """The vehicle or the terrain of a run; `terrain unknown` where the log does not say it."""
+    name = str(summary[key])
+    return f"{key} unknown" if name == "unknown" else name
 
 
 def _format_loss(loss: Mapping[str, object]) -> str:
@@ -246,7 +257,7 @@ def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
 
 def _format_medians(by_input: Mapping[str, object], key: str) -> str:
     parts = (
-        f"{_number(mapping_in(by_input, name), key, 2)} m/s {words}"
+        f"{_size(mapping_in(by_input, name), key)} m/s {words}"
         for name, words in INPUT_WORDS.items()
         if name in by_input
     )
@@ -303,8 +314,11 @@ def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
         lines.append(
             _row("same", "nothing was computed: log and configuration are unchanged (--force computes anew)")
         )
-    if mapping_in(summary, "diagnosis").get("effects"):
-        name = shlex.quote(str(summary["run"]))
+    stored = mapping_in(summary, "diagnosis")
+    name = shlex.quote(str(summary["run"]))
+    if mapping_in(mapping_in(stored, "unexplained"), "with_formula"):
+        lines.append(_row("next", f"slip serve {name}    add the suggested term there"))
+    elif stored.get("effects"):
         lines.append(_row("next", f"slip diagnose {name}{said} --apply model.toml"))
     elif RunReport(summary).is_refused:
         log = _relative(str(mapping_in(summary, "log").get("path") or "LOG"))

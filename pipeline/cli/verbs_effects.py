@@ -123,13 +123,18 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
             names = " ".join(
                 map(shlex.quote, given if len(given) < len(runs) and len(answers) == 1 else runs)
             )
-            following = (
-                f"slip diagnose {names}{said} --apply model.toml"
-                if apply is None
-                else f"slip model export {shlex.quote(str(apply))} --to ros2_control"
-            )
+            following = _suggest_next(answer.runs, f"slip diagnose {names}{said} --apply model.toml", apply)
             print_lines(describe(answer.runs, following, everything=everything).splitlines())
     return _end(answers, errors, lossy=lossy, quiet=quiet)
+
+
+def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | None) -> str:
+    """The next command: to export an applied model, to add a suggested term, or to apply."""
+    if applied is not None:
+        return f"slip model export {shlex.quote(str(applied))} --to ros2_control"
+    if suggested := next((one.run for one in runs if one.has_suggestion), None):
+        return f"slip serve {shlex.quote(suggested)}    add the suggested term there"
+    return applying
 
 
 def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:

@@ -89,6 +89,8 @@ def naming_os_errors(
 _MINUTE, _HOUR = 60.0, 3600.0  # seconds
 _DAYS = 3
 """Days from which a duration is told in days: an experiment of 48 h is one of hours."""
+_LEAST_CM = 0.01
+"""Length below which it is told in millimetres [m]."""
 _LEAST_PART = 0.001
 """Part of a whole below which its digits say nothing: intervals of budgets are wider."""
 _NEARLY_ALL = 0.95
@@ -179,8 +181,14 @@ def format_part(share: float) -> str:
 
 
 def format_length(metres: float) -> str:
-    """A length as text: `1.06 m`, or below one metre `5.7 cm`."""
-    return f"{format_digits(metres, 3)} m" if metres >= 1.0 else f"{format_digits(100.0 * metres)} cm"
+    """A length as text: `1.06 m`, below one metre `5.7 cm`, below one centimetre `1.8 mm`."""
+    if metres >= 1.0:
+        return f"{format_digits(metres, 3)} m"
+    return (
+        f"{format_digits(100.0 * metres)} cm"
+        if metres >= _LEAST_CM
+        else f"{format_digits(1000.0 * metres)} mm"
+    )
 
 
 def format_angle(radians: float) -> str:

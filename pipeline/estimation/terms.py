@@ -15,7 +15,7 @@ from pipeline.models import ANY, FormulaEffect, Parameter, make_parameter
 
 TERM = "term_"
 CHANNELS = ("v_x", "v_y", "v_w")
-SUGGESTION = "unexplained"
+SUGGESTION = "suggested_term"
 """Id of the formula that is suggested for what no effect explains."""
 _WIDE = 50.0
 """Bound of a coefficient of a formula, in units of the usual one."""

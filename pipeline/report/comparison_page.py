@@ -52,15 +52,35 @@ _LABEL = 190
 _LABEL_LIMIT = 280
 
 
-def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
+Families = Mapping[str, Sequence[str]]
+"""Datasets that are compared with each other, by their vehicles."""
+
+
+def _label_datasets(names: Sequence[str], families: Families) -> dict[str, str]:
+    """Labels of datasets in their order, vehicle by vehicle; of several vehicles each has its own in it."""
+    vehicles = {name: vehicle for vehicle, datasets in families.items() for name in datasets}
+    labels = label_names(names)
+    if len({vehicles.get(name) for name in names}) < 2:  # noqa: PLR2004 - several
+        return labels
+    order = {vehicle: number for number, vehicle in enumerate(families)}
+    return {
+        name: labels[name]
+        if not (vehicle := vehicles.get(name)) or name.startswith(vehicle)
+        else f"{labels[name]} ({vehicle})"
+        for name in sorted(names, key=lambda name: order.get(vehicles.get(name, ""), len(order)))
+    }
+
+
+def draw_boxes(boxes: pl.DataFrame, input_name: str, families: Families, *, title: str) -> Drawing:
     """Box plot of the 2 s window norms of every dataset, sorted by the median: the published figure.
 
     Args:
         boxes: as from `spread_windows`, one input.
         input_name: input u; determines the colour.
+        families: as in `Answer`.
         title: title of the axis, with its unit.
     """
-    labels = label_names(boxes.sort("median")["group"].to_list())
+    labels = _label_datasets(boxes.sort("median")["group"].to_list(), families)
     numbers = ("low", "q1", "median", "q3", "high", pl.col("windows").cast(pl.Float64))
     rows = boxes.select("group", _label(labels), *numbers)
     base = Chart.of_rows("boxes").encode(y=_names(labels))
@@ -83,16 +103,19 @@ def draw_boxes(boxes: pl.DataFrame, input_name: str, *, title: str) -> Drawing:
     return Drawing(chart, {"boxes": rows}, note, f"Medians in m/s: {sentence}.")
 
 
-def draw_levels(runs: pl.DataFrame, levels: pl.DataFrame, *, name: str, title: str) -> Drawing:
+def draw_levels(
+    runs: pl.DataFrame, levels: pl.DataFrame, families: Families, *, name: str, title: str
+) -> Drawing:
     """Value of every run as a point, and of its dataset with an interval over runs.
 
     Args:
         runs: ``group``, ``run`` and ``value``, one row per run.
         levels: as in `View`.
+        families: as in `Answer`.
         name: name of the rows, unlike that of other drawings of the page.
         title: title of the axis, with its unit.
     """
-    labels = label_names(levels.sort("value", "dataset")["dataset"].to_list())
+    labels = _label_datasets(levels.sort("value", "dataset")["dataset"].to_list(), families)
     points = runs.filter(pl.col("value").is_not_null(), pl.col("group").is_in(list(labels)))
     points = points.select(_label(labels), "run", "value")
     highest = points["value"].max()
@@ -138,25 +161,27 @@ def draw_levels(runs: pl.DataFrame, levels: pl.DataFrame, *, name: str, title: s
     )
     chart = _frame(layer(bars, dots, middles), len(labels))
     cut = levels.filter(pl.col("high") > end).height
-    note = ""
+    notes = ["Compare within a vehicle only: the vehicles drove differently."] * (len(families) > 1)
     if cut:
-        note = (
+        notes.append(
             f"{cut} interval{'s are' if cut > 1 else ' is'} longer than the axis and cut: so few runs tell "
             "little of others."
         )
     sentence = ", ".join(
         f"{dataset} {value:.3g}" for dataset, value in levels.select("dataset", "value").iter_rows()
     )
-    return Drawing(chart, {f"{name}_spans": spans, f"{name}_runs": points}, note, f"In m/s: {sentence}.")
+    return Drawing(
+        chart, {f"{name}_spans": spans, f"{name}_runs": points}, " ".join(notes), f"In m/s: {sentence}."
+    )
 
 
-def draw_driving(bins: pl.DataFrame, input_name: str, datasets: Sequence[str]) -> Drawing:
+def draw_driving(bins: pl.DataFrame, input_name: str, families: Families) -> Drawing:
     """How hard each dataset was in each cell of commanded speed and yaw rate: a column is equal driving.
 
     Args:
         bins: as in `Answer`.
         input_name: input u.
-        datasets: in this order.
+        families: as in `Answer`; in their order.
     """
     axes = ["speed", "turn"]
     own = (
@@ -179,7 +204,8 @@ def draw_driving(bins: pl.DataFrame, input_name: str, datasets: Sequence[str]) -
         name for (name,) in own.sort("turn").select("turn_class").unique(maintain_order=True).iter_rows()
     ]
     there = set(own["group"])
-    labels = label_names([name for name in datasets if name in there])
+    datasets = [name for family in families.values() for name in family if name in there]
+    labels = _label_datasets(datasets, families)
     rows = own.select(
         _label(labels), "speed_class", "turn_class", "modulus", pl.col("samples").cast(pl.Float64)
     )
@@ -343,17 +369,16 @@ def list_pictures(answer: Answer) -> list[Picture]:
         words = INPUT_WORDS[view.input]
         title = f"{answer.measure if view.quantity != EQUAL_DRIVING else 'slip modulus'} {words} [m/s]"
         name = f"{view.quantity}_{view.input}"
-        drawing = draw_levels(own, view.levels, name=name, title=title)
+        drawing = draw_levels(own, view.levels, answer.families, name=name, title=title)
         pictures.append(Picture(name, f"{_TITLES[view.quantity]}, {words}", drawing, width="half"))
     if not answer.bins.is_empty():
-        datasets = [name for family in answer.families.values() for name in family]
         title = f"Equal driving: the same place in every panel, {INPUT_WORDS[answer.input]}"
-        pictures.append(Picture("driving", title, draw_driving(answer.bins, answer.input, datasets)))
+        pictures.append(Picture("driving", title, draw_driving(answer.bins, answer.input, answer.families)))
     boxes = answer.windows.filter(pl.col("input") == answer.input)
     if not boxes.is_empty():
         published = answer.quantity == AS_PUBLISHED
         words = "of the published chain" if published else INPUT_WORDS[answer.input]
-        drawing = draw_boxes(boxes, answer.input, title=f"2 s window norm {words} [m/s]")
+        drawing = draw_boxes(boxes, answer.input, answer.families, title=f"2 s window norm {words} [m/s]")
         pictures.append(Picture(_PUBLISHED, "The published figure", drawing))
     return pictures
 

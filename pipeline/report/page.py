@@ -211,6 +211,8 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
     if not report.is_diagnosed:
         return [("Estimate the effects that the model lacks", f"slip diagnose {name}")]
     steps = []
+    if diagnosis.has_suggestion:
+        steps.append(("Add the suggested term, and see the error fall", f"slip serve {name}"))
     if diagnosis.effects:
         steps.append(("Save the estimated model", f"slip diagnose {name} --apply model.toml"))
         steps.append(("Export it to the controller", "slip model export model.toml --to ros2_control"))
@@ -226,7 +228,7 @@ def _list_model_steps(report: RunReport, name: str) -> list[tuple[str, str]]:
             ("Look at plan/plan.html, lift the wheels, and play it", "ros2 bag play plan/plan.mcap"),
             ("Check the plan against the drive", "slip plan --check plan NEW.mcap"),
         ]
-    steps.append(("Try other effects, and plan the next drive, in the browser", "slip serve"))
+    steps.append(("Try other effects, and plan the next drive, in the browser", f"slip serve {name}"))
     if diagnosis.unexplained:
         steps.append(("Write the effect that explains the rest yourself", "slip model new-effect mine.py"))
     return steps
@@ -309,7 +311,7 @@ SECTIONS = (
     PageSection("what-now", "What to do next", view_what_now),
     PageSection("where", "Where", view_where, sum_up_where),
     PageSection("how-bad", "How much slip", view_how_bad, sum_up_slip),
-    PageSection("rest", "What is left", view_rest, lambda page: format_remaining(page.report)),
+    PageSection("rest", "Remaining error", view_rest, lambda page: format_remaining(page.report)),
     PageSection("health", "Data health", view_health, sum_up_health),
     PageSection(
         "provenance",

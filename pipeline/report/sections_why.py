@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
 from pipeline.core import format_size, mapping_in, number_in, objects_in, split_interval
-from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, suggest_manoeuvre
+from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, name_term, suggest_manoeuvre
 from pipeline.report import (
     MISSING,
     Cell,
@@ -240,7 +240,9 @@ def _list_alike(effect: Named) -> tuple[str, str] | None:
     names = [name for name in effect.confused_with if name in known]
     if not names or effect.id not in known:
         return None
-    return ", ".join(names), suggest_manoeuvre(known[effect.id], *(known[name] for name in names))
+    return ", ".join(map(name_term, names)), suggest_manoeuvre(
+        known[effect.id], *(known[name] for name in names)
+    )
 
 
 def _list_parameters(effect: Named) -> list[list[str | Cell]]:
@@ -292,10 +294,10 @@ def _list_open(report: RunReport) -> Iterator[tuple[str, str, str]]:
         texts = [describe_unexplained(rest), *terms, format_suggestion(rest)]
         # A formula that is too long for a line is nothing that anybody reads.
         yield "unexplained", "; ".join(filter(None, texts)), (rest.formula or "") if terms else ""
-    if diagnosis.learned is not None and (beyond := format_learned_share(diagnosis.learned)):
+    if beyond := format_learned_share(diagnosis):
         yield "beyond the effects", beyond, ""
     if diagnosis.unobservable_why:
-        yield "not observable in this log", ", ".join(diagnosis.unobservable_why), ""
+        yield "not observable in this log", ", ".join(map(name_term, diagnosis.unobservable_why)), ""
     known = {str(entry.get("text", "")) for entry in list_findings(report)}
     for finding in diagnosis.findings:
         if finding.text not in known:

@@ -566,6 +566,11 @@ class RunDiagnosis(msgspec.Struct, frozen=True, rename={"by_path": "by_way"}):
     learned: Learned | None = None
     commanded_turn: CommandedTurn | None = None
 
+    @property
+    def has_suggestion(self) -> bool:
+        """Whether a formula is suggested that would lower the error, and that no model holds yet."""
+        return self.unexplained is not None and self.unexplained.with_formula is not None
+
 
 _NUMBERS = frozenset(
     field.encode_name

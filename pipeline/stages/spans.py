@@ -210,7 +210,8 @@ def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
         words: sum(one.end - one.start for one in bad if one.kind == kind)
         for kind, words in _BAD_POSES.items()
     }
-    shown = [f"{words} ({of:.3g} s)" for words, of in seconds.items() if of > 0.0]
+    kinds = {words: of for words, of in seconds.items() if of > 0.0}
+    shown = [words if len(kinds) == 1 else f"{words} ({of:.3g} s)" for words, of in kinds.items()]
     text = (
         f"{sum(seconds.values()):.3g} s of the poses ({format_share(share)} of the driving) have "
         f"{' or '.join(shown)}: left out of medians and fits"

@@ -532,7 +532,17 @@ def _list_known_steps(step: Step) -> LadderSteps:
     return {tuple(_effects_of(ladder_step)): ladder_step for ladder_step in rungs}
 
 
-def keep_floor(session: Session, prepared: PreparedRun) -> Session:
-    """The session with the noise floor of its run."""
+def keep_floor(session: Session, prepared: PreparedRun, diagnosis: RunDiagnosis | None) -> Session:
+    """The session with the noise floor of its run: that of its diagnosis, else what the ideal model shows.
+
+    Args:
+        session: a session of the run.
+        prepared: the run.
+        diagnosis: of the run; None without one.
+    """
     floor = errors_as_json(prepared.problem.floor)
+    if diagnosis is not None:
+        paths = {name: one.noise_floor for name, one in diagnosis.by_path.items()}
+        known = {**paths, diagnosis.input: diagnosis.noise_floor}.get(prepared.problem.source.value)
+        floor = floor if known is None else dict[str, object](results.to_json(known))
     return session if session.floor == floor else msgspec.structs.replace(session, floor=floor)

@@ -114,9 +114,13 @@ const listRows = ({ session, named, trial, diagnosis }) => {
   return all.sort((one, other) => Number(other.helps) - Number(one.helps) || one.left - other.left);
 };
 
+// Least part of an error that an effect lowers for a model that is at the noise floor already.
+const MATTERS = 0.1;
+
 // The row to add next; null where nothing lowers the error, or not all that may is known.
-const findNext = (rows, running) => {
-  const best = rows.filter((row) => row.helps).sort((one, other) => one.left - other.left)[0] ?? null;
+const findNext = (rows, running, done) => {
+  const fall = (row) => Math.max(1 - row.to.t / row.from.t, 1 - row.to.r / row.from.r);
+  const best = rows.filter((row) => row.helps && !(done && fall(row) < MATTERS)).sort((one, other) => one.left - other.left)[0] ?? null;
   return best && (best.named || !running) ? best : null;
 };
 
@@ -138,17 +142,18 @@ const buildNext = (pane) => {
   const there = new Set(session.effects.map((effect) => effect.id));
   const rows = holdStill(pane, listRows(pane.state));
   const running = trial && !trial.done;
-  const next = findNext(rows, running);
+  const next = findNext(rows, running, session.done);
   buildReach(pane, next);
   const undecided = (diagnosis?.undecided ?? []).map((entry) => h("p", { class: "quiet" }, `Undecided: ${(entry.candidates ?? []).join(" or ")}. To decide, ${entry.separate_by ?? "drive again"}.`));
   const rest = diagnosis?.unexplained && !diagnosis.unexplained.formula && !session.done ? h("p", { class: "quiet" }, `Unexplained: ${diagnosis.unexplained.where ?? diagnosis.unexplained.channel}. Next: write it as a formula below, or diagnose another run to see whether it repeats.`) : null;
   const build = (row) => buildRow(pane, row, row === next);
   return h("div", { class: "next" },
     running && h("p", { class: "quiet trying" }, trial.total === null ? "ranking the effects of the catalogue …" : `fitting the effects in order of evidence: ${trial.tried} of ${trial.total}`, h("i", { class: "progress", bar: trial.total ? trial.tried / trial.total : 0 })),
+    session.done && !next && rows.length > 0 && h("p", { class: "nothing" }, "The model is at the noise floor: no further effect is needed."),
     h("ul", { class: "proposals" }, rows.slice(0, FIRST_ROWS).map(build)),
     rows.length > FIRST_ROWS && h("details", { class: "further" }, h("summary", {}, `${rows.length - FIRST_ROWS} more`), h("ul", { class: "proposals" }, rows.slice(FIRST_ROWS).map(build))),
     missing.length > 1 && h("button", { type: "button", class: "add-all", data: { keep: "add all" }, title: missing.join(", "), onclick: () => pane.addAll() }, `Add all ${missing.length} of the diagnosis`),
-    trial?.done && !next && h("p", { class: session.done ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
+    trial?.done && !next && !(session.done && rows.length > 0) && h("p", { class: session.done ? "nothing" : "nothing open" }, tellNothing(session, diagnosis)),
     !trial && h("button", { type: "button", class: "try", title: "rank all effects of the catalogue beside this model, and fit the best", data: { keep: "try" }, onclick: () => pane.tryAll(true) }, "Look for other effects"),
     !diagnosis && h("p", { class: "quiet undiagnosed" }, "Not diagnosed yet.", h("button", { type: "button", class: "diagnose", data: { keep: "diagnose" }, onclick: () => pane.diagnose() }, "Diagnose")),
     undecided, rest, buildPlan(pane),
@@ -184,7 +189,7 @@ const buildCatalogue = (pane, entries) => {
   const about = h("p", { class: "quiet about" });
   const tell = () => (about.textContent = chosen.value ? lead(entries.find(({ id }) => id === chosen.value).about) : "");
   const chosen = h("select", { "aria-label": "Any effect of the catalogue", class: "catalogue", data: { keep: "catalogue", field: "catalogue" }, onchange: tell }, h("option", { value: "" }, "any other effect …"),
-    entries.map((entry) => h("option", { value: entry.id }, entry.id)));
+    entries.map((entry) => h("option", { value: entry.id }, entry.name)));
   const add = h("button", { type: "button", class: "add-chosen", "aria-label": "add the chosen effect", onclick: () => chosen.value && pane.add(chosen.value) }, "Add");
   return h("div", { class: "any" }, chosen, add, about);
 };

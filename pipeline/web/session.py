@@ -25,6 +25,7 @@ from pipeline.models import (
     format_model,
     list_effects,
     make_parameter,
+    name_effect,
     parse_model,
     refuse_taken,
     stands_at_bound,
@@ -258,7 +259,12 @@ def list_catalogue(vehicle: Vehicle) -> list[dict[str, object]]:
     """Every effect that exists on a vehicle, ordered from the command to the pose."""
     every: tuple[type[Effect], ...] = (*list_effects(), ResidualTerm)
     return [
-        {"id": effect.id, "about": summarize_effect(effect), "acts_on": effect.place.name.lower()}
+        {
+            "id": effect.id,
+            "name": name_effect(effect.id),
+            "about": summarize_effect(effect),
+            "acts_on": effect.place.name.lower(),
+        }
         for effect in every
         if vehicle.kind in effect.kinds
     ]

@@ -221,7 +221,8 @@ class Sessions:
             session = open_session(file, prepared)
             if ask.action == "preview":
                 return self._preview(self._edit(file, prepared, session), ask)
-            changed = keep_floor(self._change(file, prepared, session, ask), prepared)
+            diagnosis = read_diagnosis(self.results, prepared.manifest)
+            changed = keep_floor(self._change(file, prepared, session, ask), prepared, diagnosis)
             # A step that cannot be shown is not stored.
             shown = self._show(file, prepared, changed)
             if changed is not session:

@@ -96,6 +96,12 @@ class _Part:
         ratio = orient_ratio(row, b) if row else None
         return (ratio, row) if row and ratio else None
 
+    @property
+    def has_difference(self) -> bool:
+        """Whether any pair differs, or none can be tested."""
+        verdicts = {judge_pair(row) for row in self.pairs.values()} - {UNTESTED}
+        return not verdicts or bool(verdicts - {ALIKE})
+
     def count(self) -> str:
         """How many pairs are significant."""
         verdicts = [judge_pair(row) for row in self.pairs.values()]
@@ -104,7 +110,8 @@ class _Part:
             return "no pair can be tested"
         if OF_TWO_RUNS in decided and DIFFERENT not in decided:
             return (
-                f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs only"
+                f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs: "
+                "more runs tell whether the grounds do"
             )
         return f"{decided.count(DIFFERENT)} of {len(verdicts)} pairs significant"
 
@@ -240,10 +247,15 @@ def _describe_driven(part: _Part, labels: Mapping[str, str]) -> str:
     (first, largest), *others = part.levels
     if not others:
         return f"{labels[first]} {_format_two(largest)} m/s"
+    easy, smallest = part.levels[-1]
+    if not part.has_difference:
+        ends = (
+            f"from {labels[easy]} ({_format_two(smallest)}) to {labels[first]} ({_format_two(largest)} m/s)"
+        )
+        return f"{ends}; {part.count()}"
     hard = [first, *(name for name, value in others[:-1] if value >= (1.0 - _AS_HARD) * largest)]
     values = dict(part.levels)
     numbers = [f"{labels[name]} ({_format_two(values[name])}{' m/s' * (name == first)})" for name in hard]
-    easy, smallest = part.levels[-1]
     easiest = f"{labels[easy]} ({_format_two(smallest)}) easiest"
     return f"{enumerate_texts(numbers)} hardest, {easiest}; {part.count()}"
 
@@ -280,9 +292,10 @@ def _split_difference(
         return f"{start}, and the driving does not explain it ({common})"
     if ground_factor <= _LITTLE:
         return f"{start}, and all of it is the driving ({common})"
+    sure = ", not significant" if judge_pair(ground[1]) == ALIKE else ""
     return (
         f"{start}: a factor {_format_two(driving)} is the driving, {_format_two(ground_factor)} the "
-        f"ground ({common})"
+        f"ground{sure} ({common})"
     )
 
 

@@ -25,7 +25,6 @@ from pipeline.results import (
     SEARCH_CUT,
     Errors,
     Finding,
-    Learned,
     Named,
     RunDiagnosis,
     Step,
@@ -176,10 +175,11 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
 
 
 def format_short(effect: Named) -> str:
-    """The value of an effect, or how many it has."""
+    """The first value of an effect, and how many more it has."""
     if effect.by_run:
         return "one offset a run"
-    return format_numbers(effect.shown) if len(effect.shown) == 1 else f"{len(effect.shown)} numbers"
+    first = format_numbers(dict(list(effect.shown.items())[:1]))
+    return f"{first}, {len(effect.shown) - 1} more" if len(effect.shown) > 1 else first
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:
@@ -222,7 +222,7 @@ def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
     return [
         *_label("effects", effects),
         *_label("remaining", _format_remaining(run)),
-        *_label("learned", [] if learned is None or learned.helps else [format_learned_share(learned)]),
+        *_label("learned", [] if learned is None or learned.helps else [format_learned_share(run)]),
         *findings,
         *_label("smaller", others),
         *_label("open", [*(describe_motion(effect, run) for effect in unknown), _format_unknown(run)]),
@@ -319,7 +319,7 @@ def _format_remaining(run: RunDiagnosis) -> list[str]:
             turn, least = format_angle(last.r_mrmse_rad), format_angle(floor.r_mrmse_rad)
             rows.append(f"{turn} in heading, noise floor {least}")
     if run.learned is not None and run.learned.helps:
-        rows.append(format_learned_share(run.learned))
+        rows.append(format_learned_share(run))
     rest = run.unexplained
     if rest is None:
         return [*rows, "" if run.effects else describe_lead(run), *_suggest_next_steps(run)]
@@ -367,10 +367,16 @@ def _suggest_next_steps(run: RunDiagnosis) -> list[str]:
     return [f"next steps: {'; '.join(steps)}, {how}"]
 
 
-def format_learned_share(learned: Learned) -> str:
-    """The share that a learned term explains beyond the physics, or why it does not help; else empty."""
-    if not learned.helps:
-        return f"a learned term does not help: {learned.reason}" if learned.reason else ""
+def format_learned_share(run: RunDiagnosis) -> str:
+    """The share that a learned term explains beyond the physics, or why it does not help; else empty.
+
+    Where there are encoders, it is learned between wheels and body.
+    """
+    learned = run.learned
+    scope = "from wheels to body, " if run.by_path else ""
+    if learned is None or not learned.helps:
+        reason = None if learned is None else learned.reason
+        return f"{scope}a learned term does not help: {reason}" if reason else ""
     # Below the noise floor a share is of nothing.
     known = {
         ERRORS_OVER_2S[name][0]: one
@@ -382,7 +388,7 @@ def format_learned_share(learned: Learned) -> str:
     removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
     with_learned = " and ".join(format_share(one.with_learned) for one in known.values())
     beyond = f"with a function learned from the data, which names no cause, {with_learned}"
-    return f"above the noise floor the effects remove {' and '.join(removed)}; {beyond}"
+    return f"{scope}above the noise floor, the effects remove {' and '.join(removed)}; {beyond}"
 
 
 def _format_causes(effect: Named) -> Iterator[str]:

@@ -229,10 +229,10 @@ def test_a_formula_for_the_unexplained_is_a_suggestion_that_can_be_pasted_into_a
     model = tmp_path / "model.toml"
     model.write_text(f'format = 1\n[vehicle]\npreset = "husky_a200"\n\n{left.formula}', encoding="utf-8")
     formula = read_model(model).model
-    assert formula.ids == ("unexplained",)
+    assert formula.ids == ("suggested_term",)
     # What it is said to bring is what the model has with it.
     problem = Problem([load_recording(recording, vehicle)], vehicle, Input(run.input))
-    whole = judge_whole(problem, proposal.model + formula.effect("unexplained"))
+    whole = judge_whole(problem, proposal.model + formula.effect("suggested_term"))
     assert left.with_formula == read_result(errors_as_json(whole.errors), Errors)
     before, after = (one.velocity_rms[0] for one in (run.ladder[-1], left.with_formula))
     assert after < 0.7 * before  # type: ignore[operator]

@@ -75,3 +75,10 @@ def test_a_formula_that_the_diagnosis_found_is_added(workbench: Workbench) -> No
     # The log turns as if its wheels stood 1.6 times as far apart.
     assert added["effects"][0]["parameters"][0]["value"] == pytest.approx(1 / 1.6 - 1.0, rel=0.02)
     assert added["errors"]["r"] < 0.1 * added["ideal"]["r"]
+
+
+def test_the_noise_floor_is_that_of_the_diagnosis(workbench: Workbench) -> None:
+    floor = {"t_mrmse_m": 0.0123, "r_mrmse_rad": 0.0045}
+    write_diagnosis(workbench, {"input": "command", "effects": [], "noise_floor": floor})
+    shown = cast("dict[str, Any]", workbench.session(RUN)["session"])
+    assert shown["floor"] == {"t": 0.0123, "r": 0.0045}

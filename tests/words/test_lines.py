@@ -4,8 +4,9 @@ import pytest
 from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
-from pipeline.results import DataNeed, Finding, Region, RunDiagnosis, Unexplained
-from pipeline.words.diagnosis import describe, list_findings, list_lines
+from pipeline.core import format_length
+from pipeline.results import DataNeed, Finding, Learned, PathLadder, Region, RunDiagnosis, Unexplained
+from pipeline.words.diagnosis import describe, format_learned_share, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
 MANY = (
@@ -104,3 +105,18 @@ def test_motion_that_lasts_is_one_short_sentence() -> None:
     assert describe_unexplained(lasting) == (
         "the yaw error wanders for seconds at a time (0.19 rad/s); nothing that was tried explains it"
     )
+
+
+def test_a_learned_term_is_said_of_the_path_that_it_was_learned_on() -> None:
+    learned = Learned(reason="the remaining error is at the noise floor")
+    run = RunDiagnosis(learned=learned)
+    assert format_learned_share(run) == f"a learned term does not help: {learned.reason}"
+    both = replace(run, by_path={"wheels": PathLadder()})
+    assert format_learned_share(both).startswith("from wheels to body, a learned term does not help")
+
+
+@pytest.mark.parametrize(
+    ("metres", "text"), [(1.063, "1.06 m"), (0.057, "5.7 cm"), (0.01, "1 cm"), (0.0018, "1.8 mm")]
+)
+def test_a_length_has_the_unit_that_people_read(metres: float, text: str) -> None:
+    assert format_length(metres) == text

@@ -8,6 +8,7 @@ import polars as pl
 from pipeline.core import INPUT_WORDS, finite_or_none, format_angle, format_length
 from pipeline.estimation.decision import LEAST_T
 from pipeline.estimation.driving_need import find_goal
+from pipeline.models import name_term
 from pipeline.report import begin_large, figures, format_known_share, format_number, format_split, theme
 from pipeline.report.figures import Figure, Section
 from pipeline.report.scene import (
@@ -20,7 +21,16 @@ from pipeline.report.scene import (
     thin_series,
 )
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, find_range, layer, make_axis, stack
-from pipeline.results import CAUSE_NAMES, INTERVAL_SHARE, Errors, Growth, SlipBudget, Step, format_rises
+from pipeline.results import (
+    CAUSE_NAMES,
+    CHANCE,
+    INTERVAL_SHARE,
+    Errors,
+    Growth,
+    SlipBudget,
+    Step,
+    format_rises,
+)
 from pipeline.words import describe_need
 
 _QUANTITIES = {
@@ -155,11 +165,13 @@ def list_ladder_steps(scene: Scene) -> dict[str, pl.DataFrame]:
         before = effects
         if not math.isfinite(size):
             continue
-        rises = format_rises(rungs[max(number - 1, 0)], step)
+        rises = format_rises(rungs[max(number - 1, 0)], step, CHANCE)
         rows.append(
             {
                 "rung": number,
-                "step": f"+ {', '.join(added)}{rises and f' ({rises})'}" if number else "ideal",
+                "step": f"+ {', '.join(map(name_term, added))}{rises and f' ({rises})'}"
+                if number
+                else "ideal",
                 "t": size,
                 "told": " \u00b7 ".join([format_length(size), *_list_degrees(step)]),
                 "series": "model" if effects else "ideal",

@@ -218,7 +218,7 @@ def draw_autocorrelation(scene: Scene) -> Drawing | None:
     rows = list_autocorrelations(scene)
     if not rows:
         return None
-    titles = {component: f"{QUANTITIES[component][0]} residual [1]" for component in COMPONENTS}
+    titles = {component: f"{QUANTITIES[component][0]} residual" for component in COMPONENTS}
     chart = draw_correlations(scene, "autocorrelation", titles, (0.0, "time between windows [s]"))
     note = "Grey: 95 % band of white noise. A curve outside of it for seconds shows unmodelled structure."
     return Drawing(chart, rows, note, _format_autocorrelation(rows))
@@ -330,7 +330,7 @@ def draw_crosscorrelation(scene: Scene) -> Drawing | None:
     if not rows or motion is None:
         return None
     inputs = choose_inputs(motion)
-    titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]} [1]" for one in inputs}
+    titles = {one: f"{QUANTITIES[one][0]} residual with {_WORDS[inputs[one]]}" for one in inputs}
     axis = (-LONGEST_S, "lag of the residual behind the input [s]")
     note = "Grey: 95 % band without correlation. Positive times: the input precedes the residual."
     return Drawing(
@@ -429,9 +429,7 @@ def _name_axes(signature: Signature) -> tuple[str, str]:
     what, unit = QUANTITIES[signature.channel]
     variable, own_unit = VARIABLES[signature.variable]
     error = (
-        f"{what} error, share of the step [1]"
-        if signature.variable == SINCE_STEP
-        else f"{what} error [{unit}]"
+        f"{what} error, share of the step" if signature.variable == SINCE_STEP else f"{what} error [{unit}]"
     )
     return f"{variable} [{own_unit}]", error
 

@@ -469,7 +469,7 @@ def _draw_response(component: str, series: list[str]) -> Chart:
     y = make_axis("value", None, (-0.25, 1.4), values=[0, 0.5, 1], minExtent=figures.GUTTER - 10)
     line = Chart.of_rows(f"response_{component}").mark("line", clip=True, strokeWidth=2)
     drawn = line.encode(x=x, y=y, color=figures.series_colour(series, _WORDS))
-    title = {"text": f"{_CHANNELS[component][0]}, share of the step [1]"}
+    title = {"text": f"{_CHANNELS[component][0]}, share of the step"}
     return layer(drawn).properties(width=480, height=96, title=title)
 
 
