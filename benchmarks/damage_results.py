@@ -7,16 +7,14 @@ counts what verify tells without calling it damage. Left out is what no manifest
 whole runs that are deleted, and in a bucket manifests that are, since it has no link to a run's results.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import shutil
 import tempfile
 from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.analysis import Options
 from pipeline.batch import Request
@@ -26,9 +24,6 @@ from pipeline.store import Store
 from pipeline.store import verification as room
 from pipeline.store.files import do_nothing, hash_bytes
 from pipeline.store.mirror import Mirror
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Mapping
 
 FLIPS = (0x01, 0x80, 0xFF)
 ADDRESS = "memory://damage/results"

@@ -19,7 +19,7 @@ import tempfile
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 from unittest.mock import patch
 
 from injections import Drive, Injection, list_injections
@@ -30,16 +30,13 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
+from pipeline.logs import LogData
 from pipeline.models import find_effect
-from pipeline.stages.extract import extract_tables
-
-if TYPE_CHECKING:
-    from pipeline.logs import LogData
-    from pipeline.results import Named, Value
-    from pipeline.sources import Vehicle
-    from pipeline.sources.candidates import Sources
-    from pipeline.sources.configuration import Configuration
-    from pipeline.stages.extract import Extracted
+from pipeline.results import Named, Value
+from pipeline.sources import Vehicle
+from pipeline.sources.candidates import Sources
+from pipeline.sources.configuration import Configuration
+from pipeline.stages.extract import Extracted, extract_tables
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96

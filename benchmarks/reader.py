@@ -5,8 +5,6 @@ reader read the same eight topics, each in a process of its own. The bound reads
 (with checksum) verifies it, nothing else. Exit code 1 when values differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -15,14 +13,11 @@ import subprocess
 import tempfile
 import time
 import zlib
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from measuring import RUNNER
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 Checks = dict[str, float]
 

@@ -1,23 +1,15 @@
 """A log as a robot records it, for the reader's benchmark: small messages among images and clouds."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from numpy.typing import NDArray
 
 from pipeline.logs import definition_text
 from pipeline.logs.schema import parse_msg
-from pipeline.logs.writer import encode_rows
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
-
-    from numpy.typing import NDArray
-
-    from pipeline.logs.writer import Given
+from pipeline.logs.writer import Given, encode_rows
 
 IMAGE = """std_msgs/Header header
 uint32 height

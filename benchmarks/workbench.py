@@ -6,8 +6,6 @@ number, bar, path, map and *where* have changed on the page. The peer in the sam
 question with nothing kept ready: tables, grid and score anew.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os
@@ -18,7 +16,7 @@ import tempfile
 import time
 from itertools import cycle
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 # As `slip serve` has it, before numpy is loaded.
 os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
@@ -34,13 +32,12 @@ from pipeline.sources.one_vehicle import load_vehicle
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 
+from collections.abc import Callable
+
 from chrome import BROWSER, Chrome
 from workbench_server import Workbench
 
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.store import Manifest
+from pipeline.store import Manifest
 
 EFFECTS = ("effective_track", "drive_lag", "lateral_skid")
 SETTLED = (

@@ -3,12 +3,10 @@
 Both serialize the same values; the exit code is 1 where their bytes differ.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
+from collections.abc import Callable
 from types import SimpleNamespace
-from typing import TYPE_CHECKING
 
 import numpy as np
 from mcap_ros2._dynamic import serialize_dynamic
@@ -16,9 +14,6 @@ from mcap_ros2.decoder import generate_dynamic
 from reader_log import SMALL, START_NS, payloads_of, small_fields
 
 from pipeline.logs import definition_text
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 
 def measure(work: Callable[[], list[bytes]]) -> tuple[float, list[bytes]]:

@@ -1,10 +1,8 @@
 """Paths that tests of every room share."""
 
-from __future__ import annotations
-
 import os
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from chrome import BROWSER, Browser, Chrome
@@ -13,9 +11,6 @@ from golden import check_golden  # noqa: F401
 from hypothesis import settings
 from known_misses import MISSES
 from stored import diagnosed_results, place, recorded_results, stored_run  # noqa: F401
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 # A busy machine is slow, not wrong: properties are not timed. `--hypothesis-profile many` draws more.
 settings.register_profile("few", deadline=None, max_examples=30)

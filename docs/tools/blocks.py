@@ -8,8 +8,6 @@ language `pycon` holds Python behind `>>> ` and `... `; all those of a page are 
     python docs/tools/blocks.py --write PAGE...    puts what is printed into these pages
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math
@@ -20,16 +18,13 @@ import signal
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import zip_longest
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = ROOT / "docs" / "pages"

@@ -1,24 +1,17 @@
 """The catalogue of effects as pages: what the effects' own files say, and nothing else."""
 
-from __future__ import annotations
-
 import functools
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Iterable
 
 from pipeline.export import export_model, list_targets
 from pipeline.models import find_effect, list_effects
-from pipeline.models.effect import Place
+from pipeline.models.effect import Effect, Place
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
+from pipeline.models.parameter import Parameter
 from pipeline.run import MotionError
 from pipeline.sources import Vehicle, list_presets
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable
-
-    from pipeline.models.effect import Effect
-    from pipeline.models.parameter import Parameter
 
 FOLDER = "effects"
 _PLACES = {

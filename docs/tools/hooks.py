@@ -1,26 +1,20 @@
 """Hooks of mkdocs: add the pages that the program writes about itself to the handbook."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from mkdocs.structure.files import File
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import Files
+from mkdocs.structure.pages import Page
 from reference import find_page, write_reference
 
 from pipeline.models import list_effects
-
-if TYPE_CHECKING:
-    from mkdocs.config.defaults import MkDocsConfig
-    from mkdocs.structure.files import Files
-    from mkdocs.structure.pages import Page
-
 
 _PAGES = "docs/pages"
 _NAMED = 'class="md-search" data-md-component="search" role="dialog" aria-label="Search"'

@@ -1,19 +1,14 @@
 """What screenshots.py looks at, and the states of the workbench with what a person does to reach them."""
 
-from __future__ import annotations
-
 import shutil
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 from urllib.parse import urlencode
 
+from chrome import Chrome
+
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from chrome import Chrome
 
 SAMPLES = ("warthog_ice", "husky_tile")
 LIFTED = "wheels_in_the_air"

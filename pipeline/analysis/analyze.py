@@ -1,14 +1,12 @@
 """One log through all stages: its results, preview and plan; and stored runs, opened by log or name."""
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import msgspec
 
@@ -29,6 +27,7 @@ from pipeline.logs import LogData, LogError, hash_log, list_files, locate_record
 from pipeline.recording.log_setup import LogSetup, set_up_log
 from pipeline.report import lead_up
 from pipeline.report.drive_pages import read_preview
+from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis
 from pipeline.store import (
     DIAGNOSIS,
@@ -46,10 +45,6 @@ from pipeline.store import (
     stored_contexts,
     stored_keys,
 )
-
-if TYPE_CHECKING:
-    from pipeline.report.scene import RunReport
-
 
 SUMMARY = "summary.json"
 

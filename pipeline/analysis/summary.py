@@ -1,13 +1,12 @@
 """Stored outputs of a run: its diagnosis (with it or later), its JSON summary, and package versions."""
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Mapping
 from functools import cache
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+
+import polars as pl
 
 from pipeline.analysis.work import Work
 from pipeline.core import PACKAGE, SlipError, mapping_in, number_in, objects_in, read_object, read_version
@@ -25,9 +24,6 @@ from pipeline.recording.log_setup import LogSetup
 from pipeline.results import Finding, RunDiagnosis, read_findings, read_result, to_json
 from pipeline.stages import SUMMARY_DIGITS, list_wanted, pick_row, round_number, summarize_inputs
 from pipeline.store import DIAGNOSIS, JSON, SUMMARY, Store, StoreError, load_manifest
-
-if TYPE_CHECKING:
-    import polars as pl
 
 _Packages = Mapping[str, tuple[str, ...]]
 _ALWAYS = ("numpy", "scipy", "polars", "pyarrow")

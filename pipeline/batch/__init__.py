@@ -5,18 +5,13 @@ reports the outcome of each log with its reason. The same command continues an i
 options of a batch.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
+from pipeline.analysis import Options
 from pipeline.core import SlipError, shorten
-
-if TYPE_CHECKING:
-    from pipeline.analysis import Options
 
 
 class BatchError(SlipError):

@@ -3,8 +3,6 @@
 An executor takes tasks and returns `concurrent.futures.Future`; the runner uses nothing else of it.
 """
 
-from __future__ import annotations
-
 import os
 import pickle
 import resource
@@ -17,17 +15,15 @@ from concurrent.futures import Future
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import msgspec
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import Outcome
 from pipeline.core import SlipError, end_with, silence_warnings
 from pipeline.logs import FETCHED
 from pipeline.store import JSON, LOG_NOTES, LogSighting, Mirror, Store, StoreError
-
-if TYPE_CHECKING:
-    from pipeline.analysis import Options
-    from pipeline.analysis.analyze import Outcome
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #

@@ -1,17 +1,13 @@
 """Rigid motions in the plane and in space, and segmentation of pose series."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import polars as pl
+from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipeline.core.arrays import ROUNDING_S, Flags, Floats, Ints, group_rows, robust_spread
-
-if TYPE_CHECKING:
-    import polars as pl
-    from numpy.typing import NDArray
 
 # Rigid motions in the plane and in space, vectorised over the first axis.
 #

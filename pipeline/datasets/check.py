@@ -1,13 +1,11 @@
 """Check of two groups of runs: changes by cause, tested against the spread between runs, and limits."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -39,12 +37,9 @@ from pipeline.datasets.check_readings import (
 )
 from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.datasets.pooling import ComparisonError
-from pipeline.models import write_text
-
-if TYPE_CHECKING:
-    from pipeline.models import ModelFile, Parameter
-    from pipeline.sources import Owner
-    from pipeline.store import Manifest, Store
+from pipeline.models import ModelFile, Parameter, write_text
+from pipeline.sources import Owner
+from pipeline.store import Manifest, Store
 
 Outcome = Literal["kept", "broken", "undetermined"]
 _HINT = "The handbook, Check a change, lists the keys."

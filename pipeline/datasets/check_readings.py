@@ -1,11 +1,8 @@
 """Estimates of one run with the model of a check, and the logarithms that are compared beside them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -22,16 +19,12 @@ from pipeline.core import (
 )
 from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
+from pipeline.estimation.comparison import Input
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
-from pipeline.models import Effect, Late, Parameter, is_of_one_run
+from pipeline.models import Effect, Late, Model, Parameter, is_of_one_run
 from pipeline.run import MotionRun
-
-if TYPE_CHECKING:
-    from pipeline.estimation.comparison import Input
-    from pipeline.models import Model
-
 
 POSITION_ERROR = "error.position"
 

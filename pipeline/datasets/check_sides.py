@@ -1,7 +1,5 @@
 """Both sides of a check fitted with one model, and baseline files."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import json
@@ -10,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -32,6 +30,7 @@ from pipeline.datasets.stored_fits import read_runs
 from pipeline.estimation.comparison import Input, choose_input
 from pipeline.estimation.stored_diagnosis import diagnose_stored, find_diagnosis, keep_diagnosis
 from pipeline.models import (
+    Effect,
     FormulaEffect,
     Model,
     ModelFile,
@@ -42,14 +41,9 @@ from pipeline.models import (
 )
 from pipeline.recording.log_setup import UNKNOWN
 from pipeline.results import read_model
-from pipeline.run import load_motion_run
-from pipeline.sources import agree_on_vehicle, load_vehicle
-
-if TYPE_CHECKING:
-    from pipeline.models import Effect
-    from pipeline.run import MotionRun
-    from pipeline.sources import Owner
-    from pipeline.store import Manifest, Store
+from pipeline.run import MotionRun, load_motion_run
+from pipeline.sources import Owner, agree_on_vehicle, load_vehicle
+from pipeline.store import Manifest, Store
 
 BASELINE_FORMAT = 1
 _MOST_OF_SPREAD = 16

@@ -4,24 +4,17 @@ The file is Parquet under the schema of the table `features`. Its version, colum
 checked before it is read, its values afterwards: they have the types and ranges of the table.
 """
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from pathlib import Path
 
 import polars as pl
+import pyarrow.parquet as pq
 
 from pipeline.core import make_plain, naming_os_errors, read_version
 from pipeline.datasets.compared_runs import find_material, measure_runs, read_digest
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 from schemas import Features, contract_of
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-    from pathlib import Path
-
-    import pyarrow.parquet as pq
-
 
 _HASH = 64
 

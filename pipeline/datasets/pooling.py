@@ -1,21 +1,16 @@
 """Data of each run (labels, medians, measures of difficulty), and the datasets into which runs are pooled."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError
+from pipeline.datasets.confidence import Interval
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
-
-if TYPE_CHECKING:
-    from pipeline.datasets.confidence import Interval
 
 
 class ComparisonError(SlipError):

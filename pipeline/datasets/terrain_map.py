@@ -1,12 +1,9 @@
 """Terrain map of the slip to expect, from the runs of a results folder and their positions on Earth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -30,10 +27,7 @@ from pipeline.datasets.terrain import (
 from pipeline.logs import LogIndex, TopicColumns, Wanted, open_log, read_topics
 from pipeline.sources import find_type
 from pipeline.stages import FEWEST_MESSAGES, from_local_plane, read_fixes, to_local_plane
-from pipeline.store import find_recorded_log, lack_runs
-
-if TYPE_CHECKING:
-    from pipeline.store import Manifest, Store
+from pipeline.store import Manifest, Store, find_recorded_log, lack_runs
 
 _ROUNDS = 3
 _OUTLIERS = 3.0

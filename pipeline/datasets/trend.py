@@ -1,12 +1,9 @@
 """Trends of parameters and other quantities of a vehicle over the dates of its runs, and alerts."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import polars as pl
 
@@ -18,9 +15,6 @@ from pipeline.datasets.rank_tests import LEVEL
 from pipeline.datasets.steps import FEWEST_FREE, find_changes, find_shifts, guess_shift
 from pipeline.models import UNDETERMINED, Level, cut_interval, find_effect, list_effects
 from pipeline.store import Store, lack_runs
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 _PLACES = ("earliest", "latest")
 _PERIOD = "period"

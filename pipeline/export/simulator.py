@@ -4,10 +4,8 @@ The fitted model is driven by a constant command until its motion is steady. A f
 command; of a simulator's own export, given as the current parameters, it is the robot's over the simulator's.
 """
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -15,14 +13,9 @@ import yaml
 
 from pipeline.core import Floats
 from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Amount, Current, Facts, Target, start_sheet, write_yaml
-from pipeline.models import Effect, Forward, Place, Quantity, Timing
+from pipeline.models import Effect, Forward, ModelFile, Place, Quantity, Timing
 from pipeline.run import DriveSeries, Grid, MotionError, Resets, RunContext
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.models import ModelFile
-    from pipeline.sources import Vehicle
+from pipeline.sources import Vehicle
 
 _SPEEDS = 4
 """Number of speeds: quarters of the largest driven one show a factor that falls or rises with speed."""

@@ -1,7 +1,5 @@
 """Analysis of a recording while it is written: scheduling of updates, and the knowledge so far."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -12,9 +10,10 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import msgspec
+import polars as pl
 
 from pipeline.analysis import Options
 from pipeline.analysis.work import as_recorded, identify
@@ -29,9 +28,6 @@ from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import read_drive
 from pipeline.stages import Finding, align_tables, extract_tables, list_wanted, slip_stage, velocity
 from pipeline.store import JSON, Store, check_table
-
-if TYPE_CHECKING:
-    import polars as pl
 
 _FOLDER = "live"
 _SHOWN = 5

@@ -1,11 +1,10 @@
 """The catalog of a file's contents, its coverage by checksums, and the limit of its inflated size."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
+from concurrent.futures import Executor, Future
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from mcap.records import Channel, Schema
 
@@ -14,9 +13,6 @@ from pipeline.logs.chunks import largest_plausible
 from pipeline.logs.records import ByteSource, Loss
 from pipeline.logs.remote import RemoteSource
 from pipeline.logs.spans import Span, SpanKind, checksum_holds
-
-if TYPE_CHECKING:
-    from concurrent.futures import Executor, Future
 
 
 class Cover(IntEnum):

@@ -4,21 +4,15 @@ What was inflated stands in temporary files without a name, which the system rem
 The variable TMPDIR of the environment names the folder for them.
 """
 
-from __future__ import annotations
-
 import os
 import tempfile
 import weakref
-from typing import IO, TYPE_CHECKING, Final
+from pathlib import Path
+from typing import IO, Final
 
 from pipeline.core import Newest, format_size
 from pipeline.logs.catalog import limit_inflated
 from pipeline.logs.records import LogError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import zstandard
 
 COMPRESSED: Final = (".zstd", ".zst")
 """Suffixes of files that are compressed as a whole, after their own."""

@@ -1,14 +1,13 @@
 """Index of a recording's contents, built without decoding messages, and of one that is being written."""
 
-from __future__ import annotations
-
 import itertools
+import os
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, cast
 
 from pipeline.core import PAUSE_NS, PathError, format_size, resolve_inside, usable_threads
 from pipeline.logs import records as rec
@@ -26,11 +25,7 @@ from pipeline.logs.part import (
 from pipeline.logs.records import LogError, Loss
 from pipeline.logs.remote import to_location
 from pipeline.logs.scan import Scanner
-
-if TYPE_CHECKING:
-    import os
-
-    from pipeline.logs.spans import Span
+from pipeline.logs.spans import Span
 
 SUFFIXES: Final = (".mcap", *(f".mcap{end}" for end in COMPRESSED), ".db3", ".bag")
 """Suffixes of the files of recordings."""

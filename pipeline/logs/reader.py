@@ -1,12 +1,11 @@
 """Reading the wanted topics of a recording as columns, and joining the channels of a topic."""
 
-from __future__ import annotations
-
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +31,11 @@ from pipeline.logs.columns import (
     share_times,
 )
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
+from pipeline.logs.other_formats import BagMessages
 from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
 from pipeline.logs.spans import Loaded, Span, SpanKind, load_spans
-
-if TYPE_CHECKING:
-    import os
-
-    from pipeline.logs.other_formats import BagMessages
 
 _LISTED: Final = 12
 """Maximum number of topics listed in an error."""

@@ -1,11 +1,8 @@
 """Choice of the sequence of manoeuvres that answers the open questions."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,10 +10,6 @@ from pipeline.core import Complex, Floats
 from pipeline.models import Excitation, find_effect, suggest_manoeuvre
 from pipeline.plan.manoeuvres import LEAD_S, LONGEST_S, TAIL_S, Area
 from pipeline.plan.questions import Answerable, Impossible, Question
-
-if TYPE_CHECKING:
-    from pipeline.plan.questions import Answerable
-
 
 _ROUNDS = 2
 

@@ -4,17 +4,15 @@ The plan answers open questions of their diagnosis; the forecast is of one model
 a vehicle.
 """
 
-from __future__ import annotations
-
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
-from pipeline.core import SlipError
+from pipeline.core import Floats, SlipError
 from pipeline.datasets import (
     Forecast,
     RunEvidence,
@@ -27,6 +25,7 @@ from pipeline.estimation import Recording
 from pipeline.estimation.across_runs import fit_part_jointly, split_normals
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.decision import find_cost
+from pipeline.estimation.fit import PartFit
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
 from pipeline.models import Effect, Late, Model
@@ -36,15 +35,9 @@ from pipeline.plan.plan_files import WHEELS, list_types
 from pipeline.plan.questions import Question
 from pipeline.plan.rehearsal import Knowledge
 from pipeline.results import RunDiagnosis
-from pipeline.run import load_motion_run
+from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
-from pipeline.store import Manifest
-
-if TYPE_CHECKING:
-    from pipeline.core import Floats
-    from pipeline.estimation.fit import PartFit
-    from pipeline.run import MotionRun
-    from pipeline.store import Store
+from pipeline.store import Manifest, Store
 
 MOST_JOINED = 24
 """Largest number of jointly fitted runs, those on the terrain first: more take longer for the same result."""

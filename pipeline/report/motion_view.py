@@ -1,11 +1,8 @@
 """Comparison of a model with the ideal one on a run, as rows for figures."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -13,14 +10,11 @@ import polars as pl
 from pipeline.core import Floats
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
+from pipeline.estimation.effect_signature import Signature
 from pipeline.models import Timing
 from pipeline.results import Errors, RunDiagnosis, Step, read_model
 from pipeline.run import MotionError, load_run
-
-if TYPE_CHECKING:
-    from pipeline.estimation.effect_signature import Signature
-    from pipeline.sources import Vehicle
-
+from pipeline.sources import Vehicle
 
 # Comparison of a model with the ideal one on a run, as rows for figures.
 #

@@ -1,24 +1,19 @@
 """Data of a report: summary and tables of a run, joined and thinned once for all figures."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 
 from pipeline.core import mapping_in, number_in, objects_in
 from pipeline.report import format_number
+from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
 from pipeline.results import Named, RunDiagnosis
 from pipeline.run import HORIZON_S
-
-if TYPE_CHECKING:
-    from pipeline.report.motion_view import MotionView
 
 INPUTS = ("command", "measured")
 NOT_DIAGNOSED = RunDiagnosis()

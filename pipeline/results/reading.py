@@ -1,22 +1,16 @@
 """What follows from a result: refusals, the effects that count, and the distance to the noise floor."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import Final, TypeVar
 
 from pipeline.core import JSON_DIGITS, format_share, number_in, objects_in, round_digits
+from pipeline.models import ModelFile
 from pipeline.recording import FAULTS
 from pipeline.results.structs import Errors, Finding, RunDiagnosis, Step
 from pipeline.run import GROUND_UNOBSERVABLE
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Sequence
-
-    from pipeline.models import ModelFile
 
 Entry = TypeVar("Entry")
 

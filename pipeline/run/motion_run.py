@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
+import polars as pl
+from numpy.typing import NDArray
 
 from pipeline.core import ROUNDING_S, Complex, Flags, Floats, Ints, SlipError, arrays, rigid
 from pipeline.run.signals import GROUND_UNOBSERVABLE, DriveSeries, find_fastest_wheel, round_off
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    import polars as pl
-    from numpy.typing import NDArray
-
-    from pipeline.sources import Vehicle
-    from pipeline.store import Manifest
+from pipeline.sources import Vehicle
+from pipeline.store import Manifest
 
 
 class MotionError(SlipError):

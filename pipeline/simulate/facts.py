@@ -1,22 +1,18 @@
 """What can be simulated, by TOML files of this folder: vehicles, effects, topic layouts."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import Any, Literal, get_args
 
 import msgspec
 import numpy as np
 
 from pipeline.core import Floats, SlipError, guess_names
-
-if TYPE_CHECKING:
-    from pipeline.simulate.published import Published
+from pipeline.simulate.published import Published
 
 
 class SimulateError(SlipError):

@@ -1,21 +1,16 @@
 """Incidents of a simulated drive: signals that drop, repeat or stop, and a body that is stuck or pushed."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pipeline.core import Flags, Floats
 from pipeline.simulate.facts import Vehicle
+from pipeline.simulate.path import BodyMotion
 from pipeline.simulate.scenario import Incident, IncidentKind
-
-if TYPE_CHECKING:
-    from pipeline.simulate.path import BodyMotion
-    from pipeline.simulate.sensors import Poses
-    from pipeline.simulate.signals import Commands, Drive
+from pipeline.simulate.sensors import Poses
+from pipeline.simulate.signals import Commands, Drive
 
 
 def _mark(incidents: Sequence[Incident], kinds: Sequence[IncidentKind], times: Floats) -> Flags:

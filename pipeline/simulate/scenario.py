@@ -1,18 +1,14 @@
 """Everything that defines a simulated run, incidents too: a value, from which the same bytes come out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 
 from pipeline.core import Flags, Floats, quaternions_from_euler
 from pipeline.simulate.facts import VEHICLES, EffectSpec, Layout, SimulateError, Vehicle
-
-if TYPE_CHECKING:
-    from pipeline.simulate.signals import Commands, Drive
+from pipeline.simulate.signals import Commands, Drive
 
 IncidentKind = Literal[
     "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",

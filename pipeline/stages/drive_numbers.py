@@ -4,12 +4,10 @@ Power over time with energy per distance; how long the base moves after its last
 command topic; how late the drive follows its first command after a stop or a gap.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 import numpy as np
 import polars as pl
@@ -29,15 +27,12 @@ from pipeline.core import (
 )
 from pipeline.logs import TopicColumns
 from pipeline.run import MOVING_MPS
-from pipeline.sources import PowerSource, Signal
+from pipeline.sources import PowerSource, Signal, Vehicle
 from pipeline.stages import reading
 from pipeline.stages.clocks import TopicClock
 from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import hold_commands, interpolate_wheels
 from pipeline.stages.spans import LIVE
-
-if TYPE_CHECKING:
-    from pipeline.sources import Vehicle
 
 _HALF_S: Final = 0.5
 """Half the span over which speed is measured [s]: a longer one would cut corners in turns."""

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Floats, arrays
 from pipeline.run import STILL_MPS, read_wheel_times
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from pipeline.sources import Vehicle
+from pipeline.sources import Vehicle
 
 _SHARE_OF_RANGE = 0.02
 """Fraction of a command's range that counts as a change: joysticks and path followers vary by less."""

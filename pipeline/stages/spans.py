@@ -7,13 +7,12 @@ is worth a change. The price of a change is the only threshold. Which pair disag
 what it was.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
+import polars as pl
 
 from pipeline.core import (
     LOG_PEAK,
@@ -28,13 +27,9 @@ from pipeline.core import (
     weigh,
 )
 from pipeline.run import LIVE_SHARE, STILL_MPS
+from pipeline.sources import Vehicle
 from pipeline.stages.findings import Finding
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from pipeline.sources import Vehicle
-    from pipeline.stages.inputs import Ideal
+from pipeline.stages.inputs import Ideal
 
 Kind = Literal[
     "emergency_stop", "manual_driving", "pushed", "commands_silent", "stuck", "localization_frozen",

@@ -5,12 +5,10 @@ nor tilted ground causes a false velocity. Their running sum is an odometer, and
 odometer gives the velocity.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -28,14 +26,11 @@ from pipeline.run import (
     select_fresh,
     trace_traction,
 )
-from pipeline.sources import VelocitySection
+from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.findings import Finding, StageError
+from pipeline.stages.inputs import Ideal
 from pipeline.stages.spans import LIVE, USUAL_S, Rims, Span, Spans, gather_rims, mark_excluded
 from schemas import tabulate
-
-if TYPE_CHECKING:
-    from pipeline.sources import Vehicle
-    from pipeline.stages.inputs import Ideal
 
 _LEAST_TURNING_RADPS = 0.03
 """Standard deviation of the yaw rate below which an unused gyro cannot be judged, so that no disagreement is

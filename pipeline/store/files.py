@@ -5,8 +5,6 @@ so whoever follows it sees a whole generation. For several tables of the same ge
 once and read them all through it.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json
@@ -19,7 +17,9 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, TypeAlias
+from typing import BinaryIO, TypeAlias
+
+import polars as pl
 
 from pipeline.core import read_bounded, walk_files
 from pipeline.store.names import (
@@ -34,9 +34,6 @@ from pipeline.store.names import (
     path_unread,
     table_damaged,
 )
-
-if TYPE_CHECKING:
-    import polars as pl
 
 TEMPORARY = ".tmp-"
 """How the names of unfinished files and folders begin; no reader looks at them."""

@@ -1,13 +1,12 @@
 """One run's results in the making: written beside the current generation, published in one moment."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Collection, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import polars as pl
 
 from pipeline.store import files
 from pipeline.store.checksums import encode_manifest, encode_marker, load_manifest
@@ -34,11 +33,7 @@ from pipeline.store.names import (
     join_inside,
     name_disk_errors,
 )
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from pipeline.store.parquet_tables import CheckedTable
+from pipeline.store.parquet_tables import CheckedTable
 
 LATEST = "latest"
 

@@ -7,13 +7,10 @@ import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from stat import S_ISDIR
-from typing import TYPE_CHECKING
 
 from pipeline.logs import list_files
 from pipeline.store.files import hash_bytes
-
-if TYPE_CHECKING:
-    from pipeline.store.results_folder import Store
+from pipeline.store.results_folder import Store
 
 # What the logs' hashes were, so that an unchanged log is not hashed again: one small file a log, replaced
 # whole. Writers never wait for each other, and the worst that can happen to an entry is that it is lost,

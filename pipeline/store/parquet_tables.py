@@ -4,17 +4,15 @@ polars drops field metadata when it rewrites a file, so the Arrow schema is buil
 pyarrow writes it. This module is heavy to import; the rest of the room does so only where tables are touched.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import polars as pl
 import pyarrow as pa
 import pyarrow.parquet as pq
+from dataframely import FailureInfo
 
 from pipeline.store.names import (
     NO_FACTS,
@@ -25,10 +23,6 @@ from pipeline.store.names import (
     table_damaged,
 )
 from schemas import Contract, contract_of, list_contracts
-
-if TYPE_CHECKING:
-    from dataframely import FailureInfo
-
 
 BROKEN_RULES = "broken_rules"
 

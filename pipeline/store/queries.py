@@ -1,23 +1,17 @@
 """Tables of many runs: scanned over their generations, and asked in SQL."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import polars as pl
 
 from pipeline.core import shorten
+from pipeline.store.files import Manifest, Partition
 from pipeline.store.names import QUARANTINE, StoreError, date_runs, join_inside
 from pipeline.store.parquet_tables import check_rows, find_contract, schema_of
 from schemas import list_contracts
-
-if TYPE_CHECKING:
-    from pipeline.store.files import Manifest, Partition
-
 
 _QUESTION = re.compile(
     r"(?>\s|\(|--[^\n]*(?:\n|$)|/\*.*?\*/)*+(?:SELECT|WITH|FROM)\b", re.IGNORECASE | re.DOTALL

@@ -1,12 +1,11 @@
 """A folder of results: its runs, their generations, and the tables over all runs."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+
+import polars as pl
 
 from pipeline.core import read_bounded_text
 from pipeline.store import files
@@ -33,11 +32,7 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-
-if TYPE_CHECKING:
-    import polars as pl
-
-    from pipeline.store.verification import Examination
+from pipeline.store.verification import Examination
 
 LOCK = ".lock"
 RUNS = "runs"

@@ -15,8 +15,6 @@ The stored pages of the results are sandboxed from the workbench, so links betwe
 the browser knows. They are opened with a separate cookie that follows links and gives access to nothing else.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import resource
@@ -28,19 +26,17 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import msgspec
 import numpy as np
 from starlette.datastructures import QueryParams
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, JSONResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from pipeline.core import SlipError
 from pipeline.report import is_page
-
-if TYPE_CHECKING:
-    from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 _UNDOABLE = (ArithmeticError, ValueError, TypeError, LookupError, RecursionError, MemoryError)
 

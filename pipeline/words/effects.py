@@ -1,29 +1,23 @@
 """Effects as text: what the vehicle does by them, their possible causes, and their values."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 from pipeline.core import format_digits, format_interval, round_digits, split_interval, suffix_unit
 from pipeline.models import (
     AT_BOUND,
     UNDETERMINED,
+    Effect,
     Level,
+    Parameter,
     Reading,
     find_effect,
     list_effects,
     name_term,
     suggest_manoeuvre,
 )
-from pipeline.results import read_model
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.models import Effect, Parameter
-    from pipeline.results import Named, RunDiagnosis, Undecided, Value
+from pipeline.results import Named, RunDiagnosis, Undecided, Value, read_model
 
 CAUSE = ". Cause: "
 """Separator between an effect and its possible causes in the sentence of a named effect."""

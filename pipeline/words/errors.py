@@ -1,9 +1,7 @@
 """Errors of a model as text: their size, where and when they arise, what remains, and the ladder."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 from pipeline.core import (
     enumerate_texts,
@@ -18,15 +16,16 @@ from pipeline.results import (
     BREVITY,
     ERRORS_OVER_2S,
     INTERVAL_SHARE,
+    Errors,
+    Moments,
+    Region,
     RunDiagnosis,
+    Span,
+    Step,
+    Unexplained,
     list_excess,
 )
 from pipeline.run import HORIZON_S
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.results import Errors, Moments, Region, Span, Step, Unexplained
 
 ERROR_WORDS = {"x": "forward error", "y": "lateral error", "w": "yaw error"}
 REGIONS = {

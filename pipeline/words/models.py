@@ -1,25 +1,18 @@
 """Fits of models as text: parameters, ladders, contests, and what a model is refused."""
 
-from __future__ import annotations
-
 import math
 import re
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 from pipeline.core import format_angle, format_digits, format_length, format_share, number_in, split_interval
-from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer
+from pipeline.estimation.folds import Errors
+from pipeline.estimation.ladder import Ladder, LadderStep
+from pipeline.estimation.rivals import Contest, Rival
+from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit
 from pipeline.models import AT_BOUND, UNDETERMINED
 from pipeline.results import CHANCE, ERRORS_OVER_2S, format_rises
+from pipeline.run import MotionRun
 from pipeline.words.errors import format_fall
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
-
-    from pipeline.estimation.folds import Errors
-    from pipeline.estimation.ladder import Ladder, LadderStep
-    from pipeline.estimation.rivals import Contest, Rival
-    from pipeline.estimation.tolerance import SpeedLimit
-    from pipeline.run import MotionRun
 
 _HEADS = ("forward", "lateral", "yaw rate", "position", "heading")
 _UNITS = ("m/s", "m/s", "deg/s", "over 2 s", "over 2 s")

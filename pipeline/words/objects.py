@@ -1,10 +1,9 @@
 """The JSON of a diagnosis for people and scripts: its data with the sentences of each part."""
 
-from __future__ import annotations
+from collections.abc import Mapping
+from typing import Any
 
-from typing import TYPE_CHECKING, Any
-
-from pipeline.results import to_json
+from pipeline.results import RunDiagnosis, Value, to_json
 from pipeline.words.effects import (
     describe_clause,
     describe_effect,
@@ -22,11 +21,6 @@ from pipeline.words.errors import (
     name_span,
 )
 from pipeline.words.verdict import format_verdict
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.results import RunDiagnosis, Value
 
 
 def diagnosis_as_json(run: RunDiagnosis) -> dict[str, Any]:

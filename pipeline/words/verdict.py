@@ -1,10 +1,8 @@
 """The verdict on a run in one to three sentences: how far off, what the robot does, what remains."""
 
-from __future__ import annotations
-
 import math
+from collections.abc import Iterable, Sequence
 from itertools import groupby
-from typing import TYPE_CHECKING
 
 from pipeline.core import enumerate_texts, format_share
 from pipeline.results import (
@@ -13,6 +11,9 @@ from pipeline.results import (
     CHANGE,
     ERRORS_OVER_2S,
     SEARCH_CUT,
+    Finding,
+    RunDiagnosis,
+    Step,
     find_refusal,
     has_no_pose,
     list_excess,
@@ -22,11 +23,6 @@ from pipeline.results import (
 from pipeline.run import HORIZON_S
 from pipeline.words.effects import describe_clause, list_names, name_group
 from pipeline.words.errors import format_excess, format_step
-
-if TYPE_CHECKING:
-    from collections.abc import Iterable, Sequence
-
-    from pipeline.results import Finding, RunDiagnosis, Step
 
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"

@@ -1,26 +1,20 @@
 """From a log whose names were made to break out, through the diagnosis, to the files of all targets."""
 
-from __future__ import annotations
-
 import ast
 import json
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 from xml.sax.saxutils import quoteattr
 
+import pytest
 import yaml
 from verbs import run_verb
 
 from pipeline.export import list_targets
 from pipeline.simulate import PLATFORMS, simulate_case
-
-if TYPE_CHECKING:
-    import pytest
-
-    from pipeline.simulate.published import Published
+from pipeline.simulate.published import Published
 
 NAME = (
     'bot"""; EXECUTED = 1; """ \'\'\'---><include file="/etc/passwd"/><!--- '

@@ -1,8 +1,7 @@
 """Time to look at a log grows with the number of its topics, whatever they hold, and no faster."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,10 +15,6 @@ from pipeline.recording.inspection import inspect_log
 from pipeline.recording.log_choice import MOST_POSES
 from pipeline.simulate import simulate_case
 from pipeline.stages import pose_choice
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 FEW = 150
 """Topics of a kind beside those of a drive."""

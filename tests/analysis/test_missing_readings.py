@@ -1,24 +1,17 @@
 """Readings of encoders that are missing (NaN, or a silent driver) are unknown, and no speed of zero."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.core.arrays import integrate_between
+from pipeline.core.arrays import Floats, integrate_between
 from pipeline.simulate import Encoders, Recording, make_scenario, simulate_run, write_log
 from pipeline.stages.drive import differentiate_angle
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.core.arrays import Floats
 
 
 def fall_silent(time: Floats) -> Floats:

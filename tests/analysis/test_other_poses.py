@@ -1,10 +1,10 @@
 """Poses of types other than odometry: of x, y and an angle, of Foxglove, and of fields that are named."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 from drawn_drives import (
     DrawnDrive,
@@ -21,11 +21,6 @@ from drawn_drives import (
 
 from pipeline.core import SlipError
 from pipeline.sources import ConfigurationError
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import polars as pl
 
 FLAT = "float64 x\nfloat64 y\nfloat64 theta\n"
 STAMPED = f"std_msgs/Header header\n{FLAT}"

@@ -1,12 +1,12 @@
 """Poses, wheels and vehicles from what few robots publish: written as they do, taken through the program."""
 
-from __future__ import annotations
-
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import polars as pl
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
@@ -21,11 +21,6 @@ from pipeline.simulate import PLATFORMS, Platform, simulate_case
 from pipeline.simulate.platforms import Fields, fix, ground_velocity, imu, joints, odometry, twist
 from pipeline.simulate.published import Published, Q
 from pipeline.sources import load_configuration
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping
-
-    import polars as pl
 
 FOUR = ("front_left", "front_right", "rear_left", "rear_right")
 WHEEL = "{}_wheel_joint"

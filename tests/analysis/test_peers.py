@@ -1,16 +1,11 @@
 """Which runs a report sets its own beside."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
+from pathlib import Path
 
 from pipeline.analysis.summary import find_peers
 from pipeline.store import JSON, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-    from pathlib import Path
 
 OWN: Mapping[str, JSON] = {
     "run": "field/own",

@@ -1,8 +1,6 @@
 """Two types on one topic: both are read where both can serve; otherwise it is said what is left out."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,12 +17,8 @@ from drawn_drives import (
     write_drawn,
 )
 
+from pipeline.core.arrays import Ints
 from pipeline.sources.message_types import find_alike
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.core.arrays import Ints
 
 STAMPED = "geometry_msgs/msg/TwistStamped"
 POSE, COVARIANCE = (f"geometry_msgs/msg/{name}Stamped" for name in ("Pose", "PoseWithCovariance"))

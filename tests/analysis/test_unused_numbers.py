@@ -1,8 +1,6 @@
 """Topics of two numbers a message are named, with the lines that take them for wheels."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +17,6 @@ from drawn_drives import (
 )
 
 from pipeline.core import SlipError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 POSE = "geometry_msgs/msg/PoseStamped"
 

@@ -1,11 +1,10 @@
 """Python's face: the numbers of the command line, tables, charts, and errors of one line."""
 
-from __future__ import annotations
-
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import polars as pl
 import pytest
@@ -13,9 +12,6 @@ from verbs import ask_verb
 
 import slip
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 EFFECT = "effective_track"
 

@@ -1,18 +1,18 @@
 """Addresses in the results of a stranger are not asked unless the user says so, whatever verb reads them."""
 
-from __future__ import annotations
-
 import json
 import threading
 from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
 from batch_tools import batch
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
+
+from collections.abc import Iterator
+from pathlib import Path
 
 import fsspec
 
@@ -21,10 +21,6 @@ from pipeline.cli import main
 from pipeline.logs import LogError, open_store
 from pipeline.store import LOG_NOTES, Store
 from pipeline.store.checksums import encode_manifest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 RUN = "season/a"
 VERBS = {

@@ -1,9 +1,8 @@
 """Folders nested 1,500 levels deep, among results and logs: one line says where, all else is done."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from batch_tools import batch, counts
@@ -11,10 +10,6 @@ from batch_tools import batch, counts
 from pipeline.batch import Pruning
 from pipeline.cli import main
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 
 def ask(capsys: pytest.CaptureFixture[str], *words: object) -> tuple[int, str]:

@@ -1,20 +1,15 @@
 """A disk that refuses: one clear line, nothing half visible, and the same command goes on afterwards."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from batch_tools import batch, counts, read_tables
 
 from pipeline.store import Store, StoreError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.fixture

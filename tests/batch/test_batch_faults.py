@@ -1,12 +1,9 @@
 """A batch that memory or the disk fails at any moment: whole runs, and the same command again finishes."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from batch_tools import batch, read_tables
@@ -16,10 +13,9 @@ from pipeline.store import Store
 
 pytest.importorskip("_testcapi", reason="this Python cannot refuse memory on purpose")
 
-from faults import DISK, MEMORY, Fault, arm, draw_faults
+from collections.abc import Mapping
 
-if TYPE_CHECKING:
-    from collections.abc import Mapping
+from faults import DISK, MEMORY, Fault, arm, draw_faults
 
 FEW_ROUNDS, MANY_ROUNDS = 6, 500
 FINISHED, FAILED = 0, 3

@@ -1,7 +1,5 @@
 """Killed at any moment: readers see whole runs, and the same command again leaves what one run would have."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import random
@@ -11,8 +9,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import polars as pl
 import pytest
@@ -20,9 +18,6 @@ from batch_tools import IMPORTABLE, batch, counts, read_tables, start_slip
 from batch_works import work_dying_at_steps
 
 from pipeline.store import STEPS, Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
 
 FEW_ROUNDS, MANY_ROUNDS = 6, 100
 

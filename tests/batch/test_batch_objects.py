@@ -1,11 +1,8 @@
 """Logs and results on an object store: a local S3 server stands in for it."""
 
-from __future__ import annotations
-
 import os
 import pickle
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from batch_tools import batch, counts, read_tables
@@ -13,6 +10,7 @@ from batch_tools import batch, counts, read_tables
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 pytest.importorskip("moto", reason="moto is not installed")
 
+import fsspec
 import numpy as np
 from object_store import BUCKET, upload
 
@@ -25,9 +23,6 @@ from pipeline.logs.writer import LogWriter
 from pipeline.store import Partition, Store, StoreError
 from pipeline.store import mirror as mirror_room
 from pipeline.store.mirror import Mirror
-
-if TYPE_CHECKING:
-    import fsspec
 
 
 def test_a_log_is_read_as_if_it_were_here(bucket: fsspec.AbstractFileSystem, season: Path) -> None:

@@ -1,9 +1,6 @@
 """An object that is overwritten while it is read: one version or none, never both."""
 
-from __future__ import annotations
-
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -12,20 +9,17 @@ from batch_tools import batch, counts
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 pytest.importorskip("moto", reason="moto is not installed")
 
+from collections.abc import Callable
+
+import fsspec
 import s3fs
 from object_store import BUCKET, upload
 
 from pipeline.logs import LogError, RemotePath, Wanted, open_log, read_topics
 from pipeline.logs import remote as bucket_room
+from pipeline.logs.remote import Info
 from pipeline.logs.writer import LogWriter
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    import fsspec
-
-    from pipeline.logs.remote import Info
 
 ADDRESS = f"{BUCKET}/log.mcap"
 ROWS = 600

@@ -1,18 +1,13 @@
 """Poisoned logs cost themselves and nothing else, and are named."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from batch_tools import batch, counts, read_tables
 from batch_works import work_poisoned
 from pebble.pool.process import PoolManager
-
-if TYPE_CHECKING:
-    import pytest
 
 KINDS = ("raises", "panics", "hangs", "eats", "dies", "leaves", "unpicklable")
 LIMITS = {"executor": "local", "timeout_s": 3.0, "memory_bytes": 700_000_000}

@@ -1,7 +1,5 @@
 """The nightly units: what they run does run, one at a time."""
 
-from __future__ import annotations
-
 import configparser
 import fcntl
 import os
@@ -13,18 +11,14 @@ import sys
 import types
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 import yaml
 from batch_tools import HERE
 
 from pipeline.batch import BatchError
-from pipeline.batch.schedule import Nightly, parse_clock, print_units
+from pipeline.batch.schedule import Nightly, System, parse_clock, print_units
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pipeline.batch.schedule import System
 
 needs_flock = pytest.mark.skipif(not shutil.which("flock"), reason="there is no flock here")
 

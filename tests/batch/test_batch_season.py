@@ -1,12 +1,10 @@
 """A season from the outside: what is done, what is left alone, what becomes of whom."""
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from batch_tools import Watch, ask, batch, counts, read_tables
 
 from pipeline.analysis.analyze import analyze_log, update_datasets
@@ -15,9 +13,6 @@ from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
 from pipeline.batch.season import run_batch
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    import pytest
 
 
 def hash_all(folder: Path) -> dict[str, str]:

@@ -1,8 +1,6 @@
 """Files with one name and numbers are parts of one recording only if they follow one another in time."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from mcap_files import FLOAT, START, payloads, text_of, write_channels
@@ -10,9 +8,6 @@ from mcap_files import FLOAT, START, payloads, text_of, write_channels
 from pipeline.batch.recordings import find_recordings
 from pipeline.logs import LogError, open_log
 from pipeline.logs.index import find_parts
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 SECOND = 1_000_000_000
 

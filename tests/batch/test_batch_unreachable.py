@@ -1,23 +1,19 @@
 """An object store that does not do what it should: one line, within the time that somebody waits."""
 
-from __future__ import annotations
-
 import socket
 import time
-from typing import TYPE_CHECKING
 
 import pytest
 
 pytest.importorskip("s3fs", reason="the extra s3 is not installed")
 
+from collections.abc import Iterator
+from pathlib import Path
+
 import fsspec
 
 from pipeline.cli import main
 from pipeline.logs import remote as bucket_room
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 LOG = "s3://nobody/logs/a.mcap"
 VERBS = {

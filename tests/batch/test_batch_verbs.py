@@ -1,18 +1,13 @@
 """The verbs as scripts use them: JSON, exit codes, one clear line."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+import pytest
 from verbs import run_slip
 
 from pipeline.batch.season import Line
 from pipeline.cli.screen import LineWatch
-
-if TYPE_CHECKING:
-    import pytest
 
 INLINE = ("--executor", "inline", "--settle", "0")
 

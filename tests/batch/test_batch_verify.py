@@ -1,26 +1,18 @@
 """`slip results verify --repair`: what can be made again is, by the next batch; nothing whole is touched."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
+import pytest
 from batch_tools import batch, counts, read_tables
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.batch.batch_check import verify_results
+from pipeline.batch.batch_check import Verification, verify_results
 from pipeline.cli import main
 from pipeline.store import LOG_NOTES, Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    import pytest
-
-    from pipeline.batch.batch_check import Verification
 
 
 def verify(out: Path, *, repair: bool = False) -> Verification:

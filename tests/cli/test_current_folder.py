@@ -1,7 +1,5 @@
 """Python files that came with somebody's logs are not imported, whatever their names, whatever verb runs."""
 
-from __future__ import annotations
-
 import json
 import os
 import shlex
@@ -9,15 +7,12 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
 
 OTHERS = ("pipeline", "numpy", "polars", "pyarrow", "pebble", "cyclopts", "usercustomize", "sitecustomize")
 SLIP = Path(sysconfig.get_path("scripts")) / "slip"

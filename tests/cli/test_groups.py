@@ -1,22 +1,16 @@
 """The commands by task: what moved says where to, and an option means the same everywhere."""
 
-from __future__ import annotations
-
 import inspect
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
+from cyclopts import App
 from verbs import run_program, run_verb
 
 from pipeline.cli import build_app
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from cyclopts import App
 
 MOVED = {
     "predict": "fleet predict",

@@ -1,27 +1,21 @@
 """Every command that the program prints or advises is one that there is."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import json
 import re
 import shlex
+from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
+from cyclopts import App
 from verbs import run_verb
 
 from pipeline.cli import _MOVED
 from pipeline.cli import build_app as build
 from pipeline.models import Excitation, find_effect
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from cyclopts import App
 
 build_app = functools.cache(build)
 

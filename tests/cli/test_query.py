@@ -1,12 +1,10 @@
 """`slip results query`: the answer as a table, CSV or JSON, and one line for what cannot be answered."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
 import subprocess
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import polars as pl
 import pytest
@@ -16,9 +14,6 @@ from pipeline.cli import verbs_results
 from pipeline.core import slip_command
 from pipeline.store import Store
 from pipeline.store.parquet_tables import schema_of
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def ask(out: Path, sql: str, *options: str) -> tuple[int, str, str]:

@@ -1,8 +1,6 @@
 """Names of files and topics reach the screen as what they are, and do nothing to it."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -11,9 +9,6 @@ from hypothesis import strategies as st
 from pipeline.cli import main
 from pipeline.cli.conventions import fold_line, print_error, print_lines, tidy_line
 from pipeline.core import SlipError
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,12 @@
 """Folders of any depth are looked through without recursion, and within bounds."""
 
-from __future__ import annotations
+from collections.abc import Callable
+from pathlib import Path
 
-from typing import TYPE_CHECKING
+import pytest
 
 from pipeline.core import untrusted
 from pipeline.core.untrusted import MOST_LEVELS, walk_files
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    import pytest
 
 
 def walk_all(top: Path) -> tuple[list[str], list[str]]:

@@ -1,11 +1,8 @@
 """A check of simulated runs: what changed is named, limits are judged, a baseline stands for its runs."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 from xml.etree import ElementTree as ET
 
 import pytest
@@ -26,13 +23,11 @@ from pipeline.datasets.check import (
 from pipeline.datasets.check_readings import POSITION_ERROR
 from pipeline.datasets.check_sides import Sides, read_baseline, read_under, unite_effects
 from pipeline.models.catalogue import find_effect
+from pipeline.models.effect import Effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
+from pipeline.run import MotionRun
 from pipeline.words.check import format_junit, format_markdown, format_verdict, list_lines
-
-if TYPE_CHECKING:
-    from pipeline.models.effect import Effect
-    from pipeline.run import MotionRun
 
 USUAL = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": 1.6}}
 LATE = {**USUAL, "drive_lag": {"tau": 0.45}}

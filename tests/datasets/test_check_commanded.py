@@ -1,9 +1,7 @@
 """What a robot does of the body command: judged in a check, and told in the verdict on a run."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -18,18 +16,12 @@ from pipeline.datasets.check_sides import Sides, read_under
 from pipeline.models.catalogue import find_effect
 from pipeline.models.model import Model
 from pipeline.models.model_file import ModelFile
-from pipeline.run import load_motion_run
+from pipeline.run import MotionRun, load_motion_run
 from pipeline.simulate import make_scenario, simulate_run, write_log
-from pipeline.sources import find_preset
+from pipeline.sources import Vehicle, find_preset
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.align import measure_body_multiplier
 from pipeline.words.check import format_verdict, list_lines
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.run import MotionRun
-    from pipeline.sources import Vehicle
 
 TRACK = 1.8
 EFFECTS = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": TRACK}}

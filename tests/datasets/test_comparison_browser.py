@@ -1,19 +1,14 @@
 """Pages over many runs in a real browser, as wide as a phone and as a laptop: nothing is cut or overlaps."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
+from chrome import Chrome
 from comparison_store import Run, write_run
 
 from pipeline.cli import main
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
 
 DRAWN = "document.documentElement?.dataset.drawn === 'yes'"
 CUT = """[...document.querySelectorAll('.table')].filter((box) => box.scrollWidth > box.clientWidth + 1)

@@ -1,20 +1,15 @@
 """100 runs of 12,000 rows: lazy, without a loop over rows."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from comparison_store import Run, write_budgets, write_run
 
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # A program counts as large as what started it ever was, and tests before this one may have been large.
 MEASURE = """

@@ -1,11 +1,9 @@
 """`slip fleet trend`: what moved over the runs of a vehicle."""
 
-from __future__ import annotations
-
 import json
 import re
 from datetime import UTC, date, datetime, timedelta
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from comparison_store import Run, write_run
@@ -15,9 +13,6 @@ from pipeline.datasets.trend import Trend, follow_trend
 from pipeline.report.trend_page import write_trend
 from pipeline.store import Store
 from pipeline.store.names import read_day
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FIRST = date(2026, 4, 20)
 

@@ -1,9 +1,7 @@
 """Grounds at equal driving: what the driving did falls away, and what cannot be compared has no number."""
 
-from __future__ import annotations
-
 import shutil
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -15,14 +13,10 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.datasets.compare import compare_results
 from pipeline.datasets.compared_runs import Question
 from pipeline.datasets.equal_driving import find_overlap, level_runs, measure_bins
+from pipeline.datasets.pairs import Answer
 from pipeline.datasets.pooled_tests import compare_means
 from pipeline.store import Store
 from pipeline.words.comparison import list_lines, list_pairs
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.datasets.pairs import Answer
 
 RATE = 20.0
 FACTORS = {"command": 1.0, "measured": 0.5}

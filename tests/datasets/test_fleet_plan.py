@@ -1,10 +1,8 @@
 """A plan for a vehicle on a terrain starts from what the fleet's runs let expect there."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +18,6 @@ from pipeline.plan.rehearsal import learn
 from pipeline.simulate import Program, make_scenario
 from pipeline.sources import Vehicle, find_preset, list_configuration_files
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 # Track factors of three runs a ground: known well on ice, badly on gravel.
 FLEET = {"ice": (1.50, 1.51, 1.49), "gravel": (1.6, 2.0, 1.8)}

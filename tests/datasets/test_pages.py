@@ -1,9 +1,7 @@
 """Pages over all runs lead to each other and to what is there."""
 
-from __future__ import annotations
-
 import re
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from comparison_store import Run, write_run
 
@@ -15,9 +13,6 @@ from pipeline.report import lead_to
 from pipeline.report.map_page import write_map
 from pipeline.report.trend_page import write_trend
 from pipeline.store import Store, see_log
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def make_results(folder: Path) -> Store:

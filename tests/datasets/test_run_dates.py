@@ -1,8 +1,6 @@
 """Dates of runs where names and clocks contradict each other."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from comparison_store import Run, write_run
@@ -11,9 +9,6 @@ from pipeline.datasets.compared_runs import find_material
 from pipeline.report import format_date, render_catalogue
 from pipeline.store import Partition, Store
 from pipeline.store.names import date_runs, read_day
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 PLACEHOLDER = 1_700_000_000_000_000_000
 HOUR = 3_600_000_000_000

@@ -1,17 +1,13 @@
 """Every command of README and handbook prints what stands below it; every picture is of the current code."""
 
-from __future__ import annotations
-
 import base64
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import pytest
 from blocks import check_page, list_pages, read_commands
+from chrome import Chrome
 from pictures import FOLDER, draw_pictures
-
-if TYPE_CHECKING:
-    from chrome import Chrome
 
 ROOT = Path(__file__).parents[2]
 WITH_COMMANDS = [page for page in list_pages() if read_commands(page.read_text(encoding="utf-8"))]

@@ -1,16 +1,16 @@
 """The handbook: whole, offline, and true to the code it speaks of."""
 
-from __future__ import annotations
-
 import re
 import shlex
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
 from barriers import find_barriers
 from blocks import find_difference, list_pages, read_commands
+from chrome import Chrome
+from cyclopts import App
 from effects_pages import list_settings
 from reference import list_verbs, write_reference
 
@@ -18,12 +18,6 @@ from pipeline.cli import build_app
 from pipeline.models import find_effect, list_effects
 from pipeline.sources import Configuration, list_presets
 from schemas import list_contracts
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from chrome import Chrome
-    from cyclopts import App
 
 ROOT = Path(__file__).parents[2]
 README = ROOT / "README.md"

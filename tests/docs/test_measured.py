@@ -1,16 +1,11 @@
 """Tables of the handbook: what was measured, at a version that is not too old."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import measured_tables as tables
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 ROOT = Path(__file__).parents[2]
 FILES = sorted(tables.MEASURED.glob("*.json"))

@@ -1,11 +1,10 @@
 """The page of promises holds the program: commands, exit codes, files, JSON keys and names of Python."""
 
-from __future__ import annotations
-
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import pytest
 from reference import list_verbs
@@ -13,9 +12,6 @@ from verbs import ask_verb, run_verb
 
 import slip
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "pages" / "promises.md").read_text(encoding="utf-8")

@@ -1,17 +1,11 @@
 """Every page on a phone and a laptop, light and dark: nobody is kept out, nothing fails or is cut."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from chrome import Chrome
 from screen_states import Screen
 from screenshots import LOOKS, format_table, photograph, take_all
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
 
 PAGE = """<!DOCTYPE html><html lang="en"><title>page</title>
 <meta name="viewport" content="width=device-width"><body><main><h1>page</h1>{}</main></body></html>"""

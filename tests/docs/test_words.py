@@ -1,16 +1,11 @@
 """What people read is standard English of the field: no phrase of the glossary's left column is shown."""
 
-from __future__ import annotations
-
 import ast
 import re
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 RENDERED = ("pipeline/cli", "pipeline/models/effects")

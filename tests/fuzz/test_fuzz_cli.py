@@ -1,15 +1,10 @@
 """A short run of the fuzz target of the command line, and that it notices what it looks for."""
 
-from __future__ import annotations
-
 import random
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fuzz_cli import Answer, Case, damage_text, describe, judge, run
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 FINE = Answer(0, out='{"a": 1}')
 FILES = {"log.mcap": (3, 1), "out/x": (1, 1)}

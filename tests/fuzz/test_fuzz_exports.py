@@ -1,18 +1,13 @@
 """A short run of the fuzz target of the exports; an hour is `python tests/fuzz/fuzz_exports.py`."""
 
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from exported_texts import READERS
 from fuzz_exports import run
 
 from pipeline.export import list_targets
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def test_odd_models_are_exported_as_data_or_refused_in_one_line(tmp_path: Path) -> None:

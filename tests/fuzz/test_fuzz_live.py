@@ -1,20 +1,14 @@
 """A short run of the fuzz target of live servers, and that it notices what it looks for."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from fuzz_live import PATCHES, prepare, run_case
+from live_servers import Played
 
 from pipeline.live import receiver as live_receiver
 from pipeline.live.receiver import LiveReceiver
 from pipeline.live.watch import Watch
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from live_servers import Played
 
 
 @pytest.fixture(scope="module")

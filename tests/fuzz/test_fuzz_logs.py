@@ -1,16 +1,11 @@
 """A short run of the fuzz target; an hour is `python tests/fuzz/fuzz_logs.py`."""
 
-from __future__ import annotations
-
 import random
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from fuzz_logs import check_definition, check_log, mutate, write_seeds
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -1,9 +1,7 @@
 """A short run of the fuzz target; an hour is `python tests/fuzz/fuzz_texts.py`."""
 
-from __future__ import annotations
-
 import random
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 from fuzz_texts import (
     CONFIGURATION,
@@ -16,9 +14,6 @@ from fuzz_texts import (
 )
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 MODELS = write_models()
 

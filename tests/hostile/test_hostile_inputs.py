@@ -3,26 +3,20 @@
 A row is an input, the verb that gets it, and a pattern of the line; with --json that line is one JSON object.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
+from cyclopts import App
 from verbs import run_verb
 
 from pipeline.cli import build_app
 from pipeline.logs.writer import LogWriter
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from cyclopts import App
 
 START = 1_700_000_000_000_000_000
 LONGEST_LINE, LONGEST_S = 1000, 5.0

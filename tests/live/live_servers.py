@@ -13,16 +13,14 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import Protocol
 
 import foxglove
 from mcap.reader import make_reader
+from mcap.records import Channel, Message, Schema
 from mcap_ros2.decoder import DecoderFactory
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import Server, ServerConnection, serve
-
-if TYPE_CHECKING:
-    from mcap.records import Channel, Message, Schema
 
 PATIENCE_S = 90.0
 """For a program to start on a busy machine."""

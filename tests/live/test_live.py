@@ -1,7 +1,5 @@
 """What a user is promised of a live server that is watched: everything received is kept, whatever it does."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
@@ -10,9 +8,10 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -30,6 +29,7 @@ from mcap.writer import Writer
 from mcap_protobuf.schema import build_file_descriptor_set
 from rosbags.rosbag2 import Reader
 from verbs import run_verb
+from websockets.sync.server import ServerConnection
 
 from pipeline.live import LiveError
 from pipeline.live.receiver import LiveReceiver
@@ -46,11 +46,6 @@ from pipeline.logs.live_recording import (
 )
 from pipeline.logs.reader import Wanted
 from pipeline.simulate import Scenario, simulate_run, write_log
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from websockets.sync.server import ServerConnection
 
 ODOMETRY = "/mapping/icp_odom"
 DAY_NS = 86_400 * 10**9

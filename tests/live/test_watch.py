@@ -1,7 +1,5 @@
 """What a user is promised of a recording that is watched while it is written."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -9,8 +7,8 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import pytest
@@ -28,9 +26,6 @@ from pipeline.logs.reader import Wanted
 from pipeline.results import Errors, Evidence, Growth, Named, RunDiagnosis, Step, Unobservable, Value
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 CHUNK = 1 << 14
 OTHER = {"drive_lag": 0.5}

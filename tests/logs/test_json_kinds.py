@@ -1,9 +1,7 @@
 """JSON messages of which some have a field of another kind than the rest: missing there, as null is."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +10,6 @@ from hypothesis import strategies as st
 from mcap_files import START, read_one, write_channels
 
 from pipeline.logs import Ragged, Strings, TransformBuffer, Wanted, read_topics
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ODD = ["a", "1.0", "", True, False, [1.0], [], ["a"], [[1]], {"a": 1.0}, {}, None, "\ud800", [None]]
 

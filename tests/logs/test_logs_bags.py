@@ -1,26 +1,20 @@
 """Bags of ROS 1 and ROS 2 give what the same recording gives as MCAP; what is wrong with them is said."""
 
-from __future__ import annotations
-
 import hashlib
 import sqlite3
 import tracemalloc
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from bag_files import STORE_1, write_bag, write_db3
-from mcap_files import FLOAT, SHARED, START, value_of, write_small
+from mcap_files import FLOAT, SHARED, START, Truth, value_of, write_small
 from rosbags.rosbag1 import Reader as BagReader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionMode
 
 from pipeline.logs import LogError, Wanted, hash_log, is_finished, open_log, read_topics
 from pipeline.logs import chunks as inflate_module
-
-if TYPE_CHECKING:
-    from mcap_files import Truth
 
 
 def read_all(path: Path) -> Truth:

@@ -1,9 +1,8 @@
 """A small file never asks for much work: bytes inflated, records read and places searched are bounded."""
 
-from __future__ import annotations
-
 import struct
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import lz4.frame
 import pytest
@@ -12,10 +11,6 @@ from mcap_files import START, WITHOUT_INDEX, chunk_places, record_starts, write_
 
 from pipeline.logs import Wanted, catalog, chunks, columns, open_log, read_topics, records
 from pipeline.logs import records as rec
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 MIB = 1 << 20
 HEAD = b"\x89MCAP0\r\n" + rec.HEAD.pack(rec.HEADER, 8) + bytes(8)

@@ -1,10 +1,9 @@
 """What checksums cover is never returned wrong, and what none covers is said."""
 
-from __future__ import annotations
-
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import damage
 import lz4.frame
@@ -23,9 +22,6 @@ from mcap_files import (
 )
 
 from pipeline.logs import definition_text
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 def set_crc(content: bytes, start: int, crc: int) -> bytes:

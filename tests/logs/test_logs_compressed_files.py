@@ -1,24 +1,17 @@
 """Files that rosbag2 compresses as a whole: read as they are, refused with a reason where damaged."""
 
-from __future__ import annotations
-
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 import zstandard
-from mcap_files import read_small, write_small
+from mcap_files import Truth, read_small, write_small
 
 from pipeline.batch.recordings import find_recordings
 from pipeline.logs import LogError, compressed, hash_log, open_log
 from pipeline.logs.index import list_files
 from pipeline.sources import list_configuration_files
 from pipeline.store.stored_runs import name_plainly
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from mcap_files import Truth
 
 
 def compress(path: Path, end: str = ".zstd", frames: int = 1) -> Path:

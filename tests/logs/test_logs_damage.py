@@ -1,9 +1,8 @@
 """A damaged log gives everything that is whole, nothing that is wrong, and says what is missing."""
 
-from __future__ import annotations
-
 import struct
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -23,9 +22,6 @@ from mcap_files import (
 
 from pipeline.logs import LogError, Wanted, open_log, read_topics
 from pipeline.logs.writer import LogWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4", ""])

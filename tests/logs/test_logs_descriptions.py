@@ -1,11 +1,10 @@
 """Which copy of a schema or channel is believed, and what is said where nothing covers it."""
 
 # ruff: noqa: ANN401 - options of a writer come in many types
-from __future__ import annotations
-
 import struct
 import zlib
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +13,6 @@ from mcap.writer import CompressionType, Writer
 from mcap_files import START, payloads, record_starts
 
 from pipeline.logs import LogData, Wanted, open_log, read_topics
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ROWS = 251
 KIND = "demo/msg/Motion"

@@ -1,11 +1,10 @@
 """Every value is the one that the official reader returns."""
 
 # ruff: noqa: ANN401 - columns and messages come in many shapes
-from __future__ import annotations
-
 from collections import Counter
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -30,9 +29,6 @@ from pipeline.logs import (
     read_topics,
 )
 from pipeline.logs.schema import SEQUENCE, SIZES, Structure, bundled_structure
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 LOGS = sorted((SHARED / "logs").glob("*.mcap"))
 CORPUS = sorted((SHARED / "mcap_corpus").rglob("*.mcap"))

@@ -1,19 +1,15 @@
 """A chunk cut out of a log that nothing counts is noticed where its writer numbered the messages."""
 
 # ruff: noqa: ANN401 - options of a writer come in many types
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
 from mcap_files import START, payloads, record_starts, text_of
 
 from pipeline.logs import Loss, Wanted, open_log, read_topics
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 ROWS = 400
 FLOAT = "std_msgs/msg/Float64"

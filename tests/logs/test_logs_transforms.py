@@ -1,9 +1,8 @@
 """Chains of transforms are what tf would answer, at the stamps of the child."""
 
 # ruff: noqa: ANN401 - columns and messages come in many shapes
-from __future__ import annotations
-
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +13,6 @@ from mcap_files import START
 from pipeline.core.rigid import multiply_quaternions, quaternions_from_yaw, rotate
 from pipeline.logs import LogError, TransformBuffer, open_log, read_topics, wanted_transforms
 from pipeline.logs.writer import LogWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 KIND = "tf2_msgs/msg/TFMessage"
 STEP = 50_000_000

@@ -1,10 +1,9 @@
 """What is written is what was given, for our reader and for the official one."""
 
-from __future__ import annotations
-
 import pickle
 import time
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +12,6 @@ from mcap_files import FLOAT, JOINTS, START, TEXT, assert_equals_official, read_
 
 from pipeline.logs import LogError, Wanted, bundled_types, open_log, read_topics
 from pipeline.logs.writer import LogWriter
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 ODOMETRY = "nav_msgs/msg/Odometry"
 

@@ -1,12 +1,9 @@
 """In the files of all targets names from logs and model files are data, and absurd numbers are refused."""
 
-from __future__ import annotations
-
 import math
 import tomllib
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from exported_files import CAR, FIT, HUSKY, make
@@ -22,10 +19,8 @@ from pipeline.models import Model, ModelFile, find_effect, format_model
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
 from pipeline.run import MotionError
+from pipeline.sources import Vehicle
 from pipeline.sources.configuration import RANGES
-
-if TYPE_CHECKING:
-    from pipeline.sources import Vehicle
 
 HARMLESS = "Yard robot 7"
 NAMES = st.one_of(

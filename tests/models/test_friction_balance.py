@@ -1,24 +1,18 @@
 """The model of Rabiee and Biswas: its formulas beside a balance of forces that is solved number by number."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 from msgspec.structs import replace
 from scipy.optimize import fsolve
 
+from pipeline.core.arrays import Floats
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, Timing
 from pipeline.models.literature import find_model, list_models
 from pipeline.run import MotionError
 from pipeline.simulate import Program
-
-if TYPE_CHECKING:
-    from pipeline.core.arrays import Floats
-    from pipeline.simulate import State as SimulatedState
+from pipeline.simulate import State as SimulatedState
 
 HUSKY = vehicle_of("husky_a200")
 TERMS = "friction_based_terms"

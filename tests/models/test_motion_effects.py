@@ -1,11 +1,8 @@
 """What is promised of every effect, whichever there are."""
 
-from __future__ import annotations
-
 import math
 import re
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -19,12 +16,10 @@ from pipeline.models.effect import Excitation, KinematicEffect, Late
 from pipeline.models.expression import parse_expression
 from pipeline.models.families import check_formula
 from pipeline.models.parameter import parse_unit
+from pipeline.run import MotionRun
 from pipeline.run.signals import Rolling, Velocity, Wheels, find_turning
 from pipeline.simulate import VEHICLES, Encoders, Program
 from pipeline.simulate import list_effects as list_simulated
-
-if TYPE_CHECKING:
-    from pipeline.run import MotionRun
 
 EFFECTS = list_effects()
 WRITTEN_EFFECTS = list_written_effects()

@@ -1,15 +1,13 @@
 """What is exported computes what the model computes, and no name in a model becomes code or structure."""
 
-from __future__ import annotations
-
 import builtins
 import json
 import math
 import random
 import symtable
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -24,13 +22,8 @@ from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Place, Timing, find_effect, format_model, list_effects
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.model_file import parse_model
-from pipeline.run import MotionError
+from pipeline.run import MotionError, MotionRun
 from pipeline.simulate import VEHICLES, Disturbance, Program
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")

@@ -1,9 +1,7 @@
 """Few seconds of driving and what the fleet knows before: fits with a prior, and the verbs."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,13 +12,8 @@ from pipeline.cli import main
 from pipeline.estimation import Fitted, Input, Problem, estimate_intervals, fit_model, score
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.models import Model, find_effect, read_model
-from pipeline.run import MotionError
+from pipeline.run import MotionError, MotionRun
 from pipeline.run.windows import cut_run, find_driven
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": {"k": 1.8}, "lateral_skid": {"c": 0.08}}

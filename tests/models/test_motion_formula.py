@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 import math
 from contextlib import suppress
 from fractions import Fraction
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -17,9 +14,7 @@ from pipeline.models.expression import parse_expression
 from pipeline.models.formula import FormulaEffect, make_parameter
 from pipeline.models.parameter import Unit, parse_unit
 from pipeline.run import MotionError
-
-if TYPE_CHECKING:
-    from pipeline.simulate import State as SimulatedState
+from pipeline.simulate import State as SimulatedState
 
 KNOWN = {
     "a": parse_unit("m", ""),

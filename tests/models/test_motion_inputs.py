@@ -1,18 +1,13 @@
 """Which input a verb takes, and the reason that it gives."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import pytest
 from motion_runs import simulate
 
 from pipeline.estimation import Input, choose_input
 from pipeline.models import find_effect
-
-if TYPE_CHECKING:
-    from pipeline.run import MotionRun
+from pipeline.run import MotionRun
 
 LAG, SKID = find_effect("drive_lag")(), find_effect("lateral_skid")()
 

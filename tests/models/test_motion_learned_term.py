@@ -1,19 +1,17 @@
 """A learned term beyond the named physics: kept where it helps, gone where its data end, and its bands."""
 
-from __future__ import annotations
-
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
 from verbs import run_verb
 
-from pipeline.estimation import Comparison, Input, Problem, fit_model, hold_out
+from pipeline.estimation import Comparison, Fitted, HeldOut, Input, Problem, fit_model, hold_out
 from pipeline.estimation.across_runs import Ratios, make_bands, measure_coverage
 from pipeline.estimation.ladder import judge_model
 from pipeline.estimation.learned_step import (
@@ -29,13 +27,8 @@ from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect, format_model
 from pipeline.models.learned_term import INPUTS, Bands, LearnedInput, ResidualTerm
 from pipeline.models.model_file import parse_model
+from pipeline.run import MotionRun
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from pipeline.estimation import Fitted, HeldOut
-    from pipeline.run import MotionRun
 
 HUSKY = vehicle_of("husky_a200")
 HERE = Path("model.toml")

@@ -1,7 +1,6 @@
-from __future__ import annotations
-
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,17 +8,12 @@ from motion_runs import simulate, vehicle_of
 from scipy.optimize import least_squares
 from verbs import run_verb
 
+from pipeline.core.arrays import Floats
 from pipeline.estimation import Input, Problem, fit_model
 from pipeline.models import Model, Timing, read_model
 from pipeline.models.literature import MODELS, find_model
 from pipeline.simulate import VEHICLES, Program
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from pipeline.core.arrays import Floats
-    from pipeline.simulate import State as SimulatedState
+from pipeline.simulate import State as SimulatedState
 
 HUSKY = vehicle_of("husky_a200")
 TRACK_M = HUSKY.track_width_m or math.nan

@@ -1,8 +1,6 @@
 """What is no fault: steps of a command, a gyro that fell silent, a localization that waits for motion."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 import polars as pl
@@ -14,9 +12,6 @@ from pipeline.models import Model
 from pipeline.run import load_run
 from pipeline.run.heading import fit_gyro
 from pipeline.simulate import VEHICLES, Disturbance, Imu, PoseSensor, Program, simulate_run
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 HUSKY = vehicle_of("husky_a200")
 

@@ -1,9 +1,7 @@
 """The real recordings: what the right effects, given by hand, leave of the ideal model's held-out error."""
 
-from __future__ import annotations
-
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,9 +11,6 @@ from pipeline.estimation import Problem, carry_over, climb, fit_model
 from pipeline.estimation.ladder import compare_losses
 from pipeline.models import Model, find_effect
 from pipeline.results.reading import CHANCE, list_rises
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 pytestmark = pytest.mark.long
 

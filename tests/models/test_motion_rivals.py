@@ -1,7 +1,5 @@
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,9 +20,6 @@ from pipeline.estimation.rivals import (
 from pipeline.models import Model
 from pipeline.models.literature import find_model
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 HUSKY = vehicle_of("husky_a200")
 TRUTH = {"effective_track": {"k": 1.8}, "drive_lag": {"tau": 0.3}}

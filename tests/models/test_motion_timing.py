@@ -1,8 +1,6 @@
 """Poses stand at the moments they belong to, faults of a localization are left out, encoders may be late."""
 
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 import polars as pl
@@ -17,9 +15,6 @@ from pipeline.models import Model, find_effect
 from pipeline.run import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run
 from pipeline.simulate.programs import lag_signal
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 HUSKY = vehicle_of("husky_a200")
 SKID = {"effective_track": 1.8, "turn_lag": {"tau_mean": 0.1, "tau_diff": 0.4}, "icr_offset": 0.12}

@@ -1,6 +1,4 @@
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from collections.abc import Mapping
 
 import numpy as np
 import pytest
@@ -12,9 +10,6 @@ from pipeline.estimation.comparison import Comparison
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, Timing, find_effect
 from pipeline.simulate import VEHICLES, Disturbance, Program
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 HUSKY = vehicle_of("husky_a200")
 TILE = {"effective_track": 1.8, "icr_offset": 0.12}

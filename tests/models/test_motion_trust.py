@@ -1,12 +1,11 @@
 """Python that a model file names is not run before its very content has been trusted."""
 
-from __future__ import annotations
-
 import json
 import os
 import py_compile
 import shutil
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
@@ -18,10 +17,6 @@ from pipeline.models.model_file import list_code, parse_model
 from pipeline.run import MotionError
 from pipeline.simulate import simulate_case
 from pipeline.web.session import Session, SessionFile, Step, show_session
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
 
 MODEL = """effects = ["own.py"]
 [vehicle]

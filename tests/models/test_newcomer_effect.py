@@ -1,11 +1,9 @@
 """One file of an effect in its folder: catalogue, handbook, export, simulation and shared tests know it."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -16,9 +14,6 @@ import pipeline.models.effects
 from pipeline.export import export_model
 from pipeline.models import Model, ModelFile, catalogue, find_effect
 from pipeline.sources import find_preset
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "docs" / "tools"))

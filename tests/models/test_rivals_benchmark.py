@@ -1,19 +1,14 @@
 """The benchmark `rivals`: where a model comes from, who is marked as better, and no recordings."""
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 import rivals
 from motion_runs import vehicle_of
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.sources import Vehicle
+from pipeline.sources import Vehicle
 
 
 @dataclass(eq=False)

@@ -1,9 +1,7 @@
 """Signatures of effects: simulated logs with known numbers, and the curve that physics gives each of them."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from functools import cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
@@ -15,9 +13,6 @@ from pipeline.models import Effect, Timing, find_effect
 from pipeline.models.effect import Parameter
 from pipeline.models.formula import FormulaEffect
 from pipeline.simulate import Ground
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 TRUE: Mapping[str, tuple[str, float]] = {
     "effective_track": ("k", 1.6),

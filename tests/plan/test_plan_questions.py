@@ -1,17 +1,16 @@
 """What a plan expects of evidence, and that a drive with hidden physics brings it."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 import pytest
 from motion_runs import simulate
+from numpy.typing import NDArray
 from plan_game import draw_scenario, record
 from scipy.special import stdtrit
 from verbs import run_verb
@@ -26,11 +25,6 @@ from pipeline.plan.rehearsal import Hypothesis, Rehearsal, Senses, assume, learn
 from pipeline.results import Named, RunDiagnosis, Undecided, Unobservable, Value
 from pipeline.simulate import Program, find_vehicle
 from pipeline.sources import find_preset
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
-
-    from numpy.typing import NDArray
 
 
 def test_what_a_refit_leaves_is_the_residual_of_least_squares() -> None:

@@ -1,14 +1,11 @@
 """Nobody is kept out: pages without serious barriers, ramps that need no colour."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from barriers import find_barriers
-from chrome import LAPTOP, PHONE
+from chrome import LAPTOP, PHONE, Chrome
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
@@ -16,9 +13,6 @@ from pipeline.cli import main
 from pipeline.report import CATALOGUE, read_own, render_catalogue, theme, write_page
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from chrome import Chrome
 
 DRAWN = (
     "document.readyState === 'complete' && (document.documentElement.dataset.drawn === 'yes' ||"

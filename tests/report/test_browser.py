@@ -1,7 +1,5 @@
 """The page in a real browser, from a file, at the widths of a phone and of a laptop."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import json
@@ -9,18 +7,14 @@ import queue
 import subprocess
 import threading
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
-from chrome import BROWSER, FLAGS, LAPTOP, PHONE
+from chrome import BROWSER, FLAGS, LAPTOP, PHONE, Chrome
 from report_synthesis import list_places, make_report
 
 from pipeline.report.page import render_report
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
 
 WINDOW = "--window-size=1400,1000"
 PATIENCE_S = 40.0

@@ -1,26 +1,21 @@
 """What the room writes: figures for papers, the bundle's cache."""
 
-from __future__ import annotations
-
 import os
 import time
-from typing import TYPE_CHECKING, Literal
+from pathlib import Path
+from typing import Literal
 
 import pytest
 from report_synthesis import list_places, make_report
 
 from pipeline.report import ReportError, theme
 from pipeline.report.page import write_figures
+from pipeline.report.scene import RunReport
 from pipeline.report.theme import (
     cache_path,
     load_bundle,
     warm_bundle,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.report.scene import RunReport
 
 START = {"svg": b"<svg", "pdf": b"%PDF", "png": b"\x89PNG"}
 

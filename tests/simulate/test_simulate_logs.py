@@ -1,9 +1,7 @@
 """Logs of simulated runs, read back with the official reader: layouts, stamps, faults, equal bytes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,17 +16,13 @@ from pipeline.simulate import (
     PoseSensor,
     Recording,
     Scenario,
+    SimulatedRun,
     SimulateError,
     list_cases,
     simulate_case,
     simulate_run,
     write_log,
 )
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.simulate import SimulatedRun
 
 SHORT = Scenario(duration_s=12.0)
 START_NS = SHORT.clock.start_ns

@@ -1,21 +1,16 @@
 """The rigid-body skid-steer slips for physical reasons, in the measure that mechanics predicts."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from pipeline.simulate.facts import VEHICLES, SimulateError
+from pipeline.simulate.messages import SimulatedRun
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.scenario import Ground, Program, Scenario
-
-if TYPE_CHECKING:
-    from pipeline.simulate.messages import SimulatedRun
 
 pytest.importorskip("mujoco", reason="the extra `sim` is not installed")
 

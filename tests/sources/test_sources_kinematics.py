@@ -1,26 +1,21 @@
 """Ideal motion of every kind of vehicle, and a new kind as one file."""
 
-from __future__ import annotations
-
 import inspect
 import os
 import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 
 from pipeline.sources import Vehicle, find_preset
 from pipeline.sources.kinematics import find_kinematics, list_kinds
-
-if TYPE_CHECKING:
-    from numpy.typing import NDArray
 
 ROOT = Path(__file__).parents[2]
 CRAB = """

@@ -1,14 +1,9 @@
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 from stage_logs import Taken, TakeThrough, record, take
 
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from pipeline.simulate import Scenario
+from pipeline.simulate import Scenario
 
 
 @pytest.fixture(scope="session")

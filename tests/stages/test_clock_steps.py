@@ -1,7 +1,5 @@
 """A recorder's clock that is set inside a log: nothing is sized by how far, and nothing else is found."""
 
-from __future__ import annotations
-
 import json
 import resource
 import subprocess
@@ -9,29 +7,23 @@ import sys
 import tracemalloc
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from stage_logs import FIELD, TakeThrough, keep_good_rows, record
+from stage_logs import FIELD, Taken, TakeThrough, keep_good_rows, record
 
 from pipeline.analysis.work import as_recorded
 from pipeline.datasets.confidence import integrated_time
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.run import Alignment, read_drive
-from pipeline.simulate import Clock
+from pipeline.simulate import Clock, Scenario
 from pipeline.stages.align import align_tables
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.slip_stage import compute_slip
 from pipeline.stages.velocity import compute_velocities
-
-if TYPE_CHECKING:
-    from stage_logs import Taken
-
-    from pipeline.simulate import Scenario
 
 SECOND, DAY = 10**9, 86_400 * 10**9
 START = 1_700_000_000 * SECOND

@@ -1,9 +1,7 @@
 """A base that stops by itself when nothing is asked of it: how long it waits, and commands are held."""
 
-from __future__ import annotations
-
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import polars as pl
@@ -13,9 +11,6 @@ from stage_logs import FIELD, TakeThrough
 from pipeline.recording.command_scale import roll
 from pipeline.simulate import Incident, Program, Scenario
 from pipeline.stages.drive_numbers import find_timeout
-
-if TYPE_CHECKING:
-    from collections.abc import Mapping
 
 STARTS = np.linspace(12.0, 280.0, 20)
 LONG_S = 1.5

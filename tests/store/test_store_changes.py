@@ -1,22 +1,16 @@
 """What changed in a run, went from it or was added is noticed by its manifest; a kill is none of these."""
 
-from __future__ import annotations
-
 import shutil
+from collections.abc import Callable
 from itertools import cycle
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from conftest import StartWriter
 from store_samples import write_generation
 
 from pipeline.store import Store
 from pipeline.store.names import Sample
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-    from pathlib import Path
-
-    from conftest import StartWriter
 
 RUN, OTHER = "2026/husky", "2026/warthog"
 

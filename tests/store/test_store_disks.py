@@ -1,20 +1,15 @@
 """A disk that refuses: one clear error, nothing half visible, and the same command works afterwards."""
 
-from __future__ import annotations
-
 import errno
 import os
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from store_samples import make_slip, read_seed, write_generation
 
 from pipeline.store import Store, StoreError
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 RUN = "2026/husky"
 OLD, NEW = 1, 2

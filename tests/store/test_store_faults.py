@@ -1,12 +1,9 @@
 """Memory refused at any allocation, a disk that fails at any call: the old results or the new ones, whole."""
 
-from __future__ import annotations
-
 import multiprocessing
 import os
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from store_samples import read_seed, write_generation
@@ -16,10 +13,9 @@ from pipeline.store import Store
 
 pytest.importorskip("_testcapi", reason="this Python cannot refuse memory on purpose")
 
-from faults import DISK, MEMORY, Fault, arm, draw_faults
+from multiprocessing.context import ForkServerContext
 
-if TYPE_CHECKING:
-    from multiprocessing.context import ForkServerContext
+from faults import DISK, MEMORY, Fault, arm, draw_faults
 
 RUN = "2026/husky"
 WRITTEN, REFUSED = 0, 3

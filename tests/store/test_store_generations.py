@@ -1,19 +1,12 @@
 """Generations: published whole, never changed, reused by link, pruned on demand."""
 
-from __future__ import annotations
-
 import json
-from typing import TYPE_CHECKING
+from collections.abc import Callable
 
 import pytest
 from store_samples import break_windows, make_slip, make_windows, read_seed, write_generation
 
-from pipeline.store import Manifest, Store, StoreError, TableReport
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
-
-    from pipeline.store import Generation
+from pipeline.store import Generation, Manifest, Store, StoreError, TableReport
 
 RUN = "2026/husky"
 

@@ -1,18 +1,13 @@
 """Remembered hashes: an unchanged log is not hashed again, a changed one always is."""
 
-from __future__ import annotations
-
 import dataclasses
 import os
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
 
 from pipeline.store import LogIdentities, Store, see_log
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 OLD_NS = 1_700_000_000_000_000_000
 

@@ -1,21 +1,15 @@
 """A writer killed at any moment leaves the old results or the new ones; finishing later gives the same."""
 
-from __future__ import annotations
-
 import random
 import signal
 import time
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from conftest import StartWriter
 from store_samples import read_seed, write_generation
 
 from pipeline.store import STEPS, Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from conftest import StartWriter
 
 RUN = "2026/husky"
 OLD, NEW = 1, 2

@@ -1,25 +1,19 @@
 """One writer a run at a time; different runs do not wait for each other; death releases."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
 import signal
 import time
 from concurrent.futures import ThreadPoolExecutor
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import pytest
+from conftest import StartWriter
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Store, StoreError
 from pipeline.store.files import hold_lock
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from conftest import StartWriter
 
 RUN = "husky"
 

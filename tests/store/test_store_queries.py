@@ -1,10 +1,8 @@
 """Tables over all runs: lazily, in SQL, across versions of a contract; tables of the whole results."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from pathlib import Path
 
 import numpy as np
 import polars as pl
@@ -19,9 +17,6 @@ from pipeline.store.checksums import encode_manifest
 from pipeline.store.files import MANIFEST
 from pipeline.store.parquet_tables import check_table, schema_of
 from schemas import list_contracts
-
-if TYPE_CHECKING:
-    from pathlib import Path
 
 
 @pytest.mark.parametrize("contract", list_contracts(), ids=lambda contract: contract.name)

@@ -1,10 +1,8 @@
 """Logs and results that the tests of the workbench share."""
 
-from __future__ import annotations
-
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 from stored import make_once
@@ -13,9 +11,6 @@ from workbench_server import TRACK, Workbench
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
 
 
 @pytest.fixture(scope="session")

@@ -1,15 +1,13 @@
 """The workbench in a real browser, as a person uses it: look, add, see the error fall, undo, drop, reload."""
 
-from __future__ import annotations
-
 import json
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pytest
-from chrome import LAPTOP, PHONE
+from chrome import LAPTOP, PHONE, Chrome
 from workbench_server import ERROR, RUN, SHOWN, TOKEN, TRACK, Workbench, look_for_trouble
 
 from pipeline.analysis import Options
@@ -18,9 +16,6 @@ from pipeline.logs.writer import LogWriter
 from pipeline.report import theme
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from chrome import Chrome
 
 START = 1_700_000_000_000_000_000
 EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"

@@ -1,14 +1,13 @@
 """Every flow of the workbench in a real browser, on a wide and on a narrow screen, and without barriers."""
 
-from __future__ import annotations
-
 import json
 from contextlib import closing
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
 from barriers import find_barriers
-from chrome import LAPTOP, PHONE
+from chrome import LAPTOP, PHONE, Chrome
 from workbench_server import ERROR, RUN, SHOWN, Workbench
 
 from pipeline.analysis.analyze import update_datasets
@@ -16,11 +15,6 @@ from pipeline.datasets.deployments import draw_up_map
 from pipeline.report.map_page import write_map
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
 
 WIDTHS = pytest.mark.parametrize("width", [LAPTOP, PHONE])
 SETTLED = (

@@ -1,20 +1,13 @@
 """Who may ask the server what, and what its answers allow a browser to do."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import secrets
-from typing import TYPE_CHECKING
 
 import pytest
-from workbench_server import RUN, TOKEN
+from workbench_server import RUN, TOKEN, Workbench
 
 from pipeline.web import Guard, make_token
-
-if TYPE_CHECKING:
-    from workbench_server import Workbench
-
 
 EVERYTHING = (
     ("GET", "/"), ("GET", "/page.js"), ("GET", "/vega.js"), ("GET", "/api/runs"), ("GET", "/api/jobs"),

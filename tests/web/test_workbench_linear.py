@@ -1,11 +1,9 @@
 """A megabyte of whatever somebody wrote takes a moment to refuse: no pattern looks at it twice."""
 
-from __future__ import annotations
-
 import contextlib
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import pytest
 
@@ -18,9 +16,6 @@ from pipeline.sources import layers as sources
 from pipeline.stages import drive, pose_choice
 from pipeline.web.session import make_formula
 from pipeline.web.stored_runs import clean_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable
 
 LENGTH = 1_000_000
 LONGEST_S = 3.0

@@ -1,27 +1,22 @@
 """The page of what is being watched: it says what the terminal of `slip watch` says, word for word."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
 import time
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
 import pytest
+from chrome import Chrome
 from mcap.reader import make_reader
 from mcap.writer import Writer
+from workbench_server import Workbench
 
 from pipeline.live.watch import read_statements, write_statement
 from pipeline.simulate import Scenario, simulate_run, write_log
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
-    from workbench_server import Workbench
 
 EVIL = "<img src=x onerror=\"window.pwned='yes'\"><script>window.pwned='yes'</script>"
 

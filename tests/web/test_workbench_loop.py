@@ -1,23 +1,17 @@
 """Compare, see where, learn, add, watch the error fall: the loop of the workbench, on both screens."""
 
-from __future__ import annotations
-
 import os
 from contextlib import closing
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 
-from chrome import LAPTOP, PHONE
+from chrome import LAPTOP, PHONE, Chrome
 from workbench_server import ERROR, RUN, SHOWN, Workbench, look_for_trouble
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
-
-if TYPE_CHECKING:
-    from pathlib import Path
-
-    from chrome import Chrome
 
 GOOD = "rgb(0, 128, 95)"
 END = "document.querySelector('.end')"

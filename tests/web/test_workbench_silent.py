@@ -1,7 +1,5 @@
 """Whoever has no token can neither shut the workbench nor make it read or print anything."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import resource
@@ -11,8 +9,10 @@ import sys
 import threading
 import time
 from collections import deque
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from typing import TYPE_CHECKING, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from test_workbench_upload import wait_for
@@ -21,10 +21,6 @@ from workbench_server import LIMITS, OPEN_FILES, TOKEN, Workbench
 
 from pipeline.web import server as serving
 from pipeline.web.server import serve
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 CROWD = 1100
 ANSWERED_S = 3.0

@@ -1,18 +1,18 @@
 """The button offers what the diagnosis names; what is no help is not offered, and its card says so."""
 
-from __future__ import annotations
-
 import json
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any, cast
 
 import pytest
 from verbs import run_verb
-from workbench_server import RUN, TRACK
+from workbench_server import RUN, TRACK, Workbench
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation.additions import explain_refusal
+from pipeline.models.model import Model
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.results.reading import read_model
 from pipeline.simulate import simulate_case
@@ -20,15 +20,8 @@ from pipeline.store import Store
 from pipeline.web import Ask, Limits, ServerFolders
 from pipeline.web.actions import Editor
 from pipeline.web.jobs import Jobs
+from pipeline.web.session import Session
 from pipeline.web.workbench import Sessions
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from workbench_server import Workbench
-
-    from pipeline.models.model import Model
-    from pipeline.web.session import Session
 
 ROOT = Path(__file__).parents[2]
 SAMPLES = sorted((ROOT / "data_samples").glob("[!m]*.mcap"))

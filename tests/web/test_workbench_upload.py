@@ -1,14 +1,13 @@
 """Logs dropped on the page: bounded, whole or not at all, named harmlessly, and analyzed."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import socket
 import time
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 import numpy as np
 import pytest
@@ -16,9 +15,6 @@ from workbench_server import LIMITS, TOKEN, Workbench
 
 from pipeline.logs.writer import LogWriter
 from pipeline.web.stored_runs import clean_name
-
-if TYPE_CHECKING:
-    from collections.abc import Callable, Iterator
 
 START = 1_700_000_000_000_000_000
 

@@ -1,25 +1,21 @@
 """A log that dies, hangs or eats memory costs itself: the page says so in a sentence, the server lives on."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import TYPE_CHECKING, cast
+from pathlib import Path
+from typing import cast
 from urllib.request import Request, urlopen
 
 import pytest
 from test_workbench_upload import files_below
 from workbench_server import LIMITS, PATIENCE_S, RUN, Workbench
 from workbench_works import work_poisoned, work_slowly
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-    from pathlib import Path
 
 
 @pytest.fixture
