@@ -16,6 +16,7 @@ from pipeline.cli.conventions import (
     ALERT,
     CLEAN,
     FAILED,
+    All,
     Choices,
     Results,
     TrustCode,
@@ -59,6 +60,7 @@ def check(  # noqa: D417 - the arguments document themselves
     file: Annotated[Path | None, Parameter(help="file to write; standard output without one")] = None,
     trust_code: TrustCode = False,
     results: Results = Path("results"),
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -70,6 +72,7 @@ def check(  # noqa: D417 - the arguments document themselves
     Args:
         simulated: BEFORE is a simulation: the spread between runs does not count.
         input: input of the model.
+        everything: also print the numbers of what did not change, and which changes could be detected.
         json: print one JSON object.
         quiet: print no progress and no summary.
     """
@@ -118,7 +121,7 @@ def check(  # noqa: D417 - the arguments document themselves
         errors = [summarize_error(after, one) for one in unkept]
         print_json({**check_as_json(checked, lines), "errors": errors})
     elif not quiet and (to is None or file is not None):
-        print_lines(format_lines(lines))
+        print_lines(format_lines(list_lines(checked, everything=everything)))
     for one in unkept:
         print_error(one)
     return FAILED if unkept else checked.code

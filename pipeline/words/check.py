@@ -23,6 +23,7 @@ Line = tuple[str, str]
 _MOST_NAMED = 3
 """Largest number of quantities in a sentence; the lines list all."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
+_DIFFERENT = ("changed", "differs")
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
@@ -230,17 +231,26 @@ def _format_smallest(check: Check, name: str) -> str:
     return f"{change.smallest:.2g}{unit} of {_name(check, name)}"
 
 
-def list_lines(check: Check) -> list[Line]:
-    """The check as labels and texts: verdict, limits, quantities, compared runs."""
+def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
+    """The check as labels and texts: verdict, limits, quantities, compared runs.
+
+    Args:
+        check: the check.
+        everything: a row with its resolution for every quantity; else what did not change is a list of names.
+    """
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
-    names = max(map(len, check.changes), default=0)
-    pairs = max((len(_format_pair(check, name)) for name in _list_known(check)), default=0)
-    for status in STATUSES:
-        for name in check.list_status(status):
-            lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
-            if status != "unknown":
-                lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
+    ranked = [name for status in STATUSES for name in check.list_status(status)]
+    known = _list_known(check)
+    shown = [name for name in ranked if everything or check.changes[name].status in _DIFFERENT]
+    names = max(map(len, shown), default=0)
+    pairs = max((len(_format_pair(check, name)) for name in shown if name in known), default=0)
+    for name in shown:
+        lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
+        if everything and name in known:
+            lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
+    if not everything:
+        lines += _list_names(check, ranked)
     if check.commanded is not None:
         share = f"the robot turns at {_format_shares(check.commanded)} of the commanded yaw rate"
         lines.append(("commanded", share))
@@ -253,6 +263,29 @@ def list_lines(check: Check) -> list[Line]:
         before, after = (" and ".join(one) for one in check.sides.terrains)
         lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
     return lines + [("note", note) for note in check.sides.notes]
+
+
+def _list_names(check: Check, ranked: Sequence[str]) -> list[Line]:
+    """Names of the quantities of which no change is shown, a line for each outcome."""
+    groups: dict[str, list[str]] = {}
+    for name in ranked:
+        if check.changes[name].status not in _DIFFERENT:
+            groups.setdefault(check.name_outcome(name), []).append(name)
+    outcomes: dict[str, set[str]] = {}
+    for name in ranked:
+        outcomes.setdefault(name.partition(".")[0], set()).add(check.name_outcome(name))
+    lines = []
+    for outcome, names in groups.items():
+        # An effect of several parameters is one name where all of them share an outcome.
+        texts = [
+            name_term(_find(check, name).effect.id)
+            if name not in LOGARITHMS and len(outcomes[name.partition(".")[0]]) == 1
+            else _name(check, name)
+            for name in names
+        ]
+        few = "; too few runs to tell" if outcome == "not shown" else ""
+        lines.append((outcome, enumerate_texts(list(dict.fromkeys(texts))) + few))
+    return [*lines, ("", "numbers and detectable changes: --all")] if lines else []
 
 
 def _list_known(check: Check) -> list[str]:

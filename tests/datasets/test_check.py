@@ -119,6 +119,16 @@ def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> N
     assert "| not shown |" in format_markdown(unseen)
 
 
+def test_a_screen_has_a_row_for_what_changed_and_names_for_the_rest(late: Sides) -> None:
+    found = compare(late)
+    lines = list_lines(found, everything=False)
+    assert [text.split()[0] for label, text in lines if label == "changed"] == ["drive_lag.tau"]
+    named = " ".join(text for label, text in lines if label in {"unchanged", "not shown"})
+    assert "effective track" in named
+    assert not any("detectable change 0" in text for _, text in lines)
+    assert len(lines) < len(list_lines(found))
+
+
 def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) -> None:
     check = compare(same)
     for smallest, outcome in ((0.5, "unchanged"), (3.4, "not shown")):
