@@ -10,7 +10,7 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Results, format_value, open_results, print_result
-from pipeline.core import INPUT_WORDS, FigureFormat, SlipError, format_part, split_interval
+from pipeline.core import INPUT_WORDS, PACKAGE, FigureFormat, SlipError, format_part, split_interval
 
 if TYPE_CHECKING:
     import polars as pl
@@ -80,7 +80,7 @@ def compare(  # noqa: D417 - arguments document themselves
         return _compare_causes(store, question, figures, json=json, quiet=quiet)
     answer = compare_results(store, question)
     written = write_answer(store, answer, figures)
-    content = {**summarize_answer(answer), "page": str(written["comparison.html"])}
+    content = {**summarize_answer(answer), "page": _find_page(written, "comparison.html")}
     return print_result(content, lambda: _format_answer(answer, written), json=json, quiet=quiet)
 
 
@@ -107,8 +107,8 @@ def _compare_causes(
     lines += [""] * bool(content["differences"])
     for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
         lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
-    page = str(written["causes.html"])
-    lines += ["", *(f"! {note}" for note in causes.notes), f"page    {page}"]
+    page = _find_page(written, "causes.html")
+    lines += ["", *(f"! {note}" for note in causes.notes), f"page    {page or _NO_PAGE}"]
     return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
@@ -137,7 +137,15 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
     notes = [f"! {note}" for note in list_shown_notes(answer)]
-    return [*lines, "", *notes, f"page    {written['comparison.html']}"]
+    return [*lines, "", *notes, f"page    {_find_page(written, 'comparison.html') or _NO_PAGE}"]
+
+
+_NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"
+
+
+def _find_page(written: Mapping[str, Path], name: str) -> str | None:
+    """A page that was written; None where figures cannot be drawn."""
+    return str(written[name]) if name in written else None
 
 
 def _format_datasets(answer: Answer, name: str) -> list[str]:

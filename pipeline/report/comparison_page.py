@@ -514,6 +514,8 @@ def _rate(shown: pl.DataFrame) -> pl.DataFrame:
 def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = None) -> dict[str, Path]:
     """Write `datasets.parquet`, `comparisons.parquet`, CSV and LaTeX tables and `comparison.html`.
 
+    Where figures cannot be drawn, the page is left out.
+
     Args:
         store: the results.
         answer: result of `compare_results`.
@@ -521,6 +523,9 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
 
     Returns:
         The files by name.
+
+    Raises:
+        SlipError: figures were asked for, and what draws them is not installed.
     """
     from pipeline.report import write_page  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import list_pictures, render_comparison  # noqa: PLC0415 - heavy
@@ -534,8 +539,9 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
         ("comparisons", comparisons, answer.comparisons),
     ):
         written |= write_tables(store, name, frame, shown)
-    page = render_comparison(answer, list_shown_notes(answer))
-    written["comparison.html"] = write_page(store, "comparison.html", page)
+    if theme.can_draw():
+        page = render_comparison(answer, list_shown_notes(answer))
+        written["comparison.html"] = write_page(store, "comparison.html", page)
     return written | add_figures(store, lambda: list_pictures(answer), figures)
 
 

@@ -521,6 +521,8 @@ def _format_cause_ends(
 def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = None) -> dict[str, Path]:
     """Write `causes` and `cause_differences` as CSV and LaTeX, and `causes.html`; the files by name.
 
+    Where figures cannot be drawn, the page is left out.
+
     Args:
         store: the results.
         causes: result of `find_causes`.
@@ -539,8 +541,9 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
     sentences = [
         format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
     ]
-    page = render_causes(replace(causes, names=names), sentences)
-    written["causes.html"] = write_page(store, "causes.html", page)
+    if theme.can_draw():
+        page = render_causes(replace(causes, names=names), sentences)
+        written["causes.html"] = write_page(store, "causes.html", page)
     return written | add_figures(store, lambda: [draw_causes(causes.budgets, names)], figures)
 
 

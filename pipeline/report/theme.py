@@ -393,13 +393,18 @@ def load_bundle() -> str:
     return script
 
 
+def can_draw() -> bool:
+    """Whether the package that draws figures is installed."""
+    return find_spec("vl_convert") is not None
+
+
 def warm_bundle() -> None:
     """Bundle in a separate process, so that it overlaps with reading the log.
 
     The bundler holds the interpreter lock while it works, so a thread would not help. Returns immediately;
     does nothing if the cache is filled or cannot be written, or without the bundler.
     """
-    if find_spec("vl_convert") is None:
+    if not can_draw():
         return
     path = cache_path()
     if path.is_file() or not _can_write(path.parent):

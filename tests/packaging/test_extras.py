@@ -9,9 +9,11 @@ from pathlib import Path
 
 import pytest
 import yaml
+from comparison_store import Run, write_run
 
 from pipeline.core import SlipError, require_package
 from pipeline.simulate import simulate_case
+from pipeline.store import Store
 
 ROOT = Path(__file__).parents[2]
 EXTRAS = ("distributed", "llvmlite", "mujoco", "numba", "pandas", "s3fs", "sklearn", "starlette", "uvicorn",
@@ -56,6 +58,20 @@ def test_slip_tables_need_no_extra(tmp_path: Path) -> None:
         for name in ("results", "whole")
     ]
     assert tables[0] == tables[1]
+
+
+def test_datasets_are_compared_without_what_draws_pages(tmp_path: Path) -> None:
+    for number, terrain in enumerate(("ice", "gravel")):
+        run = Run(name=f"field/{terrain}", dataset=f"warthog_{terrain}", terrain=terrain)
+        write_run(Store(tmp_path / "results"), run, seed=number)
+    done = run_lean("compare", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "slip of warthog, from commands" in done.stdout
+    assert done.stdout.endswith("page    none: pip install 'slip-pipeline[report]' draws it\n")
+    assert (tmp_path / "results" / "comparisons.csv").is_file()
+    refused = run_lean("compare", "--figures", "svg", cwd=tmp_path)
+    assert refused.returncode == 1
+    assert "pip install 'slip-pipeline[report]'" in refused.stderr
 
 
 @pytest.mark.parametrize(

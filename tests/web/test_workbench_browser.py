@@ -269,7 +269,7 @@ def test_a_drive_is_planned_on_request_and_its_files_are_there(
         chrome.wait("document.querySelector('.plan .ask button')")
         # The next drive is ordered while the page still reads its lists anew after the one that failed.
         chrome.run(SLOW_LISTS)
-        chrome.run("document.querySelector('.plan input').value = '2x2m'")
+        chrome.run("document.querySelector('.plan input').value = '1x1m'")
         chrome.click(".plan .ask button")
         chrome.wait("document.querySelector('.job.failed p')?.textContent.includes('area')")
         chrome.run("document.querySelector('.plan input').value = '20x10m'")
