@@ -46,7 +46,7 @@ from pipeline.report import format_distance
 from pipeline.report.motion_view import MotionView, view_diagnosis
 from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
-from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result
+from pipeline.results import ERRORS_OVER_2S, RunDiagnosis, read_result, read_suggestion
 from pipeline.results import read_model as read_diagnosed_model
 from pipeline.sources import Owner, load_vehicle
 from pipeline.store import REPORT, Manifest, Store, find_run, read_choices
@@ -325,6 +325,7 @@ class Diagnosis:
         parameters: their numbers: ``parameter value low high unit``, a 95 % interval.
         ladder: held-out errors over 2 s, effect by effect: ``added t_mrmse_m r_mrmse_rad explained_share``.
         model: the model with these effects; None where nothing could be judged.
+        suggestion: a formula as an effect, for what no effect explains; None without one.
     """
 
     def __init__(
@@ -349,6 +350,8 @@ class Diagnosis:
         self.ladder = tabulate_ladder(content)
         file = read_diagnosed_model(diagnosis)
         self.model = None if file is None else Model.of(file)
+        vehicle = diagnosis.vehicle
+        self.suggestion = None if vehicle is None else next(iter(read_suggestion(diagnosis, vehicle)), None)
 
     def to_json(self) -> dict[str, object]:
         """The object of one run of `slip diagnose --json`."""
@@ -480,7 +483,7 @@ class Check:
         keep_baseline(self._checked, Path(path))
 
     def __repr__(self) -> str:
-        return "\n".join(words.format_lines(self._lines))
+        return "\n".join(words.format_lines(list_lines(self._checked, everything=False)))
 
     def _repr_html_(self) -> str:
         shown = self.numbers.select("number", "unit", "status", "before", "after", "p")

@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         read_error,
         read_findings,
         read_model,
+        read_suggestion,
         split_main,
     )
     from pipeline.results.structs import (

@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from pipeline.core import JSON_DIGITS, format_share, number_in, objects_in, round_digits
-from pipeline.models import ModelFile
+from pipeline.models import Effect, ModelFile
 from pipeline.recording import FAULTS
 from pipeline.results.structs import Errors, Finding, RunDiagnosis, Step
 from pipeline.run import GROUND_UNOBSERVABLE
+from pipeline.sources import Vehicle
 
 Entry = TypeVar("Entry")
 
@@ -73,6 +74,21 @@ def read_model(run: RunDiagnosis) -> ModelFile | None:
         return None if run.model is None else parse_model(run.model, Path("diagnosis.toml"))
     except MotionError:
         return None
+
+
+def read_suggestion(run: RunDiagnosis, vehicle: Vehicle) -> tuple[Effect, ...]:
+    """The formula that a diagnosis suggests for what no effect explains; empty without one.
+
+    Args:
+        run: the diagnosis.
+        vehicle: its vehicle.
+    """
+    from pipeline.models import Model, ModelFile, format_model, parse_model  # noqa: PLC0415 - heavy
+
+    text = None if run.unexplained is None else run.unexplained.formula
+    if text is None:
+        return ()
+    return parse_model(format_model(ModelFile(Model(vehicle))) + text, Path("diagnosis.toml")).model.effects
 
 
 def list_added(before: Step, after: Step) -> list[str]:

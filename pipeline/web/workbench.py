@@ -11,7 +11,7 @@ from pipeline.core import SlipError
 from pipeline.estimation import Errors
 from pipeline.estimation.additions import Addition, Tries, explain_refusal, rank_named
 from pipeline.models import Effect, FormulaEffect, Model, write_model
-from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_model
+from pipeline.results import RunDiagnosis, find_refusal, read_findings, read_model, read_suggestion
 from pipeline.store import Manifest, Store, make_folder
 from pipeline.web import Ask, WorkbenchError, evaluating
 from pipeline.web.actions import Editor, PreparedRun, RunCache, Shown, keep_floor, move, open_session
@@ -19,7 +19,6 @@ from pipeline.web.jobs import Jobs
 from pipeline.web.session import (
     Session,
     SessionFile,
-    format_step,
     list_catalogue,
     list_formulas,
     make_formula,
@@ -311,9 +310,7 @@ class Sessions:
     def _edit(self, file: SessionFile, prepared: PreparedRun, session: Session) -> Editor:
         """The operations on a session, with what the diagnosis of its run found."""
         diagnosis = read_diagnosis(self.results, prepared.manifest)
-        rest = None if diagnosis is None else diagnosis.unexplained
-        text = None if rest is None else rest.formula
-        formula = () if text is None else file.parse(format_step(Model(prepared.vehicle), {}) + text).model
+        formula = () if diagnosis is None else read_suggestion(diagnosis, prepared.vehicle)
         return Editor(file, prepared, session, (*_list_named(diagnosis), *formula))
 
     def _is_named(self, editor: Editor, ask: Ask) -> bool:

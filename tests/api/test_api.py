@@ -8,9 +8,11 @@ from typing import Any
 
 import polars as pl
 import pytest
+from msgspec.structs import replace
 from verbs import ask_verb
 
 import slip
+from pipeline.results import Unexplained
 from pipeline.simulate import simulate_case
 
 EFFECT = "effective_track"
@@ -56,6 +58,16 @@ def test_a_diagnosis_is_that_of_the_command_line(
     }
     assert dict(diagnosis.effects.select("effect", "sentence").iter_rows())[EFFECT] == effect["sentence"]
     assert diagnosis.ladder["t_mrmse_m"].to_list() == [rung["t_mrmse_m"] for rung in told["ladder"]]
+
+
+def test_a_suggested_formula_is_an_effect_to_add(run: slip.Run, diagnosis: slip.Diagnosis) -> None:
+    assert diagnosis.suggestion is None
+    formula = '[[effect]]\nid = "found"\nv_y = "k * v0"\nk = {value = 0.1, unit = "1", bounds = [-1, 1]}\n'
+    told = replace(diagnosis._diagnosis, unexplained=Unexplained(formula=formula))
+    found = slip.Diagnosis(told, {}, dict)
+    assert found.suggestion is not None
+    fit = (slip.Model(run.vehicle.id) + found.suggestion).fit(run)
+    assert "found.k" in repr(fit)
 
 
 def test_what_the_analysis_found_is_not_looked_for_again(
