@@ -111,7 +111,7 @@ class _Part:
         if OF_TWO_RUNS in decided and DIFFERENT not in decided:
             return (
                 f"{decided.count(OF_TWO_RUNS)} of {len(verdicts)} pairs differ, but as two single runs: "
-                "more runs tell whether the grounds do"
+                "more runs are needed to compare the grounds"
             )
         return f"{decided.count(DIFFERENT)} of {len(verdicts)} pairs significant"
 
