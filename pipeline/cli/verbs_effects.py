@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -74,58 +74,129 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         json: print one JSON object instead of the summary.
         quiet: print no progress and no summary.
     """
-    options = build_options(choices)
-    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
     from pipeline.estimation import parse_budget  # noqa: PLC0415 - heavy
     from pipeline.models import check_target  # noqa: PLC0415 - heavy
-    from pipeline.words import describe  # noqa: PLC0415 - heavy
 
     if apply is not None:
         check_target(apply)
     known = _open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
-    answers: list[_Answer] = []
-    given, logs = logs, [name for log in logs for name in list_named(log)]
-    at_work = [logs[0]]
-    opened: dict[str, _Opened] = {}
-    # A diagnosis with default options is unique, and is stored for later requests.
-    is_plain = known is None and budget_s is None and options.inputs == INPUTS
+    found = Diagnosed()
 
     def conclude(error: SlipError) -> None:
         if json:
-            error_row = summarize_error(at_work[0], error)
-            print_json({"runs": _to_json(answers), "errors": [error_row]})
+            row = summarize_error(found.at_work, error)
+            print_json({**found.to_json(), "errors": [row]})
 
-    with limited_memory(memory, lambda: at_work[0], conclude):
-        gathered, errors, lossy = _gather(logs, options, at_work, opened, quiet=quiet or json)
-        for vehicle, recordings in gathered.values():
-            at_work[0] = recordings[0].path
-            keeps = is_plain and len(recordings) == 1
-            try:
-                agreed = _agree(known, vehicle, recordings, vehicle_of)
-                search = partial(_judge, recordings, agreed, options, known, budget_s, quiet=quiet or json)
-                asked = [opened[recording.name] for recording in recordings]
-                answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet or json))
-            except SlipError as error:
-                print_error(error)
-                errors.append(summarize_error(recordings[0].path, error))
+    with limited_memory(memory, lambda: found.at_work, conclude):
+        diagnose_logs(found, logs, build_options(choices), known, vehicle_of, budget_s, quiet=quiet or json)
     if apply is not None:
-        errors += _apply(answers, apply, quiet=quiet or json)
+        found.errors += _apply(found.answers, apply, quiet=quiet or json)
     if json:
         omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({"runs": _to_json(answers), "errors": errors, **omitted})
+        print_json({**found.to_json(), **omitted})
     elif not quiet:
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
         said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
-        for answer in answers:
-            runs = [run.run for run in answer.runs]
-            # A folder is shorter than what it holds.
-            names = " ".join(
-                map(shlex.quote, given if len(given) < len(runs) and len(answers) == 1 else runs)
-            )
-            following = _suggest_next(answer.runs, f"slip diagnose {names}{said} --apply model.toml", apply)
-            print_lines(describe(answer.runs, following, everything=everything).splitlines())
-    return _end(answers, errors, lossy=lossy, quiet=quiet)
+        print_lines(found.list_lines(logs, said, apply, everything=everything))
+    return found.end(quiet=quiet)
+
+
+@dataclass
+class Diagnosed:
+    """Diagnoses of logs as they come.
+
+    Attributes:
+        answers: one for runs that were judged together.
+        errors: errors as JSON objects; each affects only one log.
+        lossy: logs with losses.
+        at_work: name of the current log.
+    """
+
+    answers: list[_Answer] = field(default_factory=list)
+    errors: list[dict[str, str]] = field(default_factory=list)
+    lossy: list[str] = field(default_factory=list)
+    at_work: str = ""
+
+    @property
+    def runs(self) -> list[RunDiagnosis]:
+        """The diagnosis of every run."""
+        return [run for answer in self.answers for run in answer.runs]
+
+    def to_json(self) -> dict[str, object]:
+        """The object of `slip diagnose --json`."""
+        from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
+
+        chosen = {one.manifest.run: one.choices for answer in self.answers for one in answer.opened}
+        runs = [{**diagnosis_as_json(run), **chosen[run.run]} for run in self.runs]
+        return {"runs": runs, "errors": self.errors}
+
+    def list_lines(
+        self, given: Sequence[str], said: str, applied: Path | None = None, *, everything: bool = False
+    ) -> list[str]:
+        """Lines for a screen, each answer with the next command, which repeats the flags that were said."""
+        from pipeline.words import describe  # noqa: PLC0415 - heavy
+
+        lines = []
+        for answer in self.answers:
+            names = [run.run for run in answer.runs]
+            if len(given) < len(names) and len(self.answers) == 1:
+                names = list(given)  # a folder is shorter than what it holds
+            applying = f"slip diagnose {' '.join(map(shlex.quote, names))}{said} --apply model.toml"
+            following = _suggest_next(answer.runs, applying, applied)
+            lines += describe(answer.runs, following, everything=everything).splitlines()
+        return lines
+
+    def end(self, *, quiet: bool) -> int:
+        """Return the exit code, and print a note if nothing else explains why it is not 0."""
+        from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
+
+        if self.lossy and not quiet:
+            listed = f"(slip inspect {self.lossy[0]} lists them)"
+            print_note(f"logs with losses: {', '.join(self.lossy)} {listed}")
+        is_excluded = any(find_refusal(run.findings) for run in self.runs)
+        return exit_code(self.errors, lossy=bool(self.lossy) or is_excluded)
+
+
+def diagnose_logs(
+    found: Diagnosed,
+    logs: Sequence[str],
+    options: Options,
+    known: ModelFile | None = None,
+    owner: Owner | None = None,
+    budget_s: float | None = None,
+    *,
+    quiet: bool,
+) -> None:
+    """Diagnose logs, folders of logs or stored runs, those of one vehicle jointly.
+
+    Args:
+        found: receives the answers, and what could not be answered.
+        logs: logs, folders of logs, or names of runs.
+        options: of the analyses.
+        known: model that is known; only effects beyond it are estimated.
+        owner: whose geometry is used where vehicles differ.
+        budget_s: CPU time of a search [s]; None for the usual one.
+        quiet: print no progress.
+    """
+    from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
+
+    found.at_work = logs[0]
+    opened: dict[str, _Opened] = {}
+    # A diagnosis with default options is unique, and is stored for later requests.
+    is_plain = known is None and budget_s is None and options.inputs == INPUTS
+    named = [name for log in logs for name in list_named(log)]
+    for vehicle, recordings in _gather(named, options, found, opened, quiet=quiet).values():
+        found.at_work = recordings[0].path
+        try:
+            agreed = _agree(known, vehicle, recordings, owner)
+            search = partial(_judge, recordings, agreed, options, known, budget_s, quiet=quiet)
+            asked = [opened[recording.name] for recording in recordings]
+            keeps = is_plain and len(recordings) == 1
+            found.answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet))
+        except SlipError as error:
+            print_error(error)
+            found.errors.append(summarize_error(recordings[0].path, error))
 
 
 def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | None) -> str:
@@ -147,36 +218,26 @@ def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:
 
 
 def _gather(
-    logs: list[str],
-    options: Options,
-    at_work: list[str],
-    opened: dict[str, _Opened],
-    *,
-    quiet: bool,
-) -> tuple[dict[str, tuple[Vehicle, list[Recording]]], list[dict[str, str]], list[str]]:
-    """Recordings by vehicle, errors, and logs with losses; an error affects only one log.
-
-    ``at_work`` receives the name of the current log, ``opened`` the data read of each run.
-    """
+    logs: Sequence[str], options: Options, found: Diagnosed, opened: dict[str, _Opened], *, quiet: bool
+) -> dict[str, tuple[Vehicle, list[Recording]]]:
+    """Recordings by vehicle; ``opened`` receives the data read of each run."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
     from pipeline.store import read_choices  # noqa: PLC0415 - heavy
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
-    errors: list[dict[str, str]] = []
-    lossy = list[str]()
     for log in logs:
-        at_work[0] = log
+        found.at_work = log
         try:
             with open_shown(log, options, quiet=quiet) as run:
                 vehicle, recording = read_recording(run.manifest)
                 opened[recording.name] = _Opened(run.manifest, read_choices(run.manifest))
         except SlipError as error:
             print_error(error)
-            errors.append(summarize_error(log, error))
+            found.errors.append(summarize_error(log, error))
             continue
-        lossy += [log] if run.lossy else []
+        found.lossy += [log] if run.lossy else []
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
-    return gathered, errors, lossy
+    return gathered
 
 
 @dataclass(frozen=True)
@@ -229,19 +290,6 @@ def _keep(results: Path, manifest: Manifest, diagnosis: Diagnosis, *, quiet: boo
             print_note(f"slip: the diagnosis was not saved: {error}")
 
 
-def _to_json(answers: list[_Answer]) -> list[dict[str, object]]:
-    from pipeline.words import diagnosis_as_json  # noqa: PLC0415 - heavy
-
-    return [
-        {
-            **diagnosis_as_json(run),
-            **next(one.choices for one in answer.opened if one.manifest.run == run.run),
-        }
-        for answer in answers
-        for run in answer.runs
-    ]
-
-
 def _agree(
     known: ModelFile | None, vehicle: Vehicle, recordings: list[Recording], owner: Owner | None
 ) -> Vehicle:
@@ -274,16 +322,6 @@ def _judge(
             budget_s=budget_s,
             notify=progress,
         )
-
-
-def _end(answers: Sequence[_Answer], errors: Sequence[object], *, lossy: Sequence[str], quiet: bool) -> int:
-    """Return the exit code, and print a note if nothing else explains why it is not 0."""
-    from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
-
-    if lossy and not quiet:
-        print_note(f"logs with losses: {', '.join(lossy)} (slip inspect {lossy[0]} lists them)")
-    is_excluded = any(find_refusal(run.findings) for answer in answers for run in answer.runs)
-    return exit_code(errors, lossy=bool(lossy) or is_excluded)
 
 
 def _apply(answers: Sequence[_Answer], path: Path, *, quiet: bool) -> list[dict[str, str]]:

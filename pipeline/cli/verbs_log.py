@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json as json_format
 import shlex
 import signal
@@ -11,7 +10,7 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
@@ -499,40 +498,29 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
         replace_file(page, text.encode())
 
 
-def _find_alarms(answer: dict[str, object]) -> list[dict[str, object]]:
-    """Alarms of a finished diagnosis, the object of `slip diagnose --json`."""
-    from pipeline.live.running_log import list_alarms  # noqa: PLC0415
-    from pipeline.results import RunDiagnosis, read_result  # noqa: PLC0415 - heavy
-
-    runs = cast("list[Content]", answer.get("runs") or [])
-    return [alarm for run in runs for alarm in list_alarms(read_result(run, RunDiagnosis).effects)]
-
-
 def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool, stopped: bool) -> int:
-    """Diagnose the whole log with the command `slip diagnose`."""
+    """Diagnose the whole log, as `slip diagnose` does."""
     from pipeline.cli.screen import list_statements  # noqa: PLC0415 - heavy
-    from pipeline.cli.verbs_effects import diagnose  # noqa: PLC0415 - heavy
+    from pipeline.cli.verbs_effects import Diagnosed, diagnose_logs  # noqa: PLC0415 - heavy
+    from pipeline.live.running_log import list_alarms  # noqa: PLC0415 - heavy
     from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
-    def ask(*, json: bool) -> tuple[int, str]:
-        with contextlib.redirect_stdout(io.StringIO()) as taken:
-            code = diagnose([str(watched.path)], choices=choices, json=json, quiet=json and not asked_json)
-        return code, taken.getvalue()
-
-    asked_json = json
-    code, text = ask(json=json)
-    answer = cast("dict[str, object]", json_format.loads(text if json else ask(json=True)[1]))
-    alarms = _find_alarms(answer)
+    found, logs = Diagnosed(), [str(watched.path)]
+    with limited_memory(None, lambda: logs[0], lambda _: None):
+        diagnose_logs(found, logs, build_options(choices), quiet=json)
+    alarms = [alarm for run in found.runs for alarm in list_alarms(run.effects)]
+    lines = found.list_lines(logs, spell_choices(choices))
+    lines += [f"alarm     {alarm['text']}" for alarm in alarms]
+    rows = [("", line) for line in lines]
     if json:
-        answer = {"alarms": alarms, **answer}
-        sys.stdout.write(json_format.dumps({"kind": "final", "stopped": stopped, **answer}) + "\n")
+        answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **found.to_json()}
+        sys.stdout.write(json_format.dumps(answer) + "\n")
+        rows = list_statements(watched.to_json())
     else:
-        text += "".join(f"alarm     {alarm['text']}\n" for alarm in alarms)
-        sys.stdout.write(text)
+        print_lines(lines)
     if page is not None:
-        _write_page(page, text.splitlines(), is_live=False)
-    rows = list_statements(watched.to_json()) if json else [("", line) for line in text.splitlines()]
+        _write_page(page, lines, is_live=False)
     write_statement(choices.results, watched.path, rows, ended=True)
     if not stopped:
         watched.forget()
-    return code
+    return found.end(quiet=False)
