@@ -274,7 +274,7 @@ _METRES = re.compile(r"(\d+(?:\.\d+)?)\s*(mm|cm|m)")
 
 
 def read_metres(text: str) -> float:
-    """Metres of `10cm`, `0.1m` or `100mm`: a length needs its unit.
+    """Metres of `10cm`, `0.1m` or `100mm`: a length needs its unit; `limit_speeds` refuses one of zero.
 
     Raises:
         MotionError: ``bad_tolerance``.
@@ -283,8 +283,8 @@ def read_metres(text: str) -> float:
     from pipeline.sources import LENGTH_UNITS  # noqa: PLC0415
 
     match = _METRES.fullmatch(text.strip())
-    if match is None or not float(match[1]) > 0.0:
-        what = f"{text!r} is not a length above zero"
+    if match is None:
+        what = f"{text!r} is not a length"
         raise MotionError("bad_tolerance", what, where="--within", hint="Write 10cm or 0.1m.")
     return float(match[1]) * LENGTH_UNITS[match[2]]
 

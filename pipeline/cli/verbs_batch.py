@@ -34,7 +34,7 @@ from pipeline.cli.conventions import (
     print_lines,
     summarize_error,
 )
-from pipeline.core import SlipError, measure_memory, slip_command
+from pipeline.core import SlipError, align_rows, measure_memory, slip_command
 
 if TYPE_CHECKING:
     from pipeline.batch.notices import Looked, Notice
@@ -205,8 +205,7 @@ class _After:
     @property
     def lines(self) -> list[str]:
         pairs = [pair for one in self.looked for pair in one.lines]
-        width = max((len(label) for label, _ in pairs), default=0)
-        return [*([""] * bool(pairs)), *(f"{label:<{width}}  {text}" for label, text in pairs)]
+        return [*([""] * bool(pairs)), *align_rows(pairs)]
 
 
 def _look_after(

@@ -10,7 +10,15 @@ from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.cli.conventions import Results, format_value, open_results, print_result
-from pipeline.core import INPUT_WORDS, PACKAGE, FigureFormat, SlipError, format_part, split_interval
+from pipeline.core import (
+    INPUT_WORDS,
+    PACKAGE,
+    FigureFormat,
+    SlipError,
+    align_rows,
+    format_part,
+    split_interval,
+)
 
 if TYPE_CHECKING:
     import polars as pl
@@ -168,17 +176,9 @@ def _format_datasets(answer: Answer, name: str) -> list[str]:
         )
         for row in shown.iter_rows(named=True)
     ]
-    columns = range(len(table[0]) if levels else 4)
-    widths = [max(len(row[k]) for row in table) for k in columns]
-    lines = [f"{answer.measure} [m/s], {INPUT_WORDS[name]}"]
-    for row in table:
-        aligned = (f"{row[k]:>{widths[k]}}" if k in _NUMBERS else f"{row[k]:<{widths[k]}}" for k in columns)
-        lines.append("   ".join(aligned).rstrip())
-    return lines
-
-
-_NUMBERS = (1, 2, 4)
-"""Columns of the datasets' table that are aligned at their right ends."""
+    shown_columns = [row if levels else row[:4] for row in table]
+    head = f"{answer.measure} [m/s], {INPUT_WORDS[name]}"
+    return [head, *align_rows(shown_columns, right=(1, 2, 4), gap=3)]
 
 
 def _format_ends(row: Mapping[str, object]) -> str:
@@ -207,8 +207,7 @@ def _format_pairs(answer: Answer, name: str) -> list[str]:
     head = ("times as much slip", "as driven", "equal driving", "in common", "carried by, as driven")
     shown = [head, *rows[:_MOST_PAIRS]]
     columns = [k for k in range(len(head)) if any(row[k] for row in shown[1:])]
-    widths = {k: max(len(row[k]) for row in shown) + 2 for k in columns}
-    lines = ["", *("".join(f"{row[k]:<{widths[k]}}" for k in columns).rstrip() for row in shown)]
+    lines = ["", *align_rows([[row[k] for k in columns] for row in shown])]
     omitted = len(rows) - _MOST_PAIRS
     marked = any("*" in text for row in rows[:_MOST_PAIRS] for text in row)
     lines += ["* significant over all pairs of the vehicle"] if marked else []

@@ -25,7 +25,7 @@ from pipeline.cli.conventions import (
     show_progress,
     spell_choices,
 )
-from pipeline.core import SlipError, finite_or_none
+from pipeline.core import SlipError, align_rows, finite_or_none
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -432,8 +432,8 @@ def _parse_effect(text: str) -> tuple[str, dict[str, float] | float]:
 
 
 def _format_case(lists: dict[str, dict[str, str]]) -> list[str]:
-    lines = []
-    for title, rows in lists.items():
-        width = max(len(name) for name in rows)
-        lines += [title, *(f"  {name:<{width}}  {text}" for name, text in rows.items())]
-    return lines
+    return [
+        line
+        for title, rows in lists.items()
+        for line in (title, *(f"  {row}" for row in align_rows(list(rows.items()))))
+    ]

@@ -39,6 +39,7 @@ from pipeline.cli.model_runs import trust_named
 from pipeline.core import (
     FigureFormat,
     SlipError,
+    align_rows,
     format_duration,
     format_share,
     format_size,
@@ -282,14 +283,7 @@ def _format_ratings(ratings: Sequence[PoseRating]) -> list[str]:
         frames = f"{rating.parent or '?'} -> {rating.child or '?'}"
         numbers = (f"{rating.rate_hz:.3g}", format_share(rating.coverage, 0), share)
         rows.append((str(rating.source), frames, *numbers, rating.refusal or rating.reason))
-    widths = [max(len(row[column]) for row in rows) for column in range(5)]
-    return [
-        "",
-        *(
-            "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[5]])
-            for row in rows
-        ),
-    ]
+    return ["", *align_rows(rows)]
 
 
 def _format_evidence(recording: Recording | None) -> list[str]:
@@ -304,17 +298,9 @@ def _format_evidence(recording: Recording | None) -> list[str]:
             continue
         gains = (f"{one.ahead:.4g}" if one.ahead else "-", f"{one.turned:.4g}" if one.turned else "-")
         rows.append((*used, f"{one.margin:.1f}", *gains, f"{one.late_s:.2f} s", one.reason))
-    widths = [max(len(row[column]) for row in rows) for column in range(6)]
     follows = "          z: how certain it is that the motion follows the signal, above 3 it is clear"
     about = f"{follows}; x: motion over signal"
-    return [
-        "",
-        *(
-            "  ".join([*(f"{cell:<{w}}" for cell, w in zip(row, widths, strict=False)), row[6]]).rstrip()
-            for row in rows
-        ),
-        about,
-    ]
+    return ["", *align_rows(rows), about]
 
 
 def _format_topics(topics: Sequence[TopicHealth]) -> list[str]:

@@ -98,6 +98,7 @@ if TYPE_CHECKING:
         TREND_THRESHOLD,
         FigureFormat,
         SlipError,
+        align_rows,
         count_places,
         enumerate_texts,
         format_angle,

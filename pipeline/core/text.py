@@ -1,7 +1,7 @@
 """Texts: errors, numbers with their digits, lengths, durations, and shares in words."""
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from typing import Literal, get_args
 
@@ -84,6 +84,17 @@ def naming_os_errors(
         yield
     except OSError as error:
         raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
+
+
+def align_rows(rows: Sequence[Sequence[str]], *, right: Collection[int] = (), gap: int = 2) -> list[str]:
+    """Rows of texts as lines with aligned columns; those in ``right`` at their right ends."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return [
+        (" " * gap)
+        .join(f"{text:{'>' if k in right else '<'}{widths[k]}}" for k, text in enumerate(row))
+        .rstrip()
+        for row in rows
+    ]
 
 
 _MINUTE, _HOUR = 60.0, 3600.0  # seconds

@@ -106,7 +106,6 @@ if TYPE_CHECKING:
         format_change,
         format_power,
         format_quiet,
-        format_step,
         name_quantity,
         summarize_trend,
     )

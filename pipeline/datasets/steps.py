@@ -27,17 +27,19 @@ _CHUNK = 2_000
 
 
 @dataclass(frozen=True)
-class Change:
-    """Step in a series.
+class Shift:
+    """Change of level.
 
     Attributes:
         index: first value of the new level.
-        before: mean from the step before (or the start) to this one.
-        after: mean from here to the next step (or the end).
-        p: probability of a largest step as large for the same values in random order.
+        earliest, latest: bounds of that index: 95 % of a parameter, one value on either side of a series.
+        before, after: level before and after; of a parameter on average over the groups of all values.
+        p: probability of a step as large anywhere without a change.
     """
 
     index: int
+    earliest: int
+    latest: int
     before: float
     after: float
     p: float
@@ -45,7 +47,7 @@ class Change:
 
 def find_changes(
     values: ArrayLike, *, level: float = LEVEL, fewest: int = FEWEST_OF_SPREAD, seed: int = 0
-) -> tuple[Change, ...]:
+) -> tuple[Shift, ...]:
     """Split a series at its significant steps of the mean.
 
     The best split is the one with the largest weighted difference of means. Its p comes from the largest
@@ -70,8 +72,11 @@ def find_changes(
     changes = sorted(_split(series, 0, series.size, level, fewest, np.random.default_rng(seed)))
     edges = [0, *(index for index, _ in changes), series.size]
     means = [float(series[start:end].mean()) for start, end in itertools.pairwise(edges) if changes]
-    indexed = enumerate(changes)
-    return tuple(Change(index=index, before=means[i], after=means[i + 1], p=p) for i, (index, p) in indexed)
+    last = series.size - 1
+    return tuple(
+        Shift(index, max(index - 1, 1), min(index + 1, last), means[i], means[i + 1], p)
+        for i, (index, p) in enumerate(changes)
+    )
 
 
 def _split(
@@ -129,25 +134,6 @@ _RANK_TOLERANCE = 1e-6
 
 # Grid of spreads between runs, relative to the scatter of all values.
 _SPREADS = np.geomspace(1e-2, 3.0, 32)
-
-
-@dataclass(frozen=True)
-class Shift:
-    """Change of level.
-
-    Attributes:
-        index: first value of the new level.
-        earliest, latest: 95 % bounds of that index.
-        before, after: level on average over the groups of all values.
-        p: probability of a step as large anywhere without a change.
-    """
-
-    index: int
-    earliest: int
-    latest: int
-    before: float
-    after: float
-    p: float
 
 
 @dataclass(frozen=True)

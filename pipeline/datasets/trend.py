@@ -2,8 +2,9 @@
 
 import math
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import compress
 
 import polars as pl
 
@@ -12,7 +13,7 @@ from pipeline.datasets.compared_runs import ComparedRuns, find_material
 from pipeline.datasets.forecast import leave_out_odd, list_numbers
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError, gather_runs
 from pipeline.datasets.rank_tests import LEVEL
-from pipeline.datasets.steps import FEWEST_FREE, find_changes, find_shifts, guess_shift
+from pipeline.datasets.steps import FEWEST_FREE, Shift, find_changes, find_shifts, guess_shift
 from pipeline.models import UNDETERMINED, Level, cut_interval, find_effect, list_effects
 from pipeline.store import Store, lack_runs
 
@@ -95,10 +96,44 @@ class ParameterTrend:
         return f"{self.effect}.{self.parameter}"
 
     @property
+    def title(self) -> str:
+        """The parameter and its vehicle, in a sentence."""
+        return f"{self.label} of {self.vehicle}"
+
+    @property
     def shown_latest(self) -> str:
         """The estimate of the last run as text, marked if that run does not determine it."""
         mark = f" ({UNDETERMINED})" if self.last in self.undetermined else ""
         return f"{self.latest:.3g}{suffix_unit(self.unit)}{mark}"
+
+
+@dataclass(frozen=True)
+class Series:
+    """One quantity of one group over time.
+
+    Attributes:
+        group: name of the group.
+        quantity: for example `median_modulus (command)`.
+        unit: unit of the values.
+        points: ``order``, ``day``, ``run``, ``value``, in the order of time.
+        changes: changes of level, in the order of time.
+    """
+
+    group: str
+    quantity: str
+    unit: str
+    points: pl.DataFrame
+    changes: tuple[LevelChange, ...]
+
+    @property
+    def title(self) -> str:
+        """The quantity and its group, in a sentence."""
+        return f"{name_quantity(self.quantity)} of {self.group}"
+
+    @property
+    def latest(self) -> float:
+        """The last run's value."""
+        return float(self.points["value"][-1])
 
 
 def find_latest(estimates: pl.DataFrame, dated: pl.DataFrame) -> pl.DataFrame:
@@ -183,25 +218,8 @@ def _follow(
         pl.Series("limit_low", search.level - search.half).fill_nan(None).clip(*number.bounds),
         pl.Series("limit_high", search.level + search.half).fill_nan(None).clip(*number.bounds),
     )  # fmt: skip
-    edges = [0, *(shift.index for shift in search.shifts), used.height]
-    orders = used["order"].to_list()
-    changes = tuple(
-        LevelChange(
-            since=str(used["day"][shift.index]),
-            run=str(used["run"][shift.index]),
-            # The change itself lies after the previous run.
-            earliest=orders[shift.earliest - 1] + 1,
-            latest=orders[shift.latest],
-            before=shift.before,
-            after=shift.after,
-            runs_before=edges[i + 1] - edges[i],
-            runs_after=edges[i + 2] - edges[i + 1],
-            p=shift.p,
-            likely=_find_likely(
-                effect, terrains[edges[i] : edges[i + 1]], terrains[edges[i + 1] : edges[i + 2]]
-            ),
-        )
-        for i, shift in enumerate(search.shifts)
+    changes = _list_changes(
+        used, search.shifts, lambda before, after: _find_likely(effect, terrains[before], terrains[after])
     )
     missing = FEWEST_FREE - search.freedom
     need = f"{missing} more run{'s' * (missing > 1)} on a terrain driven before" if missing > 0 else ""
@@ -209,6 +227,35 @@ def _follow(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
         undetermined, int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, *last,
     )  # fmt: skip
+
+
+def _list_changes(
+    points: pl.DataFrame,
+    shifts: Sequence[Shift],
+    find_likely: Callable[[slice, slice], str] = lambda _before, _after: "",
+) -> tuple[LevelChange, ...]:
+    """Changes of level with their days and runs; the likely cause is found from the rows before and after."""
+    edges = [0, *(shift.index for shift in shifts), points.height]
+    orders = points["order"].to_list()
+    changes = []
+    for i, shift in enumerate(shifts):
+        before, after = slice(edges[i], edges[i + 1]), slice(edges[i + 1], edges[i + 2])
+        changes.append(
+            LevelChange(
+                since=str(points["day"][shift.index]),
+                run=str(points["run"][shift.index]),
+                # The change itself lies after the previous run.
+                earliest=orders[shift.earliest - 1] + 1,
+                latest=orders[shift.latest],
+                before=shift.before,
+                after=shift.after,
+                runs_before=before.stop - before.start,
+                runs_after=after.stop - after.start,
+                p=shift.p,
+                likely=find_likely(before, after),
+            )
+        )
+    return tuple(changes)
 
 
 def _leave_out_odd(rows: pl.DataFrame) -> tuple[pl.DataFrame, tuple[str, ...]]:
@@ -230,20 +277,19 @@ def _find_likely(effect: str, before: list[str], after: list[str]) -> str:
     return ", or ".join(causes)
 
 
-def format_change(trend: ParameterTrend, change: LevelChange) -> str:
+def format_change(followed: ParameterTrend | Series, change: LevelChange) -> str:
     """Describe a change in a sentence: what, since when, significance and likely cause."""
     sure = f"p = {change.p:.2g}" if change.p > 1e-3 else "p < 0.001"  # noqa: PLR2004 - limit of the draws
     likely = f": likely {change.likely}" if change.likely else ""
     return (
-        f"{shorten_change(trend, change)} since {change.since} ({change.runs_before} "
+        f"{shorten_change(followed, change)} since {change.since} ({change.runs_before} "
         f"run{'s' * (change.runs_before != 1)} before, {change.runs_after} since, {sure}){likely}"
     )
 
 
-def shorten_change(trend: ParameterTrend, change: LevelChange) -> str:
+def shorten_change(followed: ParameterTrend | Series, change: LevelChange) -> str:
     """Format the levels before and after."""
-    unit = suffix_unit(trend.unit)
-    return f"{trend.label} of {trend.vehicle} {change.before:.3g} -> {change.after:.3g}{unit}"
+    return f"{followed.title} {change.before:.3g} -> {change.after:.3g}{suffix_unit(followed.unit)}"
 
 
 def format_power(trend: ParameterTrend) -> str:
@@ -284,30 +330,6 @@ _SLIP_FIRST = ("median_modulus (command)", "median_modulus (measured)")
 
 
 @dataclass(frozen=True)
-class Series:
-    """One quantity of one group over time.
-
-    Attributes:
-        group: name of the group.
-        quantity: for example `median_modulus (command)`.
-        unit: unit of the values.
-        points: ``order``, ``day``, ``run``, ``value``, in the order of time.
-        steps: changes of level, in the order of time.
-    """
-
-    group: str
-    quantity: str
-    unit: str
-    points: pl.DataFrame
-    steps: tuple[LevelChange, ...]
-
-    @property
-    def latest(self) -> float:
-        """The last run's value."""
-        return float(self.points["value"][-1])
-
-
-@dataclass(frozen=True)
 class Alert:
     """Change, since a date, or a last value that needs attention."""
 
@@ -340,22 +362,10 @@ def follow_quantities(values: pl.DataFrame) -> list[Series]:
     for (group, quantity), rows in parts.items():
         points = rows.select("order", "day", "run", "value")
         # Half of the false alarm probability is for the parameters of a vehicle, half for all other series.
-        steps = _find_steps(points, LEVEL / 2 / tests) if _can_step(rows) else ()
-        series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, steps))
+        shifts = find_changes(points["value"].to_numpy(), level=LEVEL / 2 / tests) if _can_step(rows) else ()
+        changes = _list_changes(points, shifts)
+        series.append(Series(str(group), str(quantity), str(rows["unit"][0]), points, changes))
     return sorted(series, key=lambda one: (one.group, one.quantity))
-
-
-@dataclass(frozen=True)
-class _Event:
-    """Change that may be reported: alone, or with the one that causes it."""
-
-    group: str
-    quantity: str
-    text: str
-    short: str
-    earliest: int
-    latest: int
-    since: str
 
 
 def raise_alerts(
@@ -382,25 +392,31 @@ def raise_alerts(
     """
     moved = [(one, one.changes[-1]) for one in parameters if one.changes]
     moved = [(one, last) for one, last in moved if abs(last.after - last.before) >= one.relevant]
-    events = [
-        _Event(one.vehicle, one.label, format_change(one, last), shorten_change(one, last), last.earliest,
-               last.latest, last.since)
-        for one, last in sorted(moved, key=lambda pair: (pair[1].p, -pair[0].named))
-    ]  # fmt: skip
-    stepped = [(one, one.steps[-1]) for one in series if one.steps and one.steps[-1].size >= threshold]
-    events += [
-        _Event(vehicles.get(one.group, one.group), one.quantity, format_step(one, step),
-               shorten_step(one, step), step.earliest, step.latest, step.since)
-        for one, step in sorted(stepped, key=lambda pair: pair[0].quantity not in _SLIP_FIRST)
-    ]  # fmt: skip
+    stepped = [(one, one.changes[-1]) for one in series if one.changes]
+    stepped = [(one, last) for one, last in stepped if last.size >= threshold]
+    # Vehicle or group, quantity, and the change of what was followed; the first is the cause of the others.
+    events: list[tuple[str, str, ParameterTrend | Series, LevelChange]] = [
+        *(
+            (one.vehicle, one.label, one, last)
+            for one, last in sorted(moved, key=lambda pair: (pair[1].p, -pair[0].named))
+        ),
+        *(
+            (vehicles.get(one.group, one.group), one.quantity, one, last)
+            for one, last in sorted(stepped, key=lambda pair: pair[0].quantity not in _SLIP_FIRST)
+        ),
+    ]
     alerts = []
     while events:
-        head = events.pop(0)
-        same = [one for one in events if one.group == head.group and _overlap(one, head)]
-        events = [one for one in events if one not in same]
-        others = "; ".join(one.short for one in same)
-        text = head.text + (f"; with it: {others}" if others else "")
-        alerts.append(Alert(head.group, head.quantity, text, head.since))
+        group, quantity, head, change = events.pop(0)
+        may_be_one = [
+            owner == group and one.earliest <= change.latest and change.earliest <= one.latest
+            for owner, _, _, one in events
+        ]
+        same = list(compress(events, may_be_one))
+        others = "; ".join(shorten_change(followed, one) for _, _, followed, one in same)
+        text = format_change(head, change) + (f"; with it: {others}" if others else "")
+        alerts.append(Alert(group, quantity, text, change.since))
+        events = [event for event, joined in zip(events, may_be_one, strict=True) if not joined]
     lasts = [
         (one.group, one.quantity, name_quantity(one.quantity), one.unit, one.latest, one.points["run"][-1])
         for one in series
@@ -420,10 +436,6 @@ def raise_alerts(
     return alerts
 
 
-def _overlap(one: _Event, other: _Event) -> bool:
-    return one.earliest <= other.latest and other.earliest <= one.latest
-
-
 def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend]) -> str:
     """Text if there is no alert: no significant change, or no test possible."""
     most = max((one.points.height for one in series), default=0)
@@ -436,43 +448,8 @@ def format_quiet(series: Sequence[Series], parameters: Sequence[ParameterTrend])
     )
 
 
-def shorten_step(series: Series, step: LevelChange) -> str:
-    """Format the levels before and after."""
-    unit = suffix_unit(series.unit)
-    name = name_quantity(series.quantity)
-    return f"{name} of {series.group} {step.before:.3g} -> {step.after:.3g}{unit}"
-
-
-def format_step(series: Series, step: LevelChange) -> str:
-    """Describe a step in a sentence: quantity, levels, date, significance."""
-    return (
-        f"{shorten_step(series, step)} since {step.since} ({step.runs_before} runs before, {step.runs_after} "
-        f"since, p = {step.p:.2g})"
-    )
-
-
 def _can_step(rows: pl.DataFrame) -> bool:
     return rows.height >= FEWEST_RUNS and rows["value"].n_unique() > 1
-
-
-def _find_steps(points: pl.DataFrame, level: float) -> tuple[LevelChange, ...]:
-    changes = find_changes(points["value"].to_numpy(), level=level)
-    edges = [0, *(change.index for change in changes), points.height]
-    orders = points["order"].to_list()
-    return tuple(
-        LevelChange(
-            since=points["day"][change.index],
-            run=points["run"][change.index],
-            earliest=orders[max(change.index - 2, 0)] + 1,
-            latest=orders[min(change.index + 1, len(orders) - 1)],
-            before=change.before,
-            after=change.after,
-            runs_before=edges[i + 1] - edges[i],
-            runs_after=edges[i + 2] - edges[i + 1],
-            p=change.p,
-        )
-        for i, change in enumerate(changes)
-    )
 
 
 @dataclass(frozen=True)
@@ -617,7 +594,7 @@ def summarize_trend(trend: Trend) -> dict[str, object]:
             {
                 **pick(one, "group", "quantity", "unit"),
                 "points": one.points.drop("order").to_dicts(),
-                "changes": [step.describe(format_step(one, step)) for step in one.steps],
+                "changes": [change.describe(format_change(one, change)) for change in one.changes],
             }
             for one in trend.series
         ],

@@ -22,7 +22,6 @@ from pipeline.datasets import (
     format_change,
     format_power,
     format_quiet,
-    format_step,
     name_quantity,
     summarize_trend,
 )
@@ -180,12 +179,12 @@ def _along(points: pl.DataFrame) -> Channel:
 
 def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
     own = [one for one in series if one.points.height >= _FEWEST_POINTS]
-    own.sort(key=lambda one: (not one.steps, one.quantity.startswith(_LATER), one.quantity))
+    own.sort(key=lambda one: (not one.changes, one.quantity.startswith(_LATER), one.quantity))
     return [_picture(one, f"trend_{number}_{index}") for index, one in enumerate(own)]
 
 
 def _picture(series: Series, name: str) -> Picture:
-    steps = "; ".join(format_step(series, step) for step in series.steps)
+    steps = "; ".join(format_change(series, change) for change in series.changes)
     words = f"{series.points.height} runs, last {series.latest:.3g}. {begin_large(steps) or 'No step'}."
     title = begin_large(name_quantity(series.quantity)) + bracket_unit(series.unit)
     return Picture(name, title, _draw_series(series, name, words), "half")
@@ -211,13 +210,13 @@ def _draw_series(series: Series, name: str, words: str) -> Drawing:
     )
     chart = layer(lines, dots).properties(width=640, height=120, usermeta={"gutter": 60})
     rows = {f"{name}_points": points, f"{name}_levels": levels}
-    note = "; ".join(begin_large(format_step(series, step)) for step in series.steps)
+    note = "; ".join(begin_large(format_change(series, change)) for change in series.changes)
     return Drawing(chart, rows, note, words)
 
 
 def _tabulate_levels(series: Series) -> pl.DataFrame:
     runs = series.points["run"].to_list()
-    edges = [0, *(runs.index(step.run) for step in series.steps), len(runs)]
+    edges = [0, *(runs.index(change.run) for change in series.changes), len(runs)]
     return pl.DataFrame(
         {
             "start": [edge - 0.5 for edge in edges[:-1]],
