@@ -129,7 +129,9 @@ def _write(chrome: Chrome) -> None:
         chrome.run(f"document.querySelector('.formula [name={name}]').value = '{value}'")
     chrome.click(".formula [type=submit]")
     written = "document.querySelector('.card[data-effect=my_skid]')"
-    chrome.wait(f"({written} || !document.getElementById('toast').hidden) && {_SETTLED}")
+    # A notice goes by itself, and effects may still be tried then.
+    chrome.wait(f"{written} || !document.getElementById('toast').hidden")
+    chrome.wait(_SETTLED)
 
 
 def _set_beside(chrome: Chrome) -> None:
