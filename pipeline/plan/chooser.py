@@ -174,9 +174,10 @@ def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -
     if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
         seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
         return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    at_best = f"expected {one.format_reached(best)}"
-    because = _advise(one.question, longest_s)
-    return replace(question, because=because, reached=at_best, needs_limits=True)
+    because, needs_slope = _advise(one.question, longest_s)
+    # What a drive on level ground reaches of a slope says nothing.
+    at_best = "" if needs_slope else f"expected {one.format_reached(best)}"
+    return replace(question, because=because, reached=at_best, needs_limits=not needs_slope)
 
 
 def _continue(
@@ -214,10 +215,10 @@ _MOST_TIMES = 10
 _EVERYWHERE = Area(math.inf, math.inf)
 
 
-def _advise(question: Question, longest_s: float) -> str:
-    """Why no drive answers a question, and what shows it."""
+def _advise(question: Question, longest_s: float) -> tuple[str, bool]:
+    """Why no drive answers a question and what shows it, and whether that is a slope."""
     effects = [find_effect(name)() for name in question.effects]
     on_slope = any(Excitation.SLOPE in effect.needs for effect in effects)
     tried = f"no drive of up to {LEAD_S + longest_s + TAIL_S:.0f} s that was tried decides it"
     why = "no drive on level ground decides it" if on_slope else tried
-    return f"{why}; to observe it: {suggest_manoeuvre(*effects)}"
+    return f"{why}; to observe it: {suggest_manoeuvre(*effects)}", on_slope

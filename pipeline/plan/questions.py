@@ -7,6 +7,7 @@ parameter follows from its information (A-optimality). Both are sums over window
 end at rest add up.
 """
 
+import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -447,7 +448,16 @@ def list_reasons(questions: Sequence[Impossible]) -> list[str]:
     for one in questions:
         _, same = asked.setdefault(frozenset(one.because.split("; ")), (one.because, []))
         same.append(f"{one.question} ({one.reached})" if one.reached else one.question)
-    return [f"{'; '.join(same)}: {reason}" for reason, same in asked.values()]
+    return [f"{'; '.join(_join_presence(same))}: {reason}" for reason, same in asked.values()]
+
+
+def _join_presence(texts: Sequence[str]) -> list[str]:
+    """Questions with `whether a acts` and `whether b acts` as one: `whether a and b act`."""
+    named = [match[1] for text in texts if (match := re.fullmatch(r"whether (\S+) acts", text))]
+    if len(named) <= 1:
+        return list(texts)
+    rest = [text for text in texts if not re.fullmatch(r"whether \S+ acts", text)]
+    return [*rest, f"whether {enumerate_texts(named)} act"]
 
 
 def leave_open(one: Answerable, weight: Floats) -> Impossible:

@@ -210,11 +210,14 @@ def test_wheel_commands_on_two_topics_are_the_same_drive(plan: Plan, tmp_path: P
 def test_a_slope_cannot_be_promised_on_level_ground() -> None:
     vehicle = _find("husky_a200")
     knowledge, limits = assume(vehicle), choose_limits(vehicle)
-    questions = ask_presence(knowledge, ["slope_creep"], find_largest(knowledge, limits, 60.0))
+    questions = ask_presence(knowledge, ["slope_creep", "slope_slip"], find_largest(knowledge, limits, 60.0))
     plan = make_plan(knowledge, questions, Request(limits, parse_area("20x10m", vehicle), 60.0))
     assert not plan.manoeuvres
     assert not plan.promises
     assert "slope" in plan.impossible[0].because
+    # One sentence for both, without what level ground reaches of a slope.
+    (text,) = plan.list_impossible()
+    assert text.startswith("whether slope_creep and slope_slip act: no drive on level ground decides it")
 
 
 def _ask_for(effect: str, seconds: float, area: str, speed_mps: float = 1.0) -> Plan:
