@@ -118,11 +118,10 @@ def render_accuracy(data: Data) -> list[str]:
         *make_table(("test logs", "exactly the hidden effects named"), table),
         "",
         *fold(
-            f"Of {data['logs']} simulated logs {data['wrong']} have a wrong name; the 95 % intervals contain "
-            f"the true value in {held} of {whole} cases. Physics outside the catalogue has no name: of "
-            f"{odd['counted']} logs with such physics {flagged} are flagged as unexplained in the right "
-            f"channel, {alike} more get names of known effects that are like it, {missed} are not noticed, "
-            "or misnamed."
+            f"A wrong effect is named in {data['wrong']} of {data['logs']} simulated logs; the 95 % intervals "
+            f"contain the true value in {held} of {whole} cases. Physics outside the catalogue has no name: "
+            f"it is flagged as unexplained in the right channel in {flagged} of {odd['counted']} logs, called "
+            f"by names of known effects that are like it in {alike}, and not noticed or misnamed in {missed}."
         ),
     ]
 
