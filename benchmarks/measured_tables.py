@@ -118,10 +118,11 @@ def render_accuracy(data: Data) -> list[str]:
         *make_table(("test logs", "exactly the hidden effects named"), table),
         "",
         *fold(
-            f"A wrong effect is named in {data['wrong']} of {data['logs']} simulated logs; the 95 % intervals "
-            f"contain the true value in {held} of {whole} cases. Physics outside the catalogue has no name: "
-            f"it is flagged as unexplained in the right channel in {flagged} of {odd['counted']} logs, called "
-            f"by names of known effects that are like it in {alike}, and not noticed or misnamed in {missed}."
+            f"A wrong effect is named in {data['wrong']} of {data['logs']} simulated logs; the 95 % "
+            f"intervals contain the true value in {held} of {whole} cases. Physics outside the catalogue has "
+            f"no name: it is flagged as unexplained in the right channel in {flagged} of {odd['counted']} "
+            f"logs, called by names of known effects that are like it in {alike}, and not noticed or "
+            f"misnamed in {missed}."
         ),
     ]
 
