@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
@@ -95,26 +95,29 @@ def compare(  # noqa: D417 - arguments document themselves
 def _compare_causes(
     store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
 ) -> int:
-    from pipeline.datasets import find_causes, summarize_causes  # noqa: PLC0415 - heavy
+    from pipeline.datasets import (  # noqa: PLC0415 - heavy
+        find_causes,
+        format_difference,
+        name_causes,
+        summarize_causes,
+    )
     from pipeline.report.fleet_pages import write_causes  # noqa: PLC0415 - heavy
 
     causes = find_causes(store, question)
     written = write_causes(store, causes, figures)
-    content = summarize_causes(causes)
+    content, names = summarize_causes(causes), name_causes(causes.names)
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
-        parts = ", ".join(
-            f"{causes.names.get(one.name, one.name)} {format_part(one.share)}" for one in budget.parts
-        )
+        parts = ", ".join(f"{names.get(one.name, one.name)} {format_part(one.share)}" for one in budget.parts)
         runs = f"{budget.runs} run{'s' * (budget.runs != 1)}"
         lines += [
             "",
             f"{budget.dataset}: root mean square {budget.total**0.5:.3g} m/s, {runs}",
             f"  {parts}",
         ]
-    lines += [""] * bool(content["differences"])
-    for one in cast("Sequence[Mapping[str, object]]", content["differences"]):
-        lines += [str(one["sentence"]), *([f"  {one['note']}"] if one["note"] else [])]
+    lines += [""] * bool(causes.differences)
+    for one in causes.differences:
+        lines += [format_difference(one, names), *([f"  {one.note}"] if one.note else [])]
     page = _find_page(written, "causes.html")
     lines += ["", *(f"! {note}" for note in causes.notes), f"page    {page or _NO_PAGE}"]
     return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)

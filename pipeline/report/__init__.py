@@ -311,7 +311,6 @@ _NUMBERS = {
     "distance": (Column("distance", "m", number=True), 1.0),
     "command": (Column("slip from commands", "m/s", number=True), 1.0),
     "measured": (Column("slip from wheel encoders", "m/s", number=True), 1.0),
-    "samples": (Column("samples", number=True), 1.0),
 }
 
 
@@ -369,11 +368,11 @@ def _gather_rows(store: Store, manifests: Sequence[Manifest]) -> list[dict[str, 
     medians = (
         scan_table("aggregates", root=store.root, manifests=manifests)
         .filter(pl.col("subset") == "all")
-        .select("run", "input", "median_modulus", "distance", "samples")
+        .select("run", "input", "median_modulus", "distance")
         .collect()
     )
     # Those of the commands where they were recorded, as everywhere.
-    facts = medians.sort("input").group_by("run").agg(pl.col("distance", "samples").first())
+    facts = medians.sort("input").group_by("run").agg(pl.col("distance").first())
     for name in ("command", "measured"):
         one = medians.filter(pl.col("input") == name).select("run", pl.col("median_modulus").alias(name))
         facts = facts.join(one, on="run", how="left")

@@ -11,7 +11,7 @@ import polars as pl
 
 from pipeline.core import PathError, read_bounded, read_bounded_text, resolve_inside
 from pipeline.plan import SAFETY, Plan
-from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, theme
+from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
     Chart,
@@ -78,7 +78,7 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             plan.vehicle,
             f"{plan.commands.duration_s:.0f} s",
             f"{area.length_m:g} x {area.width_m:g} m",
-            f"at most {plan.limits.format(steered=plan.steered)}",
+            f"at most {set_squares(plan.limits.format(steered=plan.steered))}",
         ],
         safety=SAFETY,
         **_plan_as_view(plan),

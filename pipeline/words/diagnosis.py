@@ -17,7 +17,6 @@ from pipeline.models import Excitation, list_effects, name_term
 from pipeline.results import (
     ABOVE_FLOOR,
     BREVITY,
-    CAUSE_NAMES,
     CHANCE,
     CHANGE,
     DETECTED_SHARE,
@@ -420,10 +419,7 @@ def _format_budget(run: RunDiagnosis) -> str:
     """The error budget by cause: shares of the mean square slip on the leading input; empty without one."""
     for budget in run.budget if run.effects else ():
         if (budget.input, budget.quantity) == (run.input, "slip"):
-            parts = [
-                f"{CAUSE_NAMES.get(one.effect, one.effect)} {format_part(one.share)}"
-                for _, one in budget.causes
-            ]
+            parts = [f"{name_term(one.effect)} {format_part(one.share)}" for _, one in budget.causes]
             signs = "; negative: the effect increases slip" if any("-" in part for part in parts) else ""
             total = f"RMS slip {math.sqrt(budget.total):.3g} m/s"
             return f"error budget by cause ({total}): {', '.join(parts)}{signs}"

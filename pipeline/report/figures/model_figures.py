@@ -22,7 +22,6 @@ from pipeline.report.scene import (
 )
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, find_range, layer, make_axis, stack
 from pipeline.results import (
-    CAUSE_NAMES,
     CHANCE,
     INTERVAL_SHARE,
     Errors,
@@ -308,10 +307,10 @@ def list_growth(scene: Scene) -> dict[str, pl.DataFrame]:
     widths: list[tuple[str, str, float, float]] = []
     evidence: list[tuple[str, str, float, float]] = []
     for effect in scene.report.diagnosis.effects:
-        name, growth = effect.id, effect.growth or Growth()
+        name, growth = name_term(effect.id), effect.growth or Growth()
         for key, curve in growth.parameters.items():
             if key in effect.parameters:
-                goal = find_goal(name, key, effect.parameters[key].value) / INTERVAL_SHARE
+                goal = find_goal(effect.id, key, effect.parameters[key].value) / INTERVAL_SHARE
                 points = _list_points(curve.seconds, curve.half_width)
                 widths += [(name, f"{name}.{key}", second, half / goal) for second, half in points]
         if growth.evidence is not None:
@@ -375,7 +374,7 @@ def list_parts(scene: Scene) -> pl.DataFrame:
         low, high = finite_or_none(part.low), finite_or_none(part.high)
         rows.append(
             {
-                "cause": CAUSE_NAMES.get(name, name),
+                "cause": name_term(name),
                 "from": top,
                 "to": top - share,
                 "low": None if high is None else top - high,
