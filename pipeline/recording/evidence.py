@@ -55,7 +55,7 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     assert explained is not None  # noqa: S101 - chosen for it
     part = explained.motion
     ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
-    aside = best.columns_aside(part.steps, explained.lag, explained.delay)
+    aside = best.columns_aside(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
     if aside.size:
         return _find_frame_across(motion, part, join_parts(ahead, aside[:, 0]))
     course, concentration = motion.find_course_deg()

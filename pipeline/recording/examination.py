@@ -41,6 +41,7 @@ from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.outages import find_outages
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
+from pipeline.recording.wheel_scales import compare_sides, find_odd_joints, measure_wheel
 from pipeline.run import LIVE_SHARE, Alignment
 from pipeline.sources import (
     CONFIGURED,
@@ -53,7 +54,14 @@ from pipeline.sources import (
     Sources,
     Vehicle,
 )
-from pipeline.stages import Extraction, Finding, find_sideways_share, find_timeout, report_timeout
+from pipeline.stages import (
+    Extraction,
+    Finding,
+    choose_sides,
+    find_sideways_share,
+    find_timeout,
+    report_timeout,
+)
 
 
 @dataclass(frozen=True)
@@ -242,15 +250,7 @@ class Examination:
         command, wheels = self._choose_roles(drives)
         motion = self._settle_lengths(motion, readings, command, wheels)
         self._report_gyro(gyro)
-        if wheels is not None and not wheels.is_measured and self.configuration.wheels != DriveSection():
-            self._read_again(wheels, motion)
-        if wheels is not None and self.leave_out(wheels, command, motion):
-            wheels.reading.explained = None
-            self._read_again(wheels, motion)
-        is_judged = self._report_sides(motion, command, wheels)
-        if wheels is not None and "reversed" in self.changes.get("wheels", {}):
-            # What is wrong beside a side that is corrected shows now.
-            is_judged = not self._read_again(wheels, motion)
+        is_judged = self._settle_wheels(command, wheels, motion)
         kind = self._find_kind(wheels, motion)
         if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
@@ -265,9 +265,9 @@ class Examination:
             self._name_sources(command, wheels),
             self._complete(),
             tuple(self.findings),
-            "" if self.moves_sideways else kind,
+            kind,
             # Lengths that are known are not measured again.
-            Geometry() if self.is_known or self.moves_sideways else self._measure(command, wheels),
+            Geometry() if self.is_known or kind == "omni" else self._measure(command, wheels),
             tuple(describe(one, roles) for one in (*(drive.reading for drive in drives), *gyros)),
             alignment,
         )
@@ -319,7 +319,13 @@ class Examination:
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
         names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
-        return Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
+        reading = Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
+        if self.moves_sideways and section.reversed is None:
+            backward = msgspec.structs.replace(section, reversed="right")
+            reading.third_crossed = Held(
+                *_column(self.extraction.read_drive(source, backward, held=True), "sideways")
+            )
+        return reading
 
     def _make_unit(self, source: DriveSource, kind: str) -> Vehicle:
         """A vehicle of unit lengths whose inputs are those of a source."""
@@ -500,7 +506,9 @@ class Examination:
         given = self.configuration.vehicle.list_values().get("kind")
         kind = str(given or (self.vehicle.kind if self.is_known else "ackermann"))
         if self.moves_sideways:
-            return "" if self.is_known else "omni"
+            # Wheels of which each moves the body sideways as those with rollers do.
+            is_mecanum = wheels is not None and wheels.reading.form == "sides" and wheels.sign("aside")
+            return "" if self.is_known else "mecanum" if is_mecanum else "omni"
         if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
         return "ackermann" if self._read_again(wheels, motion, kind) else ""
@@ -575,6 +583,25 @@ class Examination:
 
     # Sides and signs.
 
+    def _settle_wheels(self, command: Candidate | None, wheels: Candidate | None, motion: Motion) -> bool:
+        """Correct single encoders, the wheels read anew after each; whether signs of sides are judged."""
+        if wheels is None:
+            return self._report_sides(motion, command, wheels)
+        if not wheels.is_measured and self.configuration.wheels != DriveSection():
+            self._read_again(wheels, motion)
+        if self._settle_joints(wheels, motion):
+            self._read_again(wheels, motion)
+        if self.leave_out(wheels, command, motion):
+            wheels.reading.explained = None
+            self._read_again(wheels, motion)
+        is_judged = self._report_sides(motion, command, wheels)
+        if "reversed" in self.changes.get("wheels", {}):
+            # What is wrong beside a side that is corrected shows now.
+            is_judged = not self._read_again(wheels, motion)
+        if self._settle_scales(wheels, motion):
+            self._read_again(wheels, motion)
+        return is_judged
+
     def _report_sides(self, motion: Motion, command: Candidate | None, wheels: Candidate | None) -> bool:
         """A side that is dead or counts backward; whether one was found."""
         if wheels is not None and wheels.reading.form == "sides" and self._report_dead(wheels):
@@ -620,6 +647,70 @@ class Examination:
             )
             return True
         return False
+
+    def _settle_joints(self, wheels: Candidate, motion: Motion) -> bool:
+        """Correct single wheels that contradict all others of a topic of joints; whether there are any."""
+        section, reading = self._complete().wheels, wheels.reading
+        is_free = section.factors is None and section.left is None and section.right is None
+        if wheels.source.form is not DriveForm.JOINTS or reading.form != "sides" or not is_free:
+            return False
+        times, rates = self.extraction.read_rates(wheels.source)
+        chosen = choose_sides(sorted(rates), section)
+        sides = {joint: side for side, joints in chosen.items() for joint in joints}
+        late = (0.0, 0.0) if reading.explained is None else (reading.explained.lag, reading.explained.delay)
+        turning = {
+            joint: measure_wheel(Held(times, rates[joint]), motion, late, ()) for joint in sorted(sides)
+        }
+        factors, idle = find_odd_joints(turning, sides)
+        factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}
+        for joint, factor in factors.items():
+            how = "counts backward" if factor < 0.0 else "counts"
+            if abs(factor) != 1.0:
+                how += f" {1.0 / abs(factor):.3g} times as fast as"
+            else:
+                how += " against"
+            what = f"{joint} of {wheels.source} {how} the other wheels"
+            line = ", ".join(f'"{name}" = {value:g}' for name, value in factors.items())
+            self._correct("wheels", what, f"factors = {{{line}}}", {"factors": factors})
+        for side, joints in chosen.items():
+            left = [joint for joint in joints if joint not in idle]
+            if left == joints or self.moves_sideways:
+                continue
+            lost = enumerate_texts([joint for joint in joints if joint in idle])
+            named = ", ".join(f'"{joint}"' for joint in left)
+            line = f"{side} = [{named}]"
+            what = (
+                f"the drive does not turn {lost} of {wheels.source}, as it does the other wheels of its side"
+            )
+            self._correct("wheels", what, line, {side: left})
+        return bool(factors or idle)
+
+    def _settle_scales(self, wheels: Candidate, motion: Motion) -> bool:
+        """Correct a side whose encoder counts on another scale than the other; whether one does."""
+        reading, made = wheels.reading, wheels.reading.explained
+        first, second = reading.first, reading.second
+        is_free = self._complete().wheels.factors is None
+        if reading.form != "sides" or first is None or second is None or made is None or not is_free:
+            return False
+        late = (made.lag, made.delay)
+        left, right = (measure_wheel(one, motion, late, (first, second)) for one in (first, second))
+        scale = compare_sides(left, right)
+        if scale is None:
+            return False
+        counts = {"left": abs(float(left.gains[0])), "right": abs(float(right.gains[0]))}
+        side, other = ("left", "right") if scale > 1.0 else ("right", "left")
+        if self.is_known:
+            # Which of them is right changes the radius of both, and slip of a radius that is not known not at
+            # all.
+            apart = {name: abs(np.log(one * self.vehicle.wheel_radius_m)) for name, one in counts.items()}
+            side, other = sorted(SIDES, key=lambda name: -apart[name])
+        factor = float(f"{counts[other] / counts[side]:.4g}")
+        what = (
+            f"the {side} wheels' encoder counts {1.0 / factor:.3g} times as much as the {other} one for "
+            "the same motion (another gear or resolution?)"
+        )
+        self._correct("wheels", what, f"factors = {{{side} = {factor:g}}}", {"factors": {side: factor}})
+        return True
 
     def leave_out(self, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
         """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""

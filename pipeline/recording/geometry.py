@@ -60,6 +60,11 @@ class Geometry:
             lengths = {"wheel_radius_m": self.radius, "track_width_m": self.track}
         else:
             lengths = {"wheel_radius_m": self.rolled, "track_width_m": self.effective}
+        wide = lengths.get("track_width_m")
+        if kind == "mecanum" and wide is not None:
+            # Wheels with rollers turn a body by track and wheelbase together.
+            half = Length(0.5 * wide.value, 0.5 * wide.error)
+            lengths |= {"track_width_m": half, "wheelbase_m": half}
         return {
             key: length
             for key, length in lengths.items()
@@ -181,13 +186,18 @@ def describe_vehicle(
         return "fitted_body", text
     lengths = {key: float(value) for key, value in values.items() if isinstance(value, float)}
     errors = {key: length.error for key, length in seen.list_lengths(kind).items()}
+    track = {
+        "differential": "a track of" if seen.radius is not None else "an effective track of",
+        "mecanum": "a track and a wheelbase of together",
+    }
     words = {
         "wheel_radius_m": "a wheel radius of",
-        "track_width_m": "a track of",
+        "track_width_m": track.get(kind, "a track of"),
         "wheelbase_m": "a wheelbase of",
     }
-    if kind == "differential" and seen.radius is None:
-        words["track_width_m"] = "an effective track of"
+    if kind == "mecanum":
+        errors["track_width_m"] = errors.get("track_width_m", 0.0) + errors.pop("wheelbase_m", 0.0)
+        lengths["track_width_m"] += lengths.pop("wheelbase_m")
     parts = {
         key: f"{words[key]} {lengths[key]:.3g} m"
         + (
@@ -204,7 +214,7 @@ def describe_vehicle(
         text = f"the vehicle has {own}, as given or recorded"
     else:
         text = "the log does not identify the vehicle" + (f": {own} as given or recorded" if own else "")
-    if shown and kind == "differential" and seen.radius is not None:
+    if shown and kind in {"differential", "mecanum"} and seen.radius is not None:
         text += f"; its controller turns commands into wheel speeds by {shown}, which are used"
     elif shown:
         verb = "fit" if " and " in shown else "fits"
@@ -216,14 +226,15 @@ def describe_vehicle(
             f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
             f"{text} (wheelbase_m under [vehicle] gives another)",
         )
-    radius, track = lengths["wheel_radius_m"], lengths.get("track_width_m")
-    name, guess = _guess_platform(radius, track)
+    name, guess = _guess_platform(kind, lengths["wheel_radius_m"], lengths.get("track_width_m"))
     return f"fitted_{name}", f"{text} ({guess})"
 
 
-def _guess_platform(radius: float, track: float | None) -> tuple[str, str]:
+def _guess_platform(kind: str, radius: float, track: float | None) -> tuple[str, str]:
     """Id of the platform with these lengths [m], or digits of them; and what to confirm."""
     name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
+    if kind == "mecanum":
+        return name, "[vehicle] gives others"
     alike = {} if track is None else find_alike(radius, track)
     if not alike:
         return name, "--wheel-radius and --track-width give others"

@@ -548,8 +548,8 @@ def _fit_vehicle(
         raise problem
     given = {key: value for key, value in configuration.vehicle.list_values().items() if key != "preset"}
     kind = str(given.get("kind") or recording.kind or chosen.vehicle.kind)
-    if "kind" not in given and find_sideways_share(chosen.data.topics, sources.command):
-        # The arrangement of the rollers is unknown: only body motion can be evaluated.
+    if "kind" not in given and kind != "mecanum" and find_sideways_share(chosen.data.topics, sources.command):
+        # The arrangement of the wheels is unknown: only body motion can be evaluated.
         kind = "omni"
     known = {**read_frames(TransformBuffer(chosen.data.topics))[1], **recorded, **given}
     lengths = recording.geometry.list_lengths(kind)
@@ -560,7 +560,8 @@ def _fit_vehicle(
     drives = [drive for drive in (sources.wheels, sources.command, standing_in) if drive is not None]
     is_body = all(drive.form is DriveForm.BODY for drive in drives)
     findings = list(chosen.findings)
-    if not is_body and kind == "differential" and "wheel_radius_m" not in values:
+    needed = {"differential": ("wheel_radius_m",), "mecanum": LENGTHS}.get(kind, ())
+    if not is_body and (kind == "omni" or any(key not in values for key in needed)):
         if standing_in is not None:
             return _take_unit_wheels(chosen, problem, kind, {**values, **given})
         if sources.command is None or sources.command.form is not DriveForm.BODY:
@@ -574,7 +575,7 @@ def _fit_vehicle(
             why = "no speeds of both sides are found in it (left and right under [wheels] name the joints)"
         text = f"not used: {sources.wheels}: {why}"
         findings.append(Finding("wheels_left_out", "warning", text, where="wheels"))
-        sources, is_body = replace(sources, wheels=None), True
+        sources, is_body, kind = replace(sources, wheels=None), True, kind.replace("mecanum", "omni")
     if kind == "ackermann" and "wheelbase_m" not in values:
         if standing_in is not None:
             return _take_unit_wheels(chosen, problem, kind, {**values, **given})

@@ -227,6 +227,7 @@ class Reading:
         name: for people.
         first, second: the inputs.
         third: of a base that moves sideways, what moves it to the left, in the unit of the first.
+        third_crossed: the same if the wheels of the right side count backward.
     """
 
     form: str
@@ -234,6 +235,7 @@ class Reading:
     first: Held | None
     second: Held | None
     third: Held | None = None
+    third_crossed: Held | None = None
     explained: Explained | None = field(default=None, init=False)
 
     @property
@@ -265,11 +267,12 @@ class Reading:
             return (0.5 * (one - two), -one - two) if crossed else (0.5 * (one + two), two - one)
         return (two, one) if crossed and self.form == "body" else (one, two)
 
-    def columns_aside(self, steps: Steps, lag: float, delay: float) -> Floats:
+    def columns_aside(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> Floats:
         """Increments to the left, in the reading's own units; none, or one, of shape (n, 1)."""
-        if self.third is None or not self.third.moves:
+        aside = self.third_crossed if crossed else self.third
+        if aside is None or not aside.moves:
             return np.zeros((steps.start.size, 0))
-        return self.third.integrate(steps, lag, delay)[:, None]
+        return aside.integrate(steps, lag, delay)[:, None]
 
     def explain(self, whole: Motion) -> Explained | None:
         """Fit the motion; also kept as ``explained``."""
@@ -283,8 +286,9 @@ class Reading:
         if keep.sum() < FEWEST_STEPS:
             return None
         motion = whole.take(keep)
-        may_cross = self.form == "sides" or (self.form == "body" and self.third is None)
-        may_cross = may_cross and len(self.inputs) == len(SIDES)
+        two = [one for one in (self.first, self.second) if one in self.inputs]
+        may_cross = self.form in {"sides", "body"} and len(two) == len(SIDES)
+        may_cross = may_cross and (self.third is None or self.third_crossed is not None)
         patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
@@ -293,8 +297,9 @@ class Reading:
         self.explained = tried[best]
         if len(tried) > 1:
             self.explained.other = tried[not best].blocks
-        for one in self.inputs:
-            one.forget()
+        for one in (self.first, self.second, self.third, self.third_crossed):
+            if one is not None:
+                one.forget()
         return self.explained
 
     def _find_busy(self, motion: Motion) -> Flags:
@@ -327,7 +332,7 @@ class Reading:
             (fit(ahead, beside, motion.steps).blocks, fit(yaw, empty, motion.steps).blocks),
             None,
         )
-        aside = self.columns_aside(motion.steps, lag, delay)
+        aside = self.columns_aside(motion.steps, lag, delay, crossed=crossed)
         if aside.size:
             across = motion.body.imag
             made.aside = (
@@ -377,7 +382,7 @@ class Reading:
         """Log-likelihood of both channels, each with its own gain and its squares limited."""
         columns = self.columns(part.steps, lag, delay, crossed=crossed)
         channels = list(zip((part.body.real, part.yaw), columns, limits, strict=True))
-        total, aside = 0.0, self.columns_aside(part.steps, lag, delay)
+        total, aside = 0.0, self.columns_aside(part.steps, lag, delay, crossed=crossed)
         if aside.size:
             total -= part.moved.size * np.log(_miss_across(part, join_parts(columns[0], aside[:, 0])))
             del channels[0]

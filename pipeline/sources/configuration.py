@@ -135,7 +135,8 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         sign: -1 if forward is recorded as negative.
         reversed: side that counts backward.
         exchanged: whether left and right are exchanged.
-        scale: factor on recorded speeds, where an encoder counts low or high.
+        scale: factor on recorded speeds, where encoders count low or high.
+        factors: the same of a side (``left``, ``right``) or of a joint, below zero where it counts backward.
         ignore: spans whose readings are none; empty: all are taken as recorded.
         time: which of the message's times to use.
         hold_s: how long a command stays valid.
@@ -159,6 +160,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     reversed: Literal["left", "right"] | None = None
     exchanged: bool = False
     scale: Positive | None = None
+    factors: dict[str, float] | None = None
     ignore: list[OutageSection] | None = None
     time: Clock | None = None
     hold_s: Positive | None = None

@@ -98,13 +98,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         raise _no_wheels(columns.topic, ())
     velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
-    rolling = [
-        joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
-    ]
-    left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
-    right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
-    if section.exchanged:
-        left, right = right, left
+    left, right = choose_sides(joints, section).values()
     findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
     if missing:
@@ -117,8 +111,9 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     recorded = [joint for joint in (*left, *right) if joint not in missing]
     section, converted = _convert_unit(columns.topic, times, section, velocity, position, recorded)
     findings += converted
-    for joint in {"left": left, "right": right}.get(section.reversed or "", ()):
-        velocity[joint] = -velocity[joint]
+    for side, joints_of_it in (("left", left), ("right", right)):
+        for joint in joints_of_it:
+            velocity[joint] = velocity[joint] * _find_factor(section, side, joint)
     if vehicle.kinematics.has_inputs("steering"):
         steering = _mean_steering(position, section.steering_joint, columns.topic)
         wheels = [velocity[joint] for joint in (*left, *right)]
@@ -136,6 +131,12 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     moves = vehicle.kinematics.has_inputs("sideways")
     sideways = _mean_sideways(speeds, left, section, columns.topic) if moves else None
     return Drive(left=sides[0], right=sides[1], sideways=sideways, findings=tuple(findings))
+
+
+def _find_factor(section: DriveSection, side: str, joint: str = "") -> float:
+    """Factor on the recorded speeds of a side, or of a joint of it, by its own scale and sign."""
+    factors = section.factors or {}
+    return factors.get(side, 1.0) * factors.get(joint, 1.0) * (-1.0 if section.reversed == side else 1.0)
 
 
 def _convert_unit(
@@ -310,6 +311,16 @@ def _is_known(joint: str, series: Mapping[str, Floats], other: Mapping[str, Floa
     return joint in series and bool(read[0].sum() > 0.5 * np.any(read, axis=0).sum())
 
 
+def choose_sides(joints: Sequence[str], section: DriveSection) -> dict[str, list[str]]:
+    """The joints of each side, ``left`` and ``right``, that drive and do not steer."""
+    rolling = [
+        joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
+    ]
+    left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
+    right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
+    return {"left": right, "right": left} if section.exchanged else {"left": left, "right": right}
+
+
 def _choose_joints(
     joints: Sequence[str], configured: list[str] | None, side: re.Pattern[str], other: re.Pattern[str]
 ) -> list[str]:
@@ -434,10 +445,8 @@ def read_pair(
     if form is DriveForm.SIDES:
         if section.exchanged:
             first, second = second, first
-        signs: dict[str, int] = {"left": section.sign, "right": section.sign}
-        if section.reversed is not None:
-            signs[section.reversed] *= -1
-        return read_sides(first * signs["left"], second * signs["right"], vehicle)
+        left, right = (section.sign * _find_factor(section, side) for side in ("left", "right"))
+        return read_sides(first * left, second * right, vehicle)
     if form is DriveForm.STEERING:
         return read_steering(first * section.sign, second, vehicle)
     if nominal:

@@ -64,9 +64,49 @@ def turned_and_in_degrees(path: Path, drive: Drive) -> Path:
     return write_log(path, replace(drive, yaw=drive.yaw - 0.5 * np.pi), asked=asked)
 
 
+def with_a_left_encoder_that_counts_double(path: Path, drive: Drive) -> Path:
+    """Both edges of the left encoder are counted, and one of the right."""
+    read = sides(drive)
+    assert read.first is not None
+    first = Held(read.first.times, 2.0 * read.first.values)
+    return write_log(path, drive, wheels=replace(read, first=first))
+
+
+def four_wheels(drive: Drive, factors: tuple[float, float, float, float]) -> dict[str, Held]:
+    """Front left and right, rear left and right."""
+    read = sides(drive)
+    pair = [one for one in (read.first, read.second) if one is not None]
+    names = [f"{end}_{side}_wheel" for end in ("front", "rear") for side in ("left", "right")]
+    each = zip(names, pair * 2, factors, strict=True)
+    return {name: Held(one.times, factor * one.values) for name, one, factor in each}
+
+
+def with_one_wheel_backward(path: Path, drive: Drive) -> Path:
+    """One encoder of four is wired backward."""
+    return write_log(path, drive, joints=four_wheels(drive, (1.0, 1.0, -1.0, 1.0)))
+
+
+def with_one_wheel_counting_double(path: Path, drive: Drive) -> Path:
+    """One encoder of four has twice the resolution."""
+    return write_log(path, drive, joints=four_wheels(drive, (1.0, 2.0, 1.0, 1.0)))
+
+
+def with_one_wheel_dead(path: Path, drive: Drive) -> Path:
+    """One encoder of four reads zero."""
+    return write_log(path, drive, joints=four_wheels(drive, (1.0, 1.0, 1.0, 0.0)))
+
+
 @pytest.mark.parametrize(
     ("make", "said", "keys"),
     [
+        (with_a_left_encoder_that_counts_double, ["left wheels' encoder counts 2 times"], {}),
+        (
+            with_one_wheel_backward,
+            ["rear_left_wheel of /joint_states counts backward"],
+            {"wheels.factors": {"rear_left_wheel": -1.0}},
+        ),
+        (with_one_wheel_counting_double, ["front_right_wheel of /joint_states counts 2 times"], {}),
+        (with_one_wheel_dead, ["rear_right_wheel"], {"wheels.right": ["front_right_wheel"]}),
         (in_millimetres, ["are in mm"], {"pose.unit": "mm"}),
         (in_centimetres, ["are in cm"], {"pose.unit": "cm"}),
         (without_signs, ["have no sign"], {}),

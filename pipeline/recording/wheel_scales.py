@@ -1,0 +1,106 @@
+"""Encoders of single wheels and of sides against the motion: which count backward, or on another scale."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from pipeline.core import Floats
+from pipeline.recording.motion import Motion
+from pipeline.recording.readings import Held
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit, measure_share
+
+_FOLLOWS = 0.5
+"""Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
+_SAME = 1.25
+"""Ratio of two wheels' scales up to which tyres, loads and the ground may make it."""
+_AGREE = 1.15
+"""Ratio within which driving and turning show the same scale."""
+_IDLE = 0.1
+"""Turning over that of the others below which a wheel's encoder is not turned by the drive."""
+
+
+@dataclass(frozen=True)
+class Turning:
+    """How a wheel turns with the motion.
+
+    Attributes:
+        gains: per metre ahead and per radian of the heading, shape (2,) [rad/m, 1].
+        t: their ratios to standard errors.
+        follows: whether the motion explains it.
+    """
+
+    gains: Floats
+    t: Floats
+    follows: bool
+
+
+def measure_wheel(
+    wheel: Held, motion: Motion, late: tuple[float, float], beside: tuple[Held, ...]
+) -> Turning:
+    """How a wheel turns with the motion.
+
+    Args:
+        wheel: its speed.
+        motion: of the body.
+        late: lag and delay of the motion after the wheels [s].
+        beside: signals that are recorded throughout the steps that count, too.
+    """
+    nothing = Turning(np.zeros(2), np.zeros(2), follows=False)
+    if wheel.is_constant:
+        return nothing
+    keep = np.logical_and.reduce([one.is_there(motion.steps) for one in (wheel, *beside)])
+    if keep.sum() < FEWEST_STEPS:
+        return nothing
+    part = motion.take(keep)
+    turned = wheel.integrate(part.steps, *late)
+    columns = np.column_stack([part.body.real, part.yaw, part.body.imag])
+    made = fit(turned, columns, part.steps)
+    share = measure_share(turned, columns @ made.gains)
+    return Turning(made.gains[:2], made.t[:2], share > _FOLLOWS and abs(made.t[0]) > CLEAR)
+
+
+def find_odd_joints(
+    joints: Mapping[str, Turning], sides: Mapping[str, str]
+) -> tuple[dict[str, float], list[str]]:
+    """Wheels that contradict all the others.
+
+    Args:
+        joints: by name.
+        sides: side of each of them.
+
+    Returns:
+        Factors by name of those that count backward or on another scale, and names of those that are not
+        turned by the drive, though others of their side are.
+    """
+    fine = [one for one in joints.values() if one.follows]
+    # Two wheels that differ do not tell which one is right.
+    if len(fine) < 3:  # noqa: PLR2004
+        return {}, []
+    usual = float(np.median([one.gains[0] for one in fine]))
+    factors, idle = {}, []
+    for name, one in joints.items():
+        ratio = float(one.gains[0]) / usual if usual else 0.0
+        others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
+        if one.follows and (ratio < 0.0 or abs(np.log(ratio)) > np.log(_SAME)):
+            factors[name] = -1.0 if -_SAME < ratio < -1.0 / _SAME else 1.0 / ratio
+        elif not one.follows and abs(ratio) < _IDLE and any(other.follows for other in others):
+            idle.append(name)
+    # More than half of them that differ are a vehicle of another kind.
+    return (factors, idle) if 2 * len(factors) < len(joints) else ({}, idle)
+
+
+def compare_sides(left: Turning, right: Turning) -> float | None:
+    """Scale of the left side's encoder over the right one's; None if it is the same, or not clear."""
+    if not (left.follows and right.follows):
+        return None
+    of_way, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
+    if of_way <= 0.0 or abs(np.log(of_way)) < np.log(_SAME):
+        return None
+    turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
+    # A body that turns by something else than its wheels shows two scales.
+    if turns and (of_turn >= 0.0 or abs(np.log(-of_turn / of_way)) > np.log(_AGREE)):
+        return None
+    return of_way
