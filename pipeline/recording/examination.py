@@ -9,7 +9,7 @@ import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import Floats, SlipError, enumerate_texts
+from pipeline.core import Floats, SlipError, enumerate_texts, format_duration
 from pipeline.logs import LogData
 from pipeline.recording.command_scale import measure_command_scale, roll
 from pipeline.recording.evidence import (
@@ -124,6 +124,8 @@ _BOTH_WAYS = 0.02
 """Share of a drive in one direction from which on it goes that way."""
 _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
+_AHEAD_S = 0.02
+"""Time by which a command is stamped after its recording [s] that is another clock's, and no rounding's."""
 _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
@@ -220,14 +222,20 @@ class Examination:
         self.sources, self.configuration, self.vehicle = sources, configuration, vehicle
         # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
         equal = replace(sources, others={**sources.others, "command": ()}, power=None)
+        self.findings: list[Finding] = []
+        self.changes: dict[str, dict[str, object]] = {}
         self.extraction = Extraction(data, equal, configuration, vehicle, where)
+        self.ahead = self._find_ahead()
+        if self.ahead is not None:
+            equal = replace(equal, command=self.ahead[0])
+            section = msgspec.structs.replace(configuration.command, time="log")
+            by_log = msgspec.structs.replace(configuration, command=section)
+            self.extraction = Extraction(data, equal, by_log, vehicle, where)
         drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
         self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
             find_sideways_share(data.topics, one) for one in drives
         )
         self.driven: Explained | None = None
-        self.findings: list[Finding] = []
-        self.changes: dict[str, dict[str, object]] = {}
 
     def run(self) -> Recording:
         """See `examine`."""
@@ -248,6 +256,7 @@ class Examination:
         drives = self._leave_out_sizes(drives)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
+        self._settle_stamps(command)
         motion = self._settle_lengths(motion, readings, command, wheels)
         self._report_gyro(gyro)
         is_judged = self._settle_wheels(command, wheels, motion)
@@ -273,6 +282,29 @@ class Examination:
         )
 
     # Signals.
+
+    def _find_ahead(self) -> tuple[DriveSource, float] | None:
+        """A candidate for the command that is stamped after it was recorded, and by how much [s]."""
+        late = {key: one.latency_s for key, one in self.extraction.clocks.items() if one.clock == "header"}
+        if self.configuration.command.time is not None:
+            return None
+        for source in self.sources.rank_drives("command"):
+            own = {signal.topic for signal in source.signals}
+            rest = [latency for topic, latency in late.items() if topic not in own]
+            ahead = -min((late.get(topic, 0.0) for topic in own), default=0.0)
+            if ahead > _AHEAD_S and rest and min(rest) > -_AHEAD_S:
+                return source, ahead
+        return None
+
+    def _settle_stamps(self, command: Candidate | None) -> None:
+        """Take the times of recording of a command that is stamped after it was recorded."""
+        if self.ahead is None or command is None or command.source.signals != self.ahead[0].signals:
+            return
+        what = (
+            f"the stamps of {command.source} lie {format_duration(self.ahead[1])} after they were recorded, "
+            "and those of the other topics do not: its clock runs ahead"
+        )
+        self._correct("command", what, 'time = "log"', {"time": "log"})
 
     def _read_gyro(self) -> Reading | None:
         imu = self.extraction.imu()

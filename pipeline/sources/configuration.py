@@ -177,8 +177,8 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
         topic: poses, satellite fixes, or velocities over ground.
         x: field with the position along x [m], such as ``/tracker.x``, for a topic of any type.
         y: field of the same topic with the position along y [m].
-        yaw: field of the same topic with the heading, counterclockwise from x [rad]; in degrees if its name
-            contains ``deg``.
+        yaw: field of the same topic with the heading, counterclockwise from x.
+        yaw_unit: unit of a heading that is one number; by default that with which the body moves along it.
         name: model, link or joint, if a message of the topic contains the poses of several.
         frames: parent and child.
         axes: ``enu``: y to the left of x, z up; ``ned``: y to the right, z down (north, east, down).
@@ -193,6 +193,7 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     x: str | None = None
     y: str | None = None
     yaw: str | None = None
+    yaw_unit: Literal["rad", "deg"] | None = None
     name: str | None = None
     frames: Annotated[list[str], msgspec.Meta(min_length=2, max_length=2)] | None = None
     axes: Literal["enu", "ned"] = "enu"

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
+import msgspec
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
@@ -311,6 +312,13 @@ class Extraction:
         stamp, log_time, arrays, breaks = self._recorded_poses(source)
         times = self._seconds(stamp)
         position, quaternion = reading.put_upright(arrays, self.configuration.pose)
+        if reading.is_upside_down(quaternion):
+            quaternion = reading.turn_over(quaternion)
+            text = (
+                f"the body's z axis points down in the poses of {source.topic} (ahead, right, down, or a "
+                "sensor that is mounted upside down): its frame was turned over about the x axis"
+            )
+            self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
         track = pose_topics.cut_track(
             times, position, quaternion, breaks, self.configuration.velocity, source.topic
         )
@@ -416,6 +424,16 @@ class Extraction:
 
     def _read_poses(self, source: PoseSource, columns: TopicColumns) -> reading.PoseArrays:
         pose = source.fields or find_type(columns.type_name).pose
+        if pose is not None and pose.angle:
+            asked = self.configuration.pose.yaw_unit
+            unit = asked or reading.find_angle_unit(columns, pose)
+            if unit != (asked or pose.angle_unit):
+                text = (
+                    f"the headings of {source.topic} are in degrees: the body moves along them; converted, "
+                    'as yaw_unit = "deg" under [pose] in run.toml does; yaw_unit = "rad" takes them so'
+                )
+                self.findings.append(Finding("heading_unit", "warning", text, where=source.topic))
+            pose = msgspec.structs.replace(pose, angle_unit=unit)
         if pose is None or not pose.names:
             return reading.read_pose_topic(columns, pose)
         arrays, name = read_bodies(columns, pose, source.name, self.vehicle)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -399,6 +400,22 @@ def put_upright(arrays: PoseArrays, section: PoseSection) -> tuple[Floats, Float
     return position, quaternion
 
 
+_DOWN = -0.7
+"""Height of a body's z axis below which it points down: no vehicle leans by 45 degrees in most of a drive."""
+
+
+def is_upside_down(quaternion: Floats) -> bool:
+    """Whether the z axis of a body points down in most of its poses, of shape (n, 4)."""
+    upward = 1.0 - 2.0 * (quaternion[:, 0] ** 2 + quaternion[:, 1] ** 2)
+    known = upward[np.isfinite(upward)]
+    return bool(known.size) and float(np.median(known)) < _DOWN
+
+
+def turn_over(quaternion: Floats) -> Floats:
+    """Poses (n, 4) of the body turned by half a turn about its x axis."""
+    return rigid.multiply_quaternions(quaternion, np.broadcast_to(_FLU_IN_FRD, quaternion.shape))
+
+
 @dataclass(frozen=True)
 class Receiver:
     """A topic with its clock.
@@ -427,6 +444,36 @@ class Located:
     rows: Ints
     arrays: PoseArrays
     findings: tuple[Finding, ...]
+
+
+_APART = 5
+"""Poses between two positions of a displacement: half a second at 10 Hz."""
+_ALONG = 0.5
+"""Concentration of a body's course about its heading from which on it drives along it."""
+
+
+def find_angle_unit(columns: TopicColumns, pose: PoseFields) -> Literal["rad", "deg"]:
+    """Unit of headings that are one number: that of their type, unless the body drives along the others.
+
+    Args:
+        columns: the topic.
+        pose: its fields, with an angle.
+    """
+    x, y = (numbers(columns, name) for name in axis_fields(pose.position, "xy")[:2])
+    angle, place = numbers(columns, pose.angle), x + 1j * y
+    moved, heading = place[2 * _APART :] - place[: -2 * _APART], angle[_APART:-_APART]
+    known = np.isfinite(moved) & np.isfinite(heading)
+    moved, heading = moved[known], heading[known]
+    if pose.angle_unit == "deg" or moved.size < FEWEST_MESSAGES:
+        return pose.angle_unit
+    # Modulo half a turn, since it also drives backward; a jump of the pose counts as any other displacement.
+    size = np.minimum(np.abs(moved), float(np.quantile(np.abs(moved), 0.9)))
+    course = size * np.exp(2j * np.angle(moved))
+    along = {
+        unit: abs(np.sum(course * np.exp(-2j * factor * heading))) / max(float(np.sum(size)), 1e-12)
+        for unit, factor in (("rad", 1.0), ("deg", np.pi / 180.0))
+    }
+    return "deg" if along["deg"] > _ALONG > 2.0 * along["rad"] else "rad"
 
 
 def read_pose_topic(columns: TopicColumns, fields: PoseFields | None = None) -> PoseArrays:
@@ -491,7 +538,7 @@ def _turn_axes(arrays: PoseArrays) -> PoseArrays:
     position = arrays.position[:, [1, 0, 2]] * np.array([1.0, 1.0, -1.0])
     turned = rigid.multiply_quaternions(
         np.broadcast_to(_NED_IN_ENU, arrays.quaternion.shape),
-        rigid.multiply_quaternions(arrays.quaternion, np.broadcast_to(_FLU_IN_FRD, arrays.quaternion.shape)),
+        turn_over(arrays.quaternion),
     )
     return replace(arrays, position=position, quaternion=turned)
 

@@ -96,9 +96,15 @@ def with_one_wheel_dead(path: Path, drive: Drive) -> Path:
     return write_log(path, drive, joints=four_wheels(drive, (1.0, 1.0, 1.0, 0.0)))
 
 
+def stamped_in_the_future(path: Path, drive: Drive) -> Path:
+    """The clock of the machine that sends the commands runs half a second ahead."""
+    return write_log(path, drive, command_ahead_s=0.5)
+
+
 @pytest.mark.parametrize(
     ("make", "said", "keys"),
     [
+        (stamped_in_the_future, ["its clock runs ahead"], {"command.time": "log"}),
         (with_a_left_encoder_that_counts_double, ["left wheels' encoder counts 2 times"], {}),
         (
             with_one_wheel_backward,

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -19,11 +20,11 @@ from pipeline.simulate import (
     simulate_run,
     write_log,
 )
-from pipeline.sources import Configuration, DriveSection, find_preset, load_configuration
+from pipeline.sources import Configuration, DriveSection, find_preset, find_type, load_configuration
 from pipeline.stages.clocks import Recorded, align_clocks
 from pipeline.stages.drive import read_joints, unwrap_counter
 from pipeline.stages.extract import extract_tables
-from pipeline.stages.reading import list_wanted, read_pose_topic
+from pipeline.stages.reading import find_angle_unit, is_upside_down, list_wanted, read_pose_topic, turn_over
 
 SECOND = 10**9
 COUNT = 600
@@ -122,6 +123,37 @@ def test_a_body_in_north_east_down_is_turned_upright() -> None:
     pose = read_pose_topic(columns)
     assert pose.position[0] == pytest.approx([0.0, 1.0, 2.0])
     assert np.abs(pose.quaternion[0]) == pytest.approx([0.0, 0.0, 0.0, 1.0], abs=1e-12)
+
+
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+@pytest.mark.parametrize("turning", [0.02, 0.6])
+def test_the_unit_of_a_heading_is_that_along_which_the_body_drives(
+    unit: Literal["rad", "deg"], turning: float
+) -> None:
+    times = np.arange(0.0, 60.0, 0.1)
+    yaw = 0.3 + np.cumsum(turning * np.sin(0.2 * times)) * 0.1
+    # Back and forth, and with a jump of the localization.
+    place = np.cumsum(0.08 * np.cos(0.1 * times) * np.exp(1j * yaw))
+    place[300:] += 5.0
+    theta = yaw if unit == "rad" else np.degrees(yaw)
+    stamps = np.zeros(times.size, dtype=np.int64)
+    columns = TopicColumns(
+        "/p", 0, "geometry_msgs/msg/Pose2D", stamps, stamps, None,
+        {"x": place.real, "y": place.imag, "theta": theta}, (),
+    )  # fmt: skip
+    pose = find_type(columns.type_name).pose
+    assert pose is not None
+    assert find_angle_unit(columns, pose) == unit
+
+
+def test_a_sensor_that_hangs_upside_down_is_turned_over() -> None:
+    half = 0.5 * np.linspace(-2.0, 2.0, 50)
+    zero = np.zeros(half.size)
+    upright = np.column_stack([zero, zero, np.sin(half), np.cos(half)])
+    hanging = np.column_stack([np.cos(half), np.sin(half), zero, zero])
+    assert is_upside_down(hanging)
+    assert not is_upside_down(upright)
+    assert turn_over(hanging) == pytest.approx(-upright)
 
 
 @pytest.mark.parametrize("factor", [0.05, 0.4, 3.0])
