@@ -396,6 +396,9 @@ def rate_command(one: Reading, rank: int, earliest: float) -> float:
     explained = one.explained
     assert explained is not None  # noqa: S101 - given so
     named = _USUAL * bool(COMMANDED.search(one.name.lower())) - _USUAL * is_named_measured(one.name)
-    lead = explained.lag + explained.delay - earliest
+    late = explained.lag + explained.delay
+    lead = float(np.clip((late - earliest) / _LEAD_S, 0.0, 4.0))
     held = float(np.mean([one.held_share for one in one.inputs]))
-    return named + float(np.clip(lead / _LEAD_S, 0.0, 4.0)) + 3.0 * held - 1.0 * rank
+    # No drive follows what it is told at once, and least of all what changes all the time.
+    at_once = 2.0 * _USUAL * (late < _LEAD_S) * (1.0 - held)
+    return named + lead + 3.0 * held - at_once - 1.0 * rank

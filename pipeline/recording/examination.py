@@ -462,8 +462,9 @@ class Examination:
             ),
             default=0.0,
         )
-        command = self._find(drives, self.sources.command)
-        rivals = [one for one in sure if not one.is_measured]
+        named = command = self._find(drives, self.sources.command)
+        # Plain numbers have their roles by name alone.
+        rivals = [one for one in sure if not one.is_measured or one.source.form is DriveForm.SIDES]
         if rivals and (command is None or command.source.reason != CONFIGURED):
             rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
             best = max(rivals, key=lambda one: rates[id(one)])
@@ -472,6 +473,10 @@ class Examination:
                     self._report_command(best, command)
                 command = best
         wheels = self._find(drives, self.sources.wheels)
+        if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
+            # What is named as a command measures what the other asks for.
+            is_sides = named is not None and named is not command and named.reading.form == "sides"
+            return command, named if is_sides else None
         if wheels is None and self.sources.wheels is None:
             # A pair of sides that is no command measures the wheels.
             is_free = command is None

@@ -18,6 +18,8 @@ from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps
 GRID_S = 0.02
 _SLOW_S = 0.4
 """Period [s] from which on a signal may be sent on changes only: then it holds until the next one."""
+_FEWEST_CHANGES = 4
+"""Least number of messages of a command: a start and a stop ahead, and of a turn."""
 _FEW_CELLS = 2.0
 """Cells of the grid without a signal that are no gap."""
 _LONGEST_S = 6.0 * 3600.0
@@ -43,11 +45,12 @@ class Held:
         if known.any():
             known &= np.abs(times - np.median(times[known])) < _LONGEST_S
         self.times, self.values = times[known], values[known]
-        enough = self.values.size >= FEWEST_STEPS
+        # A command that is sent on changes only has few messages, and says something all the time.
+        enough = self.values.size >= (_FEWEST_CHANGES if may_stand else FEWEST_STEPS)
         self.is_constant = not (enough and bool(np.ptp(self.values) > 0.0))
         self.moves = not self.is_constant or (enough and may_stand and bool(self.values.any()))
         self._sums: dict[float, Floats] = {}
-        if self.values.size < FEWEST_STEPS:
+        if not enough:
             return
         self._start = float(self.times[0]) - 1.0
         grid = np.arange(self._start, self.times[-1] + 2.0, GRID_S)
