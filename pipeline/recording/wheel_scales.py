@@ -1,7 +1,5 @@
 """Encoders of single wheels and of sides against the motion: which count backward, or on another scale."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Mecanum wheels that nobody describes: their lengths, and a side that counts backward."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
