@@ -60,6 +60,7 @@ from pipeline.stages import (
     choose_sides,
     find_sideways_share,
     find_timeout,
+    list_steered,
     report_timeout,
 )
 
@@ -261,6 +262,8 @@ class Examination:
         self._report_gyro(gyro)
         is_judged = self._settle_wheels(command, wheels, motion)
         kind = self._find_kind(wheels, motion)
+        if wheels is not None and not kind and self._leave_out_steered(wheels):
+            wheels = None
         if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
@@ -549,6 +552,24 @@ class Examination:
         if wheels is None or wheels.source.form is not DriveForm.JOINTS or kind != "ackermann":
             return ""
         return "ackermann" if self._read_again(wheels, motion, kind) else ""
+
+    def _leave_out_steered(self, wheels: Candidate) -> bool:
+        """Leave out wheels beside joints that steer, of a vehicle that is no car; whether there are any."""
+        is_given = self.is_known or "kind" in self.configuration.vehicle.list_values()
+        if is_given or wheels.source.form is not DriveForm.JOINTS:
+            return False
+        steered = list_steered(self.extraction.columns[wheels.source.signals[0].topic])
+        if not steered:
+            return False
+        text = (
+            f"not used: {wheels.source}: {enumerate_texts(steered)} steer, so that this is no differential "
+            "drive, and it does not turn as a car that steers by the middle of them (several axles steer, or "
+            "each wheel by itself); steering_joint and left and right under [wheels] and "
+            '[vehicle] kind = "ackermann" in run.toml take it for a car'
+        )
+        self.findings.append(Finding("wheels_steered", "warning", text, where="wheels"))
+        self.sources = replace(self.sources, wheels=None)
+        return True
 
     # Positions in other units, and signals that lack something.
 

@@ -30,7 +30,7 @@ _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
 _FRONT = re.compile(r"front|(^|[_/])(f|fl|fr|lf|rf)([_/\d]|$)")
 _REAR = re.compile(r"rear|back|(^|[_/])(rl|rr|bl|br|lr|lb|rb)([_/\d]|$)")
-_STEERS = re.compile(r"steer")
+_STEERS = re.compile(r"steer|azimuth")
 _USUAL_UNITS = {
     DriveForm.SIDES: ("rad/s", "rad/s"),
     DriveForm.BODY: ("m/s", "rad/s"),
@@ -210,7 +210,7 @@ def _mean_steering(position: Mapping[str, Floats], configured: str | None, topic
     Wheels of one axle that roll about one centre have that centre's distance in common, not the angle: the
     cotangent in the middle is the mean of theirs. Of other joints it is the mean of the angles.
     """
-    names = [configured] if configured else [joint for joint in position if _STEERS.search(joint.lower())]
+    names = [configured] if configured else [joint for joint in position if _is_steered(joint)]
     angles = [position[joint] for joint in names if joint in position]
     if not angles:
         hint = f"Set steering_joint to one of: {', '.join(sorted(position)) or 'none it has'}."
@@ -311,11 +311,21 @@ def _is_known(joint: str, series: Mapping[str, Floats], other: Mapping[str, Floa
     return joint in series and bool(read[0].sum() > 0.5 * np.any(read, axis=0).sum())
 
 
+def _is_steered(joint: str) -> bool:
+    """Whether the name of a joint says that it steers."""
+    return bool(_STEERS.search(joint.lower()))
+
+
+def list_steered(columns: TopicColumns) -> list[str]:
+    """Joints of a topic that steer by their names, and whose angles change."""
+    _, position = _read_series(columns)
+    steered = {joint: angle[np.isfinite(angle)] for joint, angle in position.items() if _is_steered(joint)}
+    return sorted(joint for joint, angle in steered.items() if angle.size and np.ptp(angle) > 0.0)
+
+
 def choose_sides(joints: Sequence[str], section: DriveSection) -> dict[str, list[str]]:
     """The joints of each side, ``left`` and ``right``, that drive and do not steer."""
-    rolling = [
-        joint for joint in joints if joint != section.steering_joint and not _STEERS.search(joint.lower())
-    ]
+    rolling = [joint for joint in joints if joint != section.steering_joint and not _is_steered(joint)]
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
     return {"left": right, "right": left} if section.exchanged else {"left": left, "right": right}
