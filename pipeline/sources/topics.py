@@ -159,6 +159,8 @@ STRING_TYPE = "std_msgs/String"
 DEFAULT_INTERVAL = ("/drive/calib_state", "calib")
 
 _NOT_A_POSE = re.compile(r"goal|initialpose|initial_pose|target|waypoint|desired|reference|setpoint|cmd")
+_PLACE = re.compile(r"pos(?!e)|station|prism|track|leica|uwb|beacon|gps|gnss")
+"""Names of points that are measured, and not picked on a screen."""
 
 Source = TypeVar("Source", DriveSource, PoseSource, TopicSource)
 
@@ -400,6 +402,10 @@ class _Chooser:
         name = topic.lower()
         if _NOT_A_POSE.search(name):
             return None
+        pose = find_type(self.types[topic]).pose
+        if pose is not None and not (pose.orientation or pose.angle):
+            is_place = LOCALIZED.search(name) or _PLACE.search(name)
+            return (1.0, PoseSource(topic, "positions by its type and name")) if is_place else None
         if DEAD_RECKONED.search(name):
             return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
         if LOCALIZED.search(name):

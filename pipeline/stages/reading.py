@@ -146,7 +146,9 @@ def axis_fields(fields: str | list[str], axes: str) -> list[str]:
 
 
 def _turn_fields(pose: PoseFields) -> list[str]:
-    """Fields of the orientation: the heading, or the four of the quaternion."""
+    """Fields of the orientation: the heading, or the four of the quaternion; none of positions alone."""
+    if not pose.angle and not pose.orientation:
+        return []
     return [pose.angle] if pose.angle else axis_fields(pose.orientation, "xyzw")
 
 
@@ -485,6 +487,9 @@ def read_pose_topic(columns: TopicColumns, fields: PoseFields | None = None) -> 
     for axis, name in enumerate(axis_fields(pose.position, "xyz")):
         position[:, axis] = numbers(columns, name)
     turns = [numbers(columns, name) for name in _turn_fields(pose)]
+    if not turns:
+        still = np.zeros(columns.log_time.size)
+        turns = [still, still, still, still + 1.0]
     if pose.angle:
         half = 0.5 * (np.radians(turns[0]) if pose.angle_unit == "deg" else turns[0])
         still = np.zeros(half.size)

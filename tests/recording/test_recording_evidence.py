@@ -246,6 +246,21 @@ def test_a_measured_motion_is_no_command() -> None:
     # Even where the names say nothing, and the motion comes first by its type.
     asked.name = "/velocity_a"
     assert rate_command(asked, 1, min(delays)) > rate_command(seen, 0, min(delays)) + 4.0
+    # Or where the names say the opposite.
+    asked.name, seen.name = "/wheel_velocity", "/motor/command"
+    assert rate_command(asked, 0, min(delays)) > rate_command(seen, 0, min(delays)) + 4.0
+
+
+def test_a_command_that_is_sent_on_changes_only_says_something_all_the_time() -> None:
+    drive = draw(7, 60.0)
+    changed = np.flatnonzero(np.append(True, np.any(np.diff(drive.asked, axis=0) != 0.0, axis=1)))[::3]
+    asked = np.zeros_like(drive.asked)
+    for first, last in zip(changed, [*changed[1:], drive.time.size], strict=True):
+        asked[first:last] = drive.asked[first]
+    first, second = (Held(drive.time[changed], asked[changed, k], may_stand=True) for k in (0, 1))
+    assert changed.size < FEWEST_STEPS
+    made = Reading("body", "/cmd_vel", first, second).explain(measured(tabulate(drive)))
+    assert made is not None
 
 
 def test_a_signal_of_another_body_explains_nothing() -> None:

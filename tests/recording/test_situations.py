@@ -139,6 +139,23 @@ def test_a_situation_is_told_and_corrected(
     assert not [one for one in setup.choice.findings if one.severity == "error"]
 
 
+def test_wheels_that_several_axles_steer_are_no_differential_drive(tmp_path: Path) -> None:
+    drive = draw(53)
+    at = slice(None, None, 5)
+    bend = np.arctan2(0.5 * drive.rate[at], np.abs(drive.speed[at]) + 0.1)
+    rolled, zero = Held(drive.time[at], drive.speed[at] / 0.1), Held(drive.time[at], 0.0 * bend)
+    speeds, angles = {}, {}
+    for end, sense in (("front", 1.0), ("rear", -1.0)):
+        for side in ("left", "right"):
+            speeds |= {f"{end}_{side}_wheel": rolled, f"{end}_{side}_steering": zero}
+            angles |= {f"{end}_{side}_wheel": zero.values, f"{end}_{side}_steering": sense * bend}
+    log = write_log(tmp_path / "log.mcap", drive, joints=speeds, angles=angles)
+    setup = set_up_log(log, Options(out=tmp_path))
+    assert setup.sources.wheels is None
+    (told,) = [one.text for one in setup.choice.findings if one.id == "wheels_steered"]
+    assert "front_left_steering" in told
+
+
 def test_wheels_of_a_known_vehicle_that_read_three_times_too_fast_are_told(tmp_path: Path) -> None:
     drive = draw(52)
     log = write_log(tmp_path / "log.mcap", drive, wheels=change(sides(drive), lambda speed: 3.0 * speed))

@@ -125,6 +125,16 @@ CASES: dict[str, tuple[str, dict[str, str], dict[str, str | None]]] = {
         {"command": "/cmd_vel", "pose": "/tf", "wheels": "/joint_states", "imu": None},
     ),
     "static transforms alone are no pose": ("jackal", {"/cmd_vel": TWIST, "/tf_static": TF}, {"pose": None}),
+    "points of a total station": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/total_station/point": "geometry_msgs/msg/PointStamped"},
+        {"pose": "/total_station/point"},
+    ),
+    "points that are picked on a screen": (
+        "jackal",
+        {"/cmd_vel": TWIST, "/clicked_point": "geometry_msgs/msg/PointStamped"},
+        {"pose": None},
+    ),
     "a stamped pose": (
         "jackal",
         {"/cmd_vel": TWIST, "/robot/pose": POSE},

@@ -89,7 +89,7 @@ class PoseFields(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     Attributes:
         position: [m]; of two fields they are x and y, and z is zero.
-        orientation: quaternion.
+        orientation: quaternion; empty, as ``angle``, of positions alone.
         angle: field of the heading in place of a quaternion, counterclockwise from x.
         angle_unit: unit of the heading.
         parent: field with the name of the reference frame.
