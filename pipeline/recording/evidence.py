@@ -347,8 +347,18 @@ def _shrink(log: float, share: float) -> float:
     return min(0.0, log - np.log(max(share, 1e-6))) if log < 0.0 else log
 
 
+_METRES = 3.0
+"""Surprise of wheels whose speeds are those of their rims [nats]."""
+_OF_METRES = 0.1
+"""Spread of the logarithm of the motion over them."""
+_UNUSUAL = 4.0
+"""Surprise of counts that no unit explains, as ticks of an encoder are [nats]."""
+_ANY = 10.0
+"""Range of the logarithm of what such a count may be."""
+
+
 def find_wheel_unit(gain: float, share: float, name: str, radius: float | None = None) -> str:
-    """Unit of wheel speeds by the radius that each would mean.
+    """Unit of wheel speeds by the radius that each would mean; empty if it is none, as ticks are.
 
     Args:
         gain: path over the wheels' angle.
@@ -358,17 +368,24 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     """
     words = {"rpm": "rpm", "deg/s": "deg"}
     named = {unit for unit, word in words.items() if re.search(rf"(?<![a-z]){word}(?![a-z])", name.lower())}
-    surprise = {unit: _STRANGE.get(unit, 0.0) for unit in WHEELS}
-    if named:
-        surprise = {unit: 0.0 if unit in named else _NAMED for unit in WHEELS}
     spread = 0.7 if radius is None else 0.35
+
+    def rate(factor: float, middle: float, spread: float) -> float:
+        return 0.5 * (_shrink(float(np.log(abs(gain) / factor / middle)), share) / spread) ** 2 + np.log(
+            spread
+        )
+
     costs = {
-        unit: _shrink(float(np.log(abs(gain) / factor / (radius or 0.12))), share) ** 2 / (2 * spread**2)
-        + surprise[unit]
+        unit: rate(factor, radius or _RADIUS[0], spread) + _STRANGE.get(unit, 0.0) * (not named)
         for unit, factor in WHEELS.items()
     }
+    costs["m/s"] = rate(1.0, 1.0, _OF_METRES) + _METRES
+    if radius is None:
+        costs[""] = float(np.log(_ANY / np.sqrt(2.0 * np.pi))) + _UNUSUAL
+    costs = {unit: cost + _NAMED * bool(named - {unit}) for unit, cost in costs.items()}
     best = min(costs, key=lambda unit: costs[unit])
-    return best if best in named or costs["rad/s"] - costs[best] > _WIN else "rad/s"
+    least = _CLEAR if best == "m/s" else _WIN
+    return best if best in named or costs["rad/s"] - costs[best] > least else "rad/s"
 
 
 # Roles.

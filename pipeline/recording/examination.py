@@ -127,6 +127,8 @@ _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
 _AHEAD_S = 0.02
 """Time by which a command is stamped after its recording [s] that is another clock's, and no rounding's."""
+_TAKEN_M = 0.1
+"""Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
 _MARGIN = 4.0
 """Gain of another command over the one by type and name that decides [nats]."""
 
@@ -1039,8 +1041,16 @@ class Examination:
         if wheels.source.signals[0].unit or self.configuration.wheels.unit is not None:
             return
         unit = find_wheel_unit(gain, share, str(wheels.source), radius)
-        if unit != "rad/s":
-            what = f"the wheel speeds of {wheels.source} are in {unit}"
+        what = f"the wheel speeds of {wheels.source} are in "
+        taken = (
+            "" if radius is not None else f": taken as those of wheels of {_TAKEN_M} m, which alters no slip"
+        )
+        if not unit:
+            what += f"no usual unit (ticks of an encoder?){taken}"
+            scale = float(f"{gain / _TAKEN_M:.4g}")
+            self._correct("wheels", what, f"scale = {scale:g}", {"scale": scale})
+        elif unit != "rad/s":
+            what += f"{unit}{taken if unit == 'm/s' else ''}"
             self._correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
 
     def _is_usable(self, drive: Candidate) -> bool:
@@ -1126,7 +1136,8 @@ class Examination:
                 speed, rate = self._command_factors()
                 radius = _scale(lengths[0], speed * self._wheel_factor())
                 made = replace(made, radius=radius, track=_scale(lengths[1], speed / rate))
-        return made
+        changes = self.changes.get("wheels", {})
+        return replace(made, is_taken="scale" in changes or changes.get("unit") == "m/s")
 
     def _command_factors(self) -> tuple[float, float]:
         """Factors from a body command as it was read to m/s and rad/s."""
@@ -1135,7 +1146,10 @@ class Examination:
 
     def _wheel_factor(self) -> float:
         """Factor from the radius of raw wheel speeds to that of rad/s."""
-        return 1.0 / WHEELS[str(self.changes.get("wheels", {}).get("unit", "rad/s"))]
+        changes = self.changes.get("wheels", {})
+        if changes.get("unit") == "m/s":
+            return _TAKEN_M
+        return 1.0 / WHEELS[str(changes.get("unit", "rad/s"))] / float(str(changes.get("scale", 1.0)))
 
     # What the user reads, and what the stages read.
 

@@ -44,6 +44,7 @@ class Geometry:
         rolled: wheel radius by the motion.
         effective: track by the motion.
         wheelbase: of a car, by the motion.
+        is_taken: whether the radius is any, since the speeds of the wheels show none.
     """
 
     radius: Length | None = None
@@ -51,6 +52,7 @@ class Geometry:
     rolled: Length | None = None
     effective: Length | None = None
     wheelbase: Length | None = None
+    is_taken: bool = False
 
     def list_lengths(self, kind: str) -> dict[str, Length]:
         """Plausible lengths of that kind of vehicle by name, those of its controller first."""
@@ -226,14 +228,15 @@ def describe_vehicle(
             f"fitted_{1e3 * lengths['wheelbase_m']:.0f}",
             f"{text} (wheelbase_m under [vehicle] gives another)",
         )
-    name, guess = _guess_platform(kind, lengths["wheel_radius_m"], lengths.get("track_width_m"))
+    is_shown = kind != "mecanum" and not seen.is_taken
+    name, guess = _guess_platform(lengths["wheel_radius_m"], lengths.get("track_width_m"), is_shown=is_shown)
     return f"fitted_{name}", f"{text} ({guess})"
 
 
-def _guess_platform(kind: str, radius: float, track: float | None) -> tuple[str, str]:
+def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tuple[str, str]:
     """Id of the platform with these lengths [m], or digits of them; and what to confirm."""
     name = f"{1e3 * radius:.0f}_{0.0 if track is None else 1e3 * track:.0f}"
-    if kind == "mecanum":
+    if not is_shown:
         return name, "[vehicle] gives others"
     alike = {} if track is None else find_alike(radius, track)
     if not alike:

@@ -217,7 +217,8 @@ def test_unit_of_a_steering_angle(
 @pytest.mark.parametrize(
     ("gain", "name", "unit"),
     [(0.033, "/joint_states", "rad/s"), (0.3, "/joint_states", "rad/s"), (0.0105, "/wheel/left/rpm", "rpm"),
-     (0.0017, "/wheels", "deg/s"), (0.1, "/wheel/left/rpm", "rad/s")],
+     (0.0017, "/wheels", "deg/s"), (0.1, "/wheel/left/rpm", "rad/s"), (1.02, "/wheel/speed", "m/s"),
+     (0.5, "/wheel/speed", "rad/s"), (3e-4, "/joint_states", "")],
 )  # fmt: skip
 def test_unit_of_wheel_speeds(gain: float, name: str, unit: str) -> None:
     assert find_wheel_unit(gain, 0.95, name) == unit
