@@ -371,9 +371,8 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     spread = 0.7 if radius is None else 0.35
 
     def rate(factor: float, middle: float, spread: float) -> float:
-        return 0.5 * (_shrink(float(np.log(abs(gain) / factor / middle)), share) / spread) ** 2 + np.log(
-            spread
-        )
+        apart = _shrink(float(np.log(abs(gain) / factor / middle)), share) / spread
+        return 0.5 * apart**2 + float(np.log(spread))
 
     costs = {
         unit: rate(factor, radius or _RADIUS[0], spread) + _STRANGE.get(unit, 0.0) * (not named)
