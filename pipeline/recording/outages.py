@@ -364,6 +364,14 @@ def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: 
         start, end = edges[index], edges[index + 1]
         inside = (begins >= start) & (begins + BLOCK_S <= end)
         if (np.abs(expected[inside]) > LIVE_SHARE * top).sum() * BLOCK_S > 0.5 * _SILENT_S:
-            is_last = index == side.times.size
-            made.append(Outage(name, float(start), np.inf if is_last else float(end), "nothing", np.inf))
+            is_first, is_last = index == 0, index == side.times.size
+            made.append(
+                Outage(
+                    name,
+                    -np.inf if is_first else float(start),
+                    np.inf if is_last else float(end),
+                    "nothing",
+                    np.inf,
+                )
+            )
     return made

@@ -8,7 +8,7 @@ what it was.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -414,6 +414,30 @@ def _solve(columns: Floats, values: Floats) -> tuple[Floats, Floats]:
     return gains / size, rest
 
 
+def _moves_otherwise(
+    blocks: _Blocks, asked: Floats, last: Floats, target: Floats, is_known: Flags, inside: Flags
+) -> bool:
+    """Whether in the pauses of a command the target follows neither the last one nor a stop.
+
+    Args:
+        blocks: of the run.
+        asked: shape (m, 3).
+        last: what was asked last, in the pauses, shape (m, 3).
+        target: shape (m, 3).
+        is_known: blocks in which the target is known, shape (m,).
+        inside: those of the pauses.
+    """
+    usual = _fit(blocks, asked, target, is_known & ~inside, is_command=True)
+    if usual is None or not inside.any():
+        return False
+    likelihoods = []
+    for source in (asked, asked + last):
+        expected = blocks.list_columns(source, usual.top, usual.friction) @ usual.gains
+        beside = replace(usual, expected=expected, is_judged=inside).compare()
+        likelihoods.append(float(beside[:, 1].sum()))
+    return min(likelihoods) > blocks.price
+
+
 def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple[list[Span], list[Finding]]:
     """Spans in which the wheels, or the body without encoders, do not follow the command."""
     measured = rims.moved if rims.driven is None else rims.driven
@@ -429,9 +453,21 @@ def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple
     if pauses:
         # Does the base keep its last command, or does it stop?
         keeps = _fit(blocks, asked + last, target, known, is_command=True)
-        if keeps is not None and keeps.total - fit.total > blocks.price:
+        longest = max(end - start for start, end in pauses)
+        inside = known & (np.abs(last).sum(axis=1) > 0.0)
+        if _moves_otherwise(blocks, asked, last, target, known, inside):
+            text = (
+                f"in {len(pauses)} pauses of the command, of up to {longest:.1f} s, the vehicle moves "
+                "otherwise than by its last one: another topic or a remote control commands it there, and "
+                "these stretches are left out"
+            )
+            findings.append(
+                Finding(
+                    "commanded_otherwise", "warning", text, where="command", value=longest, count=len(pauses)
+                )
+            )
+        elif keeps is not None and keeps.total - fit.total > blocks.price:
             fit, asked = keeps, asked + last
-            longest = max(end - start for start, end in pauses)
             text = (
                 f"in {len(pauses)} pauses the vehicle continues its last command until the next, for up to "
                 f"{longest:.1f} s beyond command.hold_s: the base holds its last command; set "

@@ -140,6 +140,16 @@ def test_a_base_that_keeps_its_last_command_is_not_driven_by_hand() -> None:
     assert not [one for one in findings if one.id in INCIDENTS]
 
 
+def test_a_command_whose_topic_changes_is_not_kept_by_the_base() -> None:
+    tables = extract(simulate_run(make_scenario(TRUTH, seed=3, duration_s=120.0)), HUSKY)
+    asked = tables["commands"]
+    first = asked.filter(pl.col("t") < asked["t"].mean())
+    findings = pass_stages({**tables, "commands": first}, HUSKY, hold_s=0.5)[1].findings
+    told = {one.id for one in findings}
+    assert "kept_command" not in told
+    assert {"commanded_otherwise", "manual_driving"} <= told
+
+
 @pytest.mark.long
 def test_95_of_100_incidents_are_found_within_a_second_at_both_ends() -> None:
     missed, more = [], 0
