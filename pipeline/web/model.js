@@ -200,8 +200,7 @@ const buildFormula = (pane) => {
   const parts = { effect: field("effect", "name, for example my_skid"), formula: field("formula", "formula: c * v0 * w0", true), parameters: field("parameters", "parameters: c [s] -0.5 .. 0.5", true) };
   const form = h("form", { onsubmit: async (event) => {
     event.preventDefault();
-    await pane.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value });
-    pane.tryAll();
+    if (await pane.act("formula", { effect: parts.effect.value.trim(), channel: channel.value, formula: parts.formula.value, parameters: parts.parameters.value })) pane.tryAll();
   } }, parts.effect, channel, parts.formula, parts.parameters, h("button", { type: "submit" }, "Add formula"),
   h("p", { class: "quiet" }, "Signals: v0, s0 (lateral), w0, f_x, f_w, left, right, roll, pitch, yaw, x, y, t, and each with _rate. Units are checked."));
   return h("details", { class: "formula" }, h("summary", {}, "Write a formula"), form);

@@ -67,8 +67,8 @@ export class Pane {
 
   async ask(action, more = {}) {
     const run = more.run ?? this.run;
-    // What was said of the step before does not stand over this one.
-    untoast();
+    // What was said of the step before does not stand over this one; a trial is no step.
+    if (action !== "try") untoast();
     this.busy(true);
     try {
       const input = more.input ?? this.state?.session.input ?? null;
@@ -85,10 +85,12 @@ export class Pane {
     }
   }
 
-  // The numbers first, then the figures.
+  // The numbers first, then the figures; whether it was done.
   async act(action, more = {}) {
     await this.settle();
-    if (await this.ask(action, more)) await this.redraw();
+    const done = await this.ask(action, more);
+    if (done) await this.redraw();
+    return done;
   }
 
   // A value that was set a moment ago becomes a step before anything else happens.
@@ -323,14 +325,12 @@ export class Pane {
 
   // The joint fit of the diagnosis, as one step that can be undone.
   async addAll() {
-    await this.act("add_named");
-    this.tryAll();
+    if (await this.act("add_named")) this.tryAll();
   }
 
   // The formula that the diagnosis found for what no effect explains.
   async addFound() {
-    await this.act("add_found");
-    this.tryAll();
+    if (await this.act("add_found")) this.tryAll();
   }
 
   async tryAll(anyway = false) {

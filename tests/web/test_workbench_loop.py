@@ -1,6 +1,7 @@
 """Compare, see where, learn, add, watch the error fall: the loop of the workbench, on both screens."""
 
 import os
+import time
 from contextlib import closing
 from pathlib import Path
 from typing import cast
@@ -73,6 +74,22 @@ def test_a_notice_does_not_stand_over_the_next_step(chrome: Chrome, workbench: W
     chrome.wait("!document.getElementById('toast').hidden")
     chrome.click(".proposals .add")
     chrome.wait("document.querySelector('.card') && document.getElementById('toast').hidden")
+
+
+def test_why_a_formula_was_refused_stays_until_the_next_step(chrome: Chrome, workbench: Workbench) -> None:
+    chrome.size(LAPTOP, 900)
+    chrome.open(workbench.address)
+    chrome.wait(f"{SHOWN} && !document.querySelector('.trying')")
+    chrome.run("document.querySelector('details.formula').open = true")
+    for name, value in {"effect": "mine", "formula": "c * v0", "parameters": "c [s] -1 .. 1"}.items():
+        chrome.run(f"document.querySelector('.formula [name={name}]').value = '{value}'")
+    chrome.click(".formula [type=submit]")
+    chrome.wait("!document.getElementById('toast').hidden")
+    time.sleep(0.5)
+    assert not chrome.run("document.getElementById('toast').hidden")
+    assert "m/s" in str(chrome.run("document.getElementById('toast').textContent"))
+    # The browser notes a refused request by itself.
+    chrome.errors.clear()
 
 
 def test_it_opens_with_the_run_that_was_analyzed_last(chrome: Chrome, results: Path, tmp_path: Path) -> None:
