@@ -18,7 +18,7 @@ from pathlib import Path
 
 from pipeline.analysis import Options
 from pipeline.batch import Request
-from pipeline.batch.season import run_batch
+from pipeline.batch.batch_run import run_batch
 from pipeline.simulate import simulate_case
 from pipeline.store import Store
 from pipeline.store import verification as room

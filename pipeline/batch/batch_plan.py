@@ -30,7 +30,7 @@ from pipeline.store import (
     see_log,
 )
 
-# Basis of a log: a hash of everything that its results depend on except the log itself.
+# Fingerprint of a log: a hash of everything that its results depend on except the log itself.
 #
 # It covers more than the keys of the stages, so that it is available without opening the log. If it differs,
 # the keys decide what has to be computed.
@@ -39,8 +39,8 @@ _WITHOUT_INFLUENCE = ("out", "run", "config", "fleet", "report", "figures", "for
 """Options without influence on the tables, or whose content is hashed separately."""
 
 
-class BasisHasher:
-    """Hashes the basis of many logs, reading each configuration file once.
+class Fingerprinter:
+    """Fingerprints of many logs, reading each configuration file once.
 
     Args:
         options: options of the user.
@@ -53,8 +53,8 @@ class BasisHasher:
         self._shared = hash_json([msgspec.to_builtins(asked, enc_hook=str), _fingerprint_program()])
         self._contents: dict[Path, str] = {}
 
-    def hash_basis(self, log: Path) -> str:
-        """Hash for one log."""
+    def find_fingerprint(self, log: Path) -> str:
+        """That of one log."""
         files = list_configuration_files(log, given=self._options.config, fleet=self._options.fleet)
         return hash_json([self._shared, [[str(file), self._hash_content(file)] for file in files]])
 
@@ -188,7 +188,7 @@ class Item:
     Attributes:
         path: the recording.
         log: state of its file; empty if it cannot be read.
-        basis: hash of everything else its results depend on.
+        fingerprint: hash of everything else its results depend on.
         before: previous ledger entry, whether or not the log has changed since.
         run: name of its run; empty until it is assigned.
         copy_of: run of the same content, if the log is a copy.
@@ -196,7 +196,7 @@ class Item:
 
     path: Path
     log: LogSighting
-    basis: str
+    fingerprint: str
     before: Entry | None = None
     run: str = ""
     copy_of: str = ""
@@ -226,7 +226,7 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     ledger = Ledger(store).read_all()
     manifests = {manifest.run: manifest for manifest in store.survey().manifests}
     asked_again = {run for run, manifest in manifests.items() if store.is_asked_again(manifest)}
-    hasher = BasisHasher(request.options)
+    hasher = Fingerprinter(request.options)
     items = [_look_at(path, hasher, ledger) for path in paths]
     settled: list[Entry] = []
     open_items: list[Item] = []
@@ -240,7 +240,7 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     named = _name_items(open_items, items, manifests, store)
     for item in named:
         if item.copy_of:
-            entry = Entry(log=item.log, basis=item.basis, state="copy", reason=item.copy_of)
+            entry = Entry(log=item.log, fingerprint=item.fingerprint, state="copy", reason=item.copy_of)
             Ledger(store).write(entry)
             settled.append(entry)
     todo = (item for item in named if not item.copy_of)
@@ -250,17 +250,17 @@ def make_plan(paths: Sequence[Path], store: Store, request: Request) -> Plan:
     )
 
 
-def _look_at(path: Path, hasher: BasisHasher, ledger: Mapping[str, Entry]) -> Item:
+def _look_at(path: Path, hasher: Fingerprinter, ledger: Mapping[str, Entry]) -> Item:
     # Unreadable logs are processed all the same: this reports what is wrong with them.
-    log, basis = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
+    log, fingerprint = LogSighting(path=str(path), size=0, mtime_ns=0, inode=0, seen_ns=0), ""
     with suppress(OSError, SlipError):
         log = see_log(path)
-        basis = hasher.hash_basis(path)
-    return Item(path=path, log=log, basis=basis, before=ledger.get(log.path))
+        fingerprint = hasher.find_fingerprint(path)
+    return Item(path=path, log=log, fingerprint=fingerprint, before=ledger.get(log.path))
 
 
 def _is_settled(item: Item, entry: Entry, manifests: Mapping[str, Manifest], request: Request) -> bool:
-    if not entry.fits(item.log, item.basis) or request.options.force:
+    if not entry.fits(item.log, item.fingerprint) or request.options.force:
         return False
     if entry.state == "quarantined":
         return not request.retries_quarantined

@@ -35,7 +35,7 @@ STATES = ("done", "unchanged", "lossy", "refused", "failed", "quarantined")
 WITH_RESULTS = frozenset({"done", "lossy", "refused"})
 
 FATAL_KILLS = 2
-"""Number of killed workers after which a log is quarantined until it, or its basis, changes."""
+"""Number of killed workers after which a log is quarantined until it, or its fingerprint, changes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ class Entry:
 
     Attributes:
         log: state of the file when it was processed.
-        basis: hash of everything beside the log that its results depend on (`hash_basis`).
+        fingerprint: hash of everything beside the log that its results depend on (`find_fingerprint`).
         state: one of `STATES` but ``unchanged``, or ``copy`` of another log's content.
         run: name of its run; empty if it has none.
         key: key of the generation that was made.
@@ -60,7 +60,7 @@ class Entry:
     """
 
     log: LogSighting
-    basis: str
+    fingerprint: str
     state: str
     run: str = ""
     key: str = ""
@@ -74,9 +74,9 @@ class Entry:
     fetched_bytes: int = 0
     at: float = field(default=0.0)
 
-    def fits(self, log: LogSighting, basis: str) -> bool:
-        """Whether neither the log nor its basis has changed."""
-        return self.log.is_same_file(log) and self.basis == basis
+    def fits(self, log: LogSighting, fingerprint: str) -> bool:
+        """Whether neither the log nor its fingerprint has changed."""
+        return self.log.is_same_file(log) and self.fingerprint == fingerprint
 
 
 class Ledger:
@@ -131,14 +131,14 @@ class Task:
     Attributes:
         path: the recording.
         log: state of its file when the batch was planned.
-        basis: hash of everything else the results depend on.
+        fingerprint: hash of everything else the results depend on.
         options: options of the analysis, including the name of its run.
         address: address of the results, if they are on an object store.
     """
 
     path: Path
     log: LogSighting
-    basis: str
+    fingerprint: str
     options: Options
     address: str | None = None
 
@@ -167,7 +167,7 @@ def work_safely(work: Callable[[Task], Report], task: Task) -> Report:
         work: function to call.
         task: its task.
     """
-    entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
+    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
     try:
         report = work(task)
         pickle.dumps(report)
@@ -183,7 +183,7 @@ def work_on(task: Task) -> Report:
     mirror = None if task.address is None else Mirror(task.address, task.options.out)
     store = Store(task.options.out)
     started, fetched = time.monotonic(), FETCHED.total
-    entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
+    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
     is_new = False
     try:
         with store.claim(entry.run) as is_ours:

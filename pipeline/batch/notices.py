@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.batch import BatchError
-from pipeline.batch.season import Outcome
+from pipeline.batch.batch_run import Outcome
 from pipeline.core import SlipError, make_plain, shorten
 from pipeline.datasets import BROKEN, Baseline, Limits, check_runs, format_quiet, read_baseline, read_digest
 from pipeline.models import ModelFile, read_model

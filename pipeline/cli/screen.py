@@ -28,7 +28,7 @@ from pipeline.results import RunDiagnosis, read_result
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from pipeline.batch.season import Line
+    from pipeline.batch.batch_run import Line
 
     Seen = Mapping[str, object]
 

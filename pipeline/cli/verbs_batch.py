@@ -37,8 +37,8 @@ from pipeline.cli.conventions import (
 from pipeline.core import SlipError, align_rows, measure_memory, slip_command
 
 if TYPE_CHECKING:
+    from pipeline.batch.batch_run import Line, Outcome
     from pipeline.batch.notices import Looked, Notice
-    from pipeline.batch.season import Line, Outcome
     from pipeline.datasets import Baseline, Limits
     from pipeline.models import ModelFile
 
@@ -169,7 +169,7 @@ def run(  # noqa: D417 - the shared choices document themselves
         retries_quarantined=retry_quarantined,
         pruning=pruning if prune else None,
     )
-    from pipeline.batch.season import run_batch  # noqa: PLC0415 - heavy
+    from pipeline.batch.batch_run import run_batch  # noqa: PLC0415 - heavy
 
     try:
         references = afterwards.open_references()

@@ -271,7 +271,7 @@ class Setting:
 
 
 @dataclass
-class Sheet:
+class ParameterTable:
     """Parameters of a target, in order.
 
     Attributes:
@@ -431,9 +431,9 @@ class Facts:
         rim = self.take(Quantity.DEADBAND).change(operator.mul, self.take(Quantity.RADIUS))
         return rim, self._turn(rim)
 
-    def list_unmapped(self, sheet: Sheet) -> list[str]:
-        """Parameters of effects that a sheet does not cover, one line for each effect."""
-        used = {(name, source) for one in sheet.settings for source in one.sources for name in one.effects}
+    def list_unmapped(self, table: ParameterTable) -> list[str]:
+        """Parameters of effects that a table does not cover, one line for each effect."""
+        used = {(name, source) for one in table.settings for source in one.sources for name in one.effects}
         lines = []
         for effect in self.file.model:
             texts = [self._format_source(effect, p) for p in effect.parameters if effect.is_used(p)]
@@ -491,8 +491,8 @@ def name_entity(vehicle: Vehicle) -> str:
     return re.sub(r"\W+", "_", vehicle.id) or "robot"
 
 
-def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sheet]:
-    """Facts of a model, and a sheet with a head that gives vehicle, target and fit.
+def start_table(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, ParameterTable]:
+    """Facts of a model, and a table with a head that gives vehicle, target and fit.
 
     Raises:
         MotionError: ``wrong_vehicle``, the target has no parameters for this kind of vehicle.
@@ -512,7 +512,7 @@ def start_sheet(file: ModelFile, target: Target, *kinds: str) -> tuple[Facts, Sh
         facts.format_fit(),
         facts.vehicle.format_unknown(),
     ]
-    return facts, Sheet([line for line in head if line])
+    return facts, ParameterTable([line for line in head if line])
 
 
 def _join(quantity: Quantity, values: list[float]) -> float:
@@ -538,17 +538,17 @@ def _take_least(*amounts: Amount) -> Amount:
 _INDENT = 2
 
 
-def list_comments(facts: Facts, sheet: Sheet) -> list[str]:
+def list_comments(facts: Facts, table: ParameterTable) -> list[str]:
     """Comment lines above the parameters: the head, and the effects that none of them covers."""
-    unmapped = facts.list_unmapped(sheet)
-    lines = [*sheet.head, *(["Not covered by these parameters:"] if unmapped else [])]
+    unmapped = facts.list_unmapped(table)
+    lines = [*table.head, *(["Not covered by these parameters:"] if unmapped else [])]
     return [make_plain(line) for line in [*lines, *(f"  {line}" for line in unmapped)]]
 
 
-def write_yaml(facts: Facts, sheet: Sheet) -> str:
-    """Format a sheet as a ROS 2 parameter file."""
+def write_yaml(facts: Facts, table: ParameterTable) -> str:
+    """Format a table as a ROS 2 parameter file."""
     tree = CommentedMap()
-    for setting in sheet.settings:
+    for setting in table.settings:
         group = tree
         *above, name = setting.path.split(".")
         for node in above:
@@ -556,7 +556,7 @@ def write_yaml(facts: Facts, sheet: Sheet) -> str:
         group[name] = _make_value(setting.value)
         comment = "\n".join(make_plain(line) for line in setting.sources)
         group.yaml_set_comment_before_after_key(name, before=comment, indent=_INDENT * len(above))
-    comments = "".join(f"# {line}\n" for line in list_comments(facts, sheet))
+    comments = "".join(f"# {line}\n" for line in list_comments(facts, table))
     if not tree:
         return comments
     yaml, text = YAML(), io.StringIO()

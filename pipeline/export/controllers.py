@@ -16,14 +16,14 @@ from pipeline.export import (
     Amount,
     Current,
     Facts,
+    ParameterTable,
     Setting,
-    Sheet,
     Target,
     combine,
     list_comments,
     name_entity,
     quote_name,
-    start_sheet,
+    start_table,
     write_yaml,
 )
 from pipeline.export.simulator import describe_spread
@@ -44,48 +44,48 @@ def write_nav2(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, NAV2, "differential", "ackermann", "mecanum", "omni")
+    facts, table = start_table(file, NAV2, "differential", "ackermann", "mecanum", "omni")
     moves_sideways = facts.vehicle.kinematics.has_inputs("sideways")
-    sheet.add(f"{_CONTROLLER}.model_delay_vx", facts.find_speed_delay(), _DELAY)
+    table.add(f"{_CONTROLLER}.model_delay_vx", facts.find_speed_delay(), _DELAY)
     if moves_sideways:
-        sheet.add(f"{_CONTROLLER}.model_delay_vy", facts.find_speed_delay(), _DELAY)
-    sheet.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
+        table.add(f"{_CONTROLLER}.model_delay_vy", facts.find_speed_delay(), _DELAY)
+    table.add(f"{_CONTROLLER}.model_delay_wz", facts.find_turn_delay(), _DELAY)
     if not moves_sideways:
-        _add_limits_of_nav2(facts, sheet)
+        _add_limits_of_nav2(facts, table)
     if facts.vehicle.kind == "ackermann":
         key = f"{_CONTROLLER}.ackermann.min_turning_r"
-        sheet.add(key, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
-    return write_yaml(facts, sheet)
+        table.add(key, facts.find_turning_radius(), "MPPI with motion_model: ackermann")
+    return write_yaml(facts, table)
 
 
-def _add_limits_of_nav2(facts: Facts, sheet: Sheet) -> None:
+def _add_limits_of_nav2(facts: Facts, table: ParameterTable) -> None:
     speed, turn = facts.find_speed_limit(), facts.find_turn_limit()
     acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
-    sheet.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
-    sheet.add(f"{_CONTROLLER}.vx_min", -speed, "MPPI")
-    sheet.add(f"{_CONTROLLER}.wz_max", turn, "MPPI")
-    sheet.add(f"{_CONTROLLER}.ax_max", acceleration, "MPPI")
-    sheet.add(f"{_CONTROLLER}.ax_min", -acceleration, "MPPI")
-    sheet.add(f"{_CONTROLLER}.az_max", turning, "MPPI")
-    sheet.add_row(
+    table.add(f"{_CONTROLLER}.vx_max", speed, "MPPI")
+    table.add(f"{_CONTROLLER}.vx_min", -speed, "MPPI")
+    table.add(f"{_CONTROLLER}.wz_max", turn, "MPPI")
+    table.add(f"{_CONTROLLER}.ax_max", acceleration, "MPPI")
+    table.add(f"{_CONTROLLER}.ax_min", -acceleration, "MPPI")
+    table.add(f"{_CONTROLLER}.az_max", turning, "MPPI")
+    table.add_row(
         f"{_CONTROLLER}.VelocityDeadbandCritic.deadband_velocities",
         (facts.find_deadband()[0], 0.0, facts.find_deadband()[1]),
         "MPPI with VelocityDeadbandCritic among its critics",
     )
     pursuit = "regulated pure pursuit"
-    sheet.add(f"{_CONTROLLER}.max_linear_vel", speed, f"{pursuit}; desired_linear_vel up to Kilted")
-    sheet.add(f"{_CONTROLLER}.min_linear_vel", -speed, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_angular_vel", turn, pursuit)
-    sheet.add(f"{_CONTROLLER}.min_angular_vel", -turn, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_linear_accel", acceleration, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_linear_decel", -acceleration, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
-    sheet.add(f"{_CONTROLLER}.max_angular_decel", -turning, pursuit)
+    table.add(f"{_CONTROLLER}.max_linear_vel", speed, f"{pursuit}; desired_linear_vel up to Kilted")
+    table.add(f"{_CONTROLLER}.min_linear_vel", -speed, pursuit)
+    table.add(f"{_CONTROLLER}.max_angular_vel", turn, pursuit)
+    table.add(f"{_CONTROLLER}.min_angular_vel", -turn, pursuit)
+    table.add(f"{_CONTROLLER}.max_linear_accel", acceleration, pursuit)
+    table.add(f"{_CONTROLLER}.max_linear_decel", -acceleration, pursuit)
+    table.add(f"{_CONTROLLER}.max_angular_accel", turning, pursuit)
+    table.add(f"{_CONTROLLER}.max_angular_decel", -turning, pursuit)
     # The smoother needs a limit for every axis or for none.
-    sheet.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
-    sheet.add_row(f"{_SMOOTHER}.min_velocity", (-speed, 0.0, -turn))
-    sheet.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
-    sheet.add_row(f"{_SMOOTHER}.max_decel", (-acceleration, 0.0, -turning))
+    table.add_row(f"{_SMOOTHER}.max_velocity", (speed, 0.0, turn))
+    table.add_row(f"{_SMOOTHER}.min_velocity", (-speed, 0.0, -turn))
+    table.add_row(f"{_SMOOTHER}.max_accel", (acceleration, 0.0, turning))
+    table.add_row(f"{_SMOOTHER}.max_decel", (-acceleration, 0.0, -turning))
 
 
 NAV2 = Target(
@@ -103,43 +103,43 @@ def write_ros2_control(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, ROS2_CONTROL, "differential", "ackermann")
+    facts, table = start_table(file, ROS2_CONTROL, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
-        _add_differential(facts, sheet)
+        _add_differential(facts, table)
     else:
-        _add_ackermann(facts, sheet)
-    return write_yaml(facts, sheet)
+        _add_ackermann(facts, table)
+    return write_yaml(facts, table)
 
 
-def _add_differential(facts: Facts, sheet: Sheet) -> None:
+def _add_differential(facts: Facts, table: ParameterTable) -> None:
     node = "diff_drive_controller.ros__parameters"
     radius, difference = facts.take(Quantity.RADIUS), facts.take(Quantity.RADIUS_DIFFERENCE)
-    sheet.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
-    sheet.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
+    table.add(f"{node}.wheel_separation", facts.measure("track_width_m"))
+    table.add(f"{node}.wheel_radius", facts.measure("wheel_radius_m"))
     track = facts.take(Quantity.TRACK)
-    sheet.add(f"{node}.wheel_separation_multiplier", track, "replaces the present multiplier")
+    table.add(f"{node}.wheel_separation_multiplier", track, "replaces the present multiplier")
     left = combine(lambda k, e: k * (1.0 - e / 2.0), radius, difference)
     right = combine(lambda k, e: k * (1.0 + e / 2.0), radius, difference)
-    sheet.add(f"{node}.left_wheel_radius_multiplier", left)
-    sheet.add(f"{node}.right_wheel_radius_multiplier", right)
+    table.add(f"{node}.left_wheel_radius_multiplier", left)
+    table.add(f"{node}.right_wheel_radius_multiplier", right)
     for axis, limit, acceleration in (
         ("linear.x", facts.find_speed_limit(), facts.find_speed_acceleration()),
         ("angular.z", facts.find_turn_limit(), facts.find_turn_acceleration()),
     ):
-        sheet.add(f"{node}.{axis}.max_velocity", limit)
-        sheet.add(f"{node}.{axis}.min_velocity", -limit)
-        sheet.add(f"{node}.{axis}.max_acceleration", acceleration)
-        sheet.add(f"{node}.{axis}.max_deceleration", -acceleration)
-    sheet.head += describe_spread(facts)
-    sheet.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
+        table.add(f"{node}.{axis}.max_velocity", limit)
+        table.add(f"{node}.{axis}.min_velocity", -limit)
+        table.add(f"{node}.{axis}.max_acceleration", acceleration)
+        table.add(f"{node}.{axis}.max_deceleration", -acceleration)
+    table.head += describe_spread(facts)
+    table.head.append("On Humble limits also need has_velocity_limits and has_acceleration_limits.")
 
 
-def _add_ackermann(facts: Facts, sheet: Sheet) -> None:
+def _add_ackermann(facts: Facts, table: ParameterTable) -> None:
     node = "ackermann_steering_controller.ros__parameters"
-    sheet.add(f"{node}.wheelbase", facts.find_wheelbase())
-    sheet.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
-    sheet.add(f"{node}.traction_wheels_radius", facts.find_radius())
-    sheet.head.append(
+    table.add(f"{node}.wheelbase", facts.find_wheelbase())
+    table.add(f"{node}.traction_track_width", facts.measure("track_width_m"))
+    table.add(f"{node}.traction_wheels_radius", facts.find_radius())
+    table.head.append(
         "On Humble traction_track_width is rear_wheel_track, traction_wheels_radius rear_wheels_radius."
     )
 
@@ -172,52 +172,52 @@ def write_autoware(file: ModelFile, current: Current, gate: str = "auto") -> str
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, AUTOWARE, "ackermann")
-    sheet.add(f"{_ALL}.wheel_radius", facts.find_radius(), _INFO)
-    sheet.add(f"{_ALL}.wheel_base", facts.find_wheelbase(), _INFO)
-    sheet.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
-    sheet.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
+    facts, table = start_table(file, AUTOWARE, "ackermann")
+    table.add(f"{_ALL}.wheel_radius", facts.find_radius(), _INFO)
+    table.add(f"{_ALL}.wheel_base", facts.find_wheelbase(), _INFO)
+    table.add(f"{_ALL}.wheel_tread", facts.measure("track_width_m"), _INFO)
+    table.add(f"{_ALL}.max_steer_angle", facts.measure("max_steering_rad"), _INFO)
     delay, lag = facts.take(Quantity.COMMAND_DELAY), facts.take(Quantity.STEERING_LAG)
-    sheet.add(f"{_ALL}.input_delay", delay, _MPC)
-    sheet.add(f"{_ALL}.vehicle_model_steer_tau", lag, f"{_MPC} with vehicle_model_type: kinematics")
-    sheet.add(f"{_ALL}.delay_compensation_time", delay, _PID)
-    sheet.add(f"{_ALL}.vel_time_delay", delay, _SIMULATOR)
-    sheet.add(f"{_ALL}.vel_time_constant", facts.take(Quantity.SPEED_LAG), _SIMULATOR)
-    sheet.add(f"{_ALL}.steer_time_delay", delay, _SIMULATOR)
-    sheet.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
-    sheet.add(f"{_ALL}.vel_lim", facts.find_speed_limit(), _SIMULATOR)
-    sheet.add(f"{_ALL}.vel_rate_lim", facts.find_speed_acceleration(), _SIMULATOR)
-    _add_offset(facts, sheet, gate)
-    return write_yaml(facts, sheet)
+    table.add(f"{_ALL}.input_delay", delay, _MPC)
+    table.add(f"{_ALL}.vehicle_model_steer_tau", lag, f"{_MPC} with vehicle_model_type: kinematics")
+    table.add(f"{_ALL}.delay_compensation_time", delay, _PID)
+    table.add(f"{_ALL}.vel_time_delay", delay, _SIMULATOR)
+    table.add(f"{_ALL}.vel_time_constant", facts.take(Quantity.SPEED_LAG), _SIMULATOR)
+    table.add(f"{_ALL}.steer_time_delay", delay, _SIMULATOR)
+    table.add(f"{_ALL}.steer_time_constant", lag, _SIMULATOR)
+    table.add(f"{_ALL}.vel_lim", facts.find_speed_limit(), _SIMULATOR)
+    table.add(f"{_ALL}.vel_rate_lim", facts.find_speed_acceleration(), _SIMULATOR)
+    _add_offset(facts, table, gate)
+    return write_yaml(facts, table)
 
 
-def _add_offset(facts: Facts, sheet: Sheet, gate: str) -> None:
+def _add_offset(facts: Facts, table: ParameterTable, gate: str) -> None:
     offset = facts.take(Quantity.STEERING_OFFSET)
     sign = "measured minus true angle: an offset to the left is a negative bias"
-    sheet.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
+    table.add(f"{_ALL}.steer_bias", -offset, f"{_SIMULATOR}; {sign}")
     if not offset.is_known:
         return
     condition, lower, turn = _find_condition(facts)
-    sheet.head.append(
+    table.head.append(
         f"steer_offset = {offset.value:.5g} rad with gate {gate}: true less measured angle as in "
         f"steer_offset_estimator{condition}; another load, tyre or ground may change it."
     )
     is_applied = gate != "off"
     sources = (*offset.sources, f"{_MPC}; gate {gate}: the offset is {'' if is_applied else 'not '}applied")
     switch = f"{_ALL}.steering_offset.enable_auto_steering_offset_removal"
-    sheet.settings.append(Setting(switch, is_applied, sources, offset.effects))
+    table.settings.append(Setting(switch, is_applied, sources, offset.effects))
     if is_applied:
-        sheet.add(f"{_ALL}.steer_offset", offset, "steer_offset.param.yaml, where the controller begins")
+        table.add(f"{_ALL}.steer_offset", offset, "steer_offset.param.yaml, where the controller begins")
     learned = gate == "auto"
     note = f"{_ESTIMATOR}; {'goes on learning' if learned else 'learns nothing'}"
-    sheet.settings.append(Setting(f"{_ALL}.calibration.mode", "auto" if learned else "off", (note,)))
+    table.settings.append(Setting(f"{_ALL}.calibration.mode", "auto" if learned else "off", (note,)))
     if not learned:
         return
-    sheet.add(f"{_ALL}.initial_offset", offset, _ESTIMATOR)
-    sheet.add(f"{_ALL}.initial_covariance", facts.find_variance(Quantity.STEERING_OFFSET), _ESTIMATOR)
+    table.add(f"{_ALL}.initial_offset", offset, _ESTIMATOR)
+    table.add(f"{_ALL}.initial_covariance", facts.find_variance(Quantity.STEERING_OFFSET), _ESTIMATOR)
     as_here = f"{_ESTIMATOR}; where the offset was measured"
-    sheet.add(f"{_ALL}.min_velocity", lower, as_here)
-    sheet.add(f"{_ALL}.max_ang_velocity", turn, as_here)
+    table.add(f"{_ALL}.min_velocity", lower, as_here)
+    table.add(f"{_ALL}.max_ang_velocity", turn, as_here)
 
 
 def _find_condition(facts: Facts) -> tuple[str, Amount, Amount]:
@@ -262,16 +262,16 @@ def write_px4(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, PX4, "differential", "ackermann")
+    facts, table = start_table(file, PX4, "differential", "ackermann")
     if facts.vehicle.kind == "differential":
-        sheet.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
-        sheet.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
+        table.add("RD_WHEEL_TRACK", facts.measure("track_width_m"))
+        table.add("RO_YAW_RATE_CORR", facts.take(Quantity.TRACK))
     else:
-        sheet.add("RA_WHEEL_BASE", facts.find_wheelbase())
-        sheet.add("RA_MAX_STR_ANG", facts.find_largest_steering())
-    sheet.add(_FULL_SPEED, _find_full_speed(facts, current))
-    _add_limits(facts, sheet)
-    return _write_lines(facts, sheet)
+        table.add("RA_WHEEL_BASE", facts.find_wheelbase())
+        table.add("RA_MAX_STR_ANG", facts.find_largest_steering())
+    table.add(_FULL_SPEED, _find_full_speed(facts, current))
+    _add_limits(facts, table)
+    return _write_lines(facts, table)
 
 
 def read_px4(text: str) -> Current:
@@ -302,25 +302,25 @@ def _find_full_speed(facts: Facts, current: Current) -> Amount:
     return combine(operator.mul, facts.take(Quantity.RADIUS), used)
 
 
-def _add_limits(facts: Facts, sheet: Sheet) -> None:
+def _add_limits(facts: Facts, table: ParameterTable) -> None:
     acceleration = facts.find_speed_acceleration()
     turn, turning = (
         amount.change(math.degrees) for amount in (facts.find_turn_limit(), facts.find_turn_acceleration())
     )
-    sheet.add("RO_SPEED_LIM", facts.find_speed_limit())
-    sheet.add("RO_YAW_RATE_LIM", turn, "in deg/s")
-    sheet.add("RO_ACCEL_LIM", acceleration)
-    sheet.add("RO_DECEL_LIM", acceleration)
-    sheet.add("RO_YAW_ACCEL_LIM", turning, "in deg/s^2")
-    sheet.add("RO_YAW_DECEL_LIM", turning, "in deg/s^2")
+    table.add("RO_SPEED_LIM", facts.find_speed_limit())
+    table.add("RO_YAW_RATE_LIM", turn, "in deg/s")
+    table.add("RO_ACCEL_LIM", acceleration)
+    table.add("RO_DECEL_LIM", acceleration)
+    table.add("RO_YAW_ACCEL_LIM", turning, "in deg/s^2")
+    table.add("RO_YAW_DECEL_LIM", turning, "in deg/s^2")
 
 
-def _write_lines(facts: Facts, sheet: Sheet) -> str:
+def _write_lines(facts: Facts, table: ParameterTable) -> str:
     text = io.StringIO()
     writer = csv.writer(text, delimiter="\t", lineterminator="\n")
-    text.writelines(f"# {line}\n" for line in list_comments(facts, sheet))
+    text.writelines(f"# {line}\n" for line in list_comments(facts, table))
     text.write("#\n# Vehicle-Id Component-Id Name Value Type\n")
-    for setting in sheet.settings:
+    for setting in table.settings:
         text.writelines(f"# {make_plain(line)}\n" for line in setting.sources)
         writer.writerow([1, 1, setting.path, setting.value, _REAL32])
     return text.getvalue()
@@ -354,18 +354,18 @@ def write_vesc(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``gains_unknown``, neither is there.
     """
-    facts, sheet = start_sheet(file, VESC, "ackermann")
+    facts, table = start_table(file, VESC, "ackermann")
     speed, servo, centre = (_find_current(facts, current, name) for name in VESC.corrects)
     radius = facts.take(Quantity.RADIUS)
     gain, offset = facts.take(Quantity.STEERING_GAIN), facts.take(Quantity.STEERING_OFFSET)
-    sheet.add(f"{_ALL}.{_SPEED_GAIN}", combine(operator.truediv, speed, radius))
-    sheet.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
+    table.add(f"{_ALL}.{_SPEED_GAIN}", combine(operator.truediv, speed, radius))
+    table.add(f"{_ALL}.{_STEERING_GAIN}", combine(operator.truediv, servo, gain))
     straight = combine(lambda c, s, g, o: c - s * o / g, centre, servo, gain, offset)
-    sheet.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
-    sheet.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.find_wheelbase())
+    table.add(f"{_ALL}.{_STEERING_OFFSET}", straight)
+    table.add("vesc_to_odom_node.ros__parameters.wheelbase", facts.find_wheelbase())
     limit = facts.find_speed_acceleration()
-    sheet.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
-    return write_yaml(facts, sheet)
+    table.add("throttle_interpolator.ros__parameters.max_acceleration", limit)
+    return write_yaml(facts, table)
 
 
 def read_vesc(text: str) -> Current:

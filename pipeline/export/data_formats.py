@@ -7,7 +7,7 @@ import textwrap
 from datetime import date, time
 
 from pipeline.core import finite_or_none, pick
-from pipeline.export import Amount, Current, Facts, Target, require_plausible, start_sheet, write_yaml
+from pipeline.export import Amount, Current, Facts, Target, require_plausible, start_table, write_yaml
 from pipeline.models import FormulaEffect, ModelFile, Quantity, ResidualTerm, learned_as_table
 from pipeline.run import find_limits, trace_traction
 
@@ -120,10 +120,10 @@ def write_thresholds(file: ModelFile, current: Current) -> str:
         MotionError: ``wrong_vehicle``.
     """
     del current
-    facts, sheet = start_sheet(file, NAV2_TRACTION, "differential", "ackermann")
+    facts, table = start_table(file, NAV2_TRACTION, "differential", "ackermann")
     for name, amount in _list_thresholds(facts).items():
-        sheet.add(f"{_NODE}.{name}", amount)
-    return write_yaml(facts, sheet)
+        table.add(f"{_NODE}.{name}", amount)
+    return write_yaml(facts, table)
 
 
 TRACTION = Target(

@@ -3,7 +3,7 @@
 from xml.etree import ElementTree as ET
 
 from pipeline.core import make_plain
-from pipeline.export import Current, Facts, Sheet, Target, list_comments, start_sheet
+from pipeline.export import Current, Facts, ParameterTable, Target, list_comments, start_table
 from pipeline.models import ModelFile
 
 _DRIVE_PLUGINS = {
@@ -18,20 +18,20 @@ def write_gazebo(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, GAZEBO, *_DRIVE_PLUGINS)
-    sheet.add("plugin.wheel_radius", facts.find_radius())
+    facts, table = start_table(file, GAZEBO, *_DRIVE_PLUGINS)
+    table.add("plugin.wheel_radius", facts.find_radius())
     if facts.vehicle.kind == "differential":
         note = "for a simulated ground on which the wheels skid as on the real one"
-        sheet.add("plugin.wheel_separation", facts.find_track(), note)
+        table.add("plugin.wheel_separation", facts.find_track(), note)
     else:
-        sheet.add("plugin.wheel_separation", facts.measure("track_width_m"))
-        sheet.add("plugin.wheel_base", facts.find_wheelbase())
-        sheet.add("plugin.steering_limit", facts.find_largest_steering())
-    _add_limits_of_gazebo(facts, sheet)
-    return _write_element(facts, sheet)
+        table.add("plugin.wheel_separation", facts.measure("track_width_m"))
+        table.add("plugin.wheel_base", facts.find_wheelbase())
+        table.add("plugin.steering_limit", facts.find_largest_steering())
+    _add_limits_of_gazebo(facts, table)
+    return _write_element(facts, table)
 
 
-def _add_limits_of_gazebo(facts: Facts, sheet: Sheet) -> None:
+def _add_limits_of_gazebo(facts: Facts, table: ParameterTable) -> None:
     linear = "linear_" if facts.vehicle.kind == "differential" else ""
     limits = [
         (f"{linear}velocity", facts.find_speed_limit()),
@@ -43,16 +43,16 @@ def _add_limits_of_gazebo(facts: Facts, sheet: Sheet) -> None:
             ("angular_acceleration", facts.find_turn_acceleration()),
         ]
     for name, limit in limits:
-        sheet.add(f"plugin.min_{name}", -limit)
-        sheet.add(f"plugin.max_{name}", limit)
+        table.add(f"plugin.min_{name}", -limit)
+        table.add(f"plugin.max_{name}", limit)
 
 
-def _write_element(facts: Facts, sheet: Sheet) -> str:
+def _write_element(facts: Facts, table: ParameterTable) -> str:
     filename, name = _DRIVE_PLUGINS[facts.vehicle.kind]
     plugin = ET.Element("plugin", {"filename": filename, "name": name})
-    for line in list_comments(facts, sheet):
+    for line in list_comments(facts, table):
         plugin.append(ET.Comment(_write_comment(line)))
-    for setting in sheet.settings:
+    for setting in table.settings:
         for line in setting.sources:
             plugin.append(ET.Comment(_write_comment(line)))
         ET.SubElement(plugin, setting.path.rpartition(".")[2]).text = repr(setting.value)

@@ -10,7 +10,7 @@ from pipeline.export import (
     Setting,
     Target,
     require_plausible,
-    start_sheet,
+    start_table,
     write_yaml,
 )
 from pipeline.models import Effect, ModelFile, Place, Quantity
@@ -44,7 +44,7 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder.
     """
-    facts, sheet = start_sheet(file, ROBOT_LOCALIZATION, *_CONTROLLERS)
+    facts, table = start_table(file, ROBOT_LOCALIZATION, *_CONTROLLERS)
     controller, known = _CONTROLLERS[facts.vehicle.kind]
     step = _find_step(file, known)
     sources = (
@@ -54,14 +54,14 @@ def write_robot_localization(file: ModelFile, current: Current) -> str:
     )
     # The error is known to some per cent; more digits would only reflect the starting values of the fit.
     x, y, w = (Amount(float(f"{error * error:.3g}"), sources) for error in step.velocity_rms)
-    sheet.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
+    table.settings.append(Setting(f"{_FILTER}.odom0_config", _FUSED, ("vx, vy and the yaw rate of odom0",)))
     acceleration, turning = facts.find_speed_acceleration(), facts.find_turn_acceleration()
     for name in ("acceleration_limits", "deceleration_limits"):
         limits = (acceleration, 0.0, 0.0, 0.0, 0.0, turning)
-        sheet.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
+        table.add_row(f"{_FILTER}.{name}", limits, "with use_control: true")
     key = f"{controller}.ros__parameters.twist_covariance_diagonal"
-    sheet.add_row(key, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
-    return write_yaml(facts, sheet)
+    table.add_row(key, (x, y, 0.0, 0.0, 0.0, w), _INDEPENDENT)
+    return write_yaml(facts, table)
 
 
 class _Step(msgspec.Struct):
@@ -125,7 +125,7 @@ def write_amcl(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``; ``not_fitted``, the file has no ladder, or none of measured wheels.
     """
-    facts, sheet = start_sheet(file, NAV2_AMCL, *_CONTROLLERS)
+    facts, table = start_table(file, NAV2_AMCL, *_CONTROLLERS)
     known = _CONTROLLERS[facts.vehicle.kind][1]
     step = _find_step(file, known)
     if step.odometry_alphas is None:
@@ -143,10 +143,10 @@ def write_amcl(file: ModelFile, current: Current) -> str:
         "variance of the way per square of the turns [m^2/rad^2]",
     )
     for number, (alpha, note) in enumerate(zip(step.odometry_alphas, notes, strict=True), start=1):
-        sheet.add(f"{_AMCL}.alpha{number}", Amount(float(f"{alpha:.3g}"), (note, *sources)))
+        table.add(f"{_AMCL}.alpha{number}", Amount(float(f"{alpha:.3g}"), (note, *sources)))
     for name, least in (("update_min_d", UPDATE_M), ("update_min_a", UPDATE_RAD)):
-        sheet.add(f"{_AMCL}.{name}", Amount(least, ("the alphas are those of updates after this motion",)))
-    return write_yaml(facts, sheet)
+        table.add(f"{_AMCL}.{name}", Amount(least, ("the alphas are those of updates after this motion",)))
+    return write_yaml(facts, table)
 
 
 UPDATE_M, UPDATE_RAD = 0.25, 0.2

@@ -12,7 +12,7 @@ import numpy as np
 import yaml
 
 from pipeline.core import Floats
-from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Amount, Current, Facts, Target, start_sheet, write_yaml
+from pipeline.export import DRIVEN_SPEED, DRIVEN_TURN, Amount, Current, Facts, Target, start_table, write_yaml
 from pipeline.models import Effect, Forward, ModelFile, Place, Quantity, Timing
 from pipeline.run import DriveSeries, Grid, MotionError, Resets, RunContext
 from pipeline.sources import Vehicle
@@ -162,28 +162,28 @@ def write_simulator(file: ModelFile, current: Current) -> str:
     Raises:
         MotionError: ``wrong_vehicle``.
     """
-    facts, sheet = start_sheet(file, SIMULATOR, "differential", "ackermann", "mecanum", "omni")
+    facts, table = start_table(file, SIMULATOR, "differential", "ackermann", "mecanum", "omni")
     response = Response(facts)
     sources = _find_sources(facts, response)
-    sheet.add_row(f"{_NODE}.speeds_mps", tuple(_cite(response.speeds, (("commanded speeds",), frozenset()))))
+    table.add_row(f"{_NODE}.speeds_mps", tuple(_cite(response.speeds, (("commanded speeds",), frozenset()))))
     of_simulator = "speeds_mps.0" in current
     whose = "robot over simulator" if of_simulator else "robot over command"
     for name, values in zip(_FACTORS, (response.linear, response.angular), strict=True):
         other = _interpolate(current, name, response.speeds)
-        sheet.add_row(
+        table.add_row(
             f"{_NODE}.{name}", tuple(_cite(_divide(values, other), sources)), f"steady motion, {whose}"
         )
     if facts.vehicle.kind == "differential":
         own = facts.vehicle.controller_track_multiplier * response.separation
         note = "for the robot's own controller: on top of radii that are multiplied by linear_factor"
         if not of_simulator:
-            sheet.add_row(f"{_NODE}.wheel_separation_multiplier", tuple(_cite(own, sources)), note)
+            table.add_row(f"{_NODE}.wheel_separation_multiplier", tuple(_cite(own, sources)), note)
     lag = Quantity.STEERING_LAG if facts.vehicle.kind == "ackermann" else Quantity.TURN_LAG
     for name, quantity in zip(_LATE, (Quantity.COMMAND_DELAY, Quantity.SPEED_LAG, lag), strict=True):
         less = Amount(current.get(name, 0.0))
         late = facts.take(quantity).change(lambda robot, other: max(robot - other, 0.0), less)
-        sheet.add(f"{_NODE}.{name}", late)
-    return write_yaml(facts, sheet)
+        table.add(f"{_NODE}.{name}", late)
+    return write_yaml(facts, table)
 
 
 def _cite(values: Floats, sources: tuple[tuple[str, ...], frozenset[str]]) -> list[Amount]:

@@ -34,7 +34,7 @@ from pipeline.simulate.facts import (
     resolve_effects,
     unknown_name,
 )
-from pipeline.simulate.messages import Field, Sheet, SimulatedRun, simulate_run
+from pipeline.simulate.messages import Field, Messages, SimulatedRun, simulate_run
 from pipeline.simulate.mujoco_vehicle import MACHINES, SkidSteer, simulate_skid_steer
 from pipeline.simulate.path import SLOPE_EFFECTS, CompactedGround
 from pipeline.simulate.platforms import PLATFORMS, Platform, find_platform, publish
@@ -106,7 +106,7 @@ def _bunch(time_s: Floats, longest_s: float) -> Floats:
     return ends[np.searchsorted(ends, time_s)]
 
 
-# Logs of platforms that speak protobuf: the same sheets as messages of their types.
+# Logs of platforms that speak protobuf: the same tables as messages of their types.
 #
 # Types as farm-ng/farm-ng-core and farm-ng/farm-ng-amiga declare them; enumerations stand as the numbers that
 # they are in a message.
@@ -138,24 +138,24 @@ def is_protobuf(type_name: str) -> bool:
     return type_name in TYPES
 
 
-def write_protobuf(sheets: Sequence[Sheet], clock: Clock, path: Path, *, marked: bool = True) -> None:
-    """Write sheets as an MCAP log of protobuf messages, in time order."""
+def write_protobuf(tables: Sequence[Messages], clock: Clock, path: Path, *, marked: bool = True) -> None:
+    """Write tables as an MCAP log of protobuf messages, in time order."""
     from mcap_protobuf.writer import Writer  # noqa: PLC0415 - heavy
 
     messages: list[tuple[int, int, Any]] = []
-    for number, sheet in enumerate(sheets):
+    for number, table in enumerate(tables):
         columns = {
-            name: np.broadcast_to(np.asarray(value, dtype=object), sheet.log_s.shape).tolist()
-            for name, value in sheet.fields.items()
+            name: np.broadcast_to(np.asarray(value, dtype=object), table.log_s.shape).tolist()
+            for name, value in table.fields.items()
         }
-        for row, time in enumerate(stamp_times(clock, sheet.log_s).tolist()):
-            message = _make_classes()[sheet.type_name]()
+        for row, time in enumerate(stamp_times(clock, table.log_s).tolist()):
+            message = _make_classes()[table.type_name]()
             for name, column in columns.items():
                 _set(message, name, column[row])
             messages.append((time, number, message))
     with path.open("wb") as stream, Writer(stream) as writer:
         for time, number, message in sorted(messages, key=lambda one: one[:2]):
-            writer.write_message(sheets[number].topic, message, time, time)
+            writer.write_message(tables[number].topic, message, time, time)
         if marked:
             writer.add_metadata(*_MARK)
 
@@ -217,34 +217,34 @@ def write_log(run: SimulatedRun, path: Path, *, marked: bool = True) -> None:
 
     scenario = run.scenario
     layout = find_layout(scenario.recording.layout, scenario.vehicle)
-    sheets = (
+    tables = (
         publish(run, layout.topics)
         if layout.topics
         else [
-            *messages.command_sheets(run, layout),
-            *messages.wheel_sheets(run, layout),
-            *messages.pose_sheets(run, layout.pose),
-            *messages.static_sheets(run, layout),
-            *messages.imu_sheets(run, layout),
-            *messages.state_sheets(run),
-            *messages.decoy_sheets(run),
+            *messages.command_tables(run, layout),
+            *messages.wheel_tables(run, layout),
+            *messages.pose_tables(run, layout.pose),
+            *messages.static_tables(run, layout),
+            *messages.imu_tables(run, layout),
+            *messages.state_tables(run),
+            *messages.decoy_tables(run),
         ]
     )
     if layout.topics and all(is_protobuf(topic.type_name) for topic in layout.topics):
-        write_protobuf(messages.cut_gaps(run, sheets), scenario.clock, path, marked=marked)
+        write_protobuf(messages.cut_gaps(run, tables), scenario.clock, path, marked=marked)
         return
     with LogWriter(path) as writer:
-        for sheet in messages.cut_gaps(run, sheets):
-            header = None if sheet.header_s is None else stamp_headers(scenario.clock, sheet.header_s)
-            if header is not None and sheet.topic in scenario.recording.zero_stamps:
+        for table in messages.cut_gaps(run, tables):
+            header = None if table.header_s is None else stamp_headers(scenario.clock, table.header_s)
+            if header is not None and table.topic in scenario.recording.zero_stamps:
                 header = np.zeros_like(header)
-            fields = sheet.fields
-            if header is not None and sheet.stamp != "header":
-                fields, header = fields | _write_stamp(sheet.stamp, header, scenario.clock.start_ns), None
+            fields = table.fields
+            if header is not None and table.stamp != "header":
+                fields, header = fields | _write_stamp(table.stamp, header, scenario.clock.start_ns), None
             writer.write_columns(
-                sheet.topic,
-                sheet.type_name,
-                stamp_times(scenario.clock, sheet.log_s),
+                table.topic,
+                table.type_name,
+                stamp_times(scenario.clock, table.log_s),
                 fields,
                 header_time=header,
             )

@@ -222,7 +222,7 @@ _TF_PERIOD_S = 0.05
 
 
 @dataclass(frozen=True)
-class Sheet:
+class Messages:
     """Messages of one topic, in true seconds.
 
     Attributes:
@@ -241,12 +241,14 @@ class Sheet:
     stamp: str = "header"
 
 
-def command_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
+def command_tables(run: SimulatedRun, layout: Layout) -> list[Messages]:
     """Messages of everything that was asked."""
-    return [sheet for topic in layout.commands for sheet in _write_command(run, layout, topic, run.commands)]
+    return [table for topic in layout.commands for table in _write_command(run, layout, topic, run.commands)]
 
 
-def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, commands: Commands) -> list[Sheet]:
+def _write_command(
+    run: SimulatedRun, layout: Layout, topic: CommandTopic, commands: Commands
+) -> list[Messages]:
     vehicle = run.scenario.vehicle
     time = commands.time_s
     log = time + run.scenario.recording.command_latency_s
@@ -260,7 +262,7 @@ def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, comma
         if stamped:
             fields["header.frame_id"] = "base_link"
         name = "geometry_msgs/msg/TwistStamped" if stamped else "geometry_msgs/msg/Twist"
-        return [Sheet(topic.topics[0], name, log, time if stamped else None, fields)]
+        return [Messages(topic.topics[0], name, log, time if stamped else None, fields)]
     if topic.form == "ackermann":
         return [_write_ackermann(topic.topics[0], log, time, commands.speed_mps, commands.turn)]
     if topic.form == "float_speed_steering":
@@ -277,18 +279,20 @@ def _write_command(run: SimulatedRun, layout: Layout, topic: CommandTopic, comma
     names, sides = names[::-1], sides[::-1]
     speeds = np.stack([left if side == "left" else right for side in sides], axis=1)
     return [
-        Sheet(topic.topics[0], "sensor_msgs/msg/JointState", log, time, {"name": names, "velocity": speeds})
+        Messages(
+            topic.topics[0], "sensor_msgs/msg/JointState", log, time, {"name": names, "velocity": speeds}
+        )
     ]
 
 
-def _write_ackermann(topic: str, log: Floats, time: Floats, speed: Floats, steering: Floats) -> Sheet:
+def _write_ackermann(topic: str, log: Floats, time: Floats, speed: Floats, steering: Floats) -> Messages:
     fields: dict[str, Field] = {"drive.speed": speed, "drive.steering_angle": steering}
-    return Sheet(topic, "ackermann_msgs/msg/AckermannDriveStamped", log, time, fields)
+    return Messages(topic, "ackermann_msgs/msg/AckermannDriveStamped", log, time, fields)
 
 
-def _write_floats(topics: tuple[str, ...], log: Floats, values: tuple[Floats, ...]) -> list[Sheet]:
+def _write_floats(topics: tuple[str, ...], log: Floats, values: tuple[Floats, ...]) -> list[Messages]:
     return [
-        Sheet(topic, "std_msgs/msg/Float64", log, None, {"data": column})
+        Messages(topic, "std_msgs/msg/Float64", log, None, {"data": column})
         for topic, column in zip(topics, values, strict=True)
     ]
 
@@ -302,12 +306,12 @@ def _name_joints(layout: Layout, wheels_per_side: int) -> tuple[list[str], list[
     return names, sides
 
 
-def wheel_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
+def wheel_tables(run: SimulatedRun, layout: Layout) -> list[Messages]:
     """Messages of the encoders, if there are any."""
-    return [sheet for topic in layout.wheels for sheet in _write_wheels(run, layout, topic)]
+    return [table for topic in layout.wheels for table in _write_wheels(run, layout, topic)]
 
 
-def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[Sheet]:
+def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[Messages]:
     wheels, encoders, vehicle = run.wheels, run.scenario.encoders, run.scenario.vehicle
     if wheels is None or encoders is None:
         return []
@@ -338,10 +342,10 @@ def _write_wheels(run: SimulatedRun, layout: Layout, topic: WheelTopic) -> list[
         fields["position"] = np.stack(turned, axis=1)
     if encoders.report != "position":
         fields["velocity"] = np.stack(turning, axis=1)
-    return [Sheet(topic.topics[0], "sensor_msgs/msg/JointState", log, time, fields)]
+    return [Messages(topic.topics[0], "sensor_msgs/msg/JointState", log, time, fields)]
 
 
-def pose_sheets(run: SimulatedRun, topic: PoseTopic) -> list[Sheet]:
+def pose_tables(run: SimulatedRun, topic: PoseTopic) -> list[Messages]:
     """Messages of the localization."""
     poses = run.poses
     if topic.form == "tf":
@@ -358,10 +362,10 @@ def pose_sheets(run: SimulatedRun, topic: PoseTopic) -> list[Sheet]:
     fields["header.frame_id"] = "map"
     if topic.form == "odometry":
         fields["child_frame_id"] = run.scenario.pose.child_frame
-    return [Sheet(topic.topic, name, poses.log_s, poses.stamp_s, fields)]
+    return [Messages(topic.topic, name, poses.log_s, poses.stamp_s, fields)]
 
 
-def static_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
+def static_tables(run: SimulatedRun, layout: Layout) -> list[Messages]:
     """Where sensors are mounted, as far as readers need it."""
     sensor = run.scenario.pose
     mounted: list[tuple[str, tuple[float, float], float]] = []
@@ -370,7 +374,7 @@ def static_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
     if sensor.child_frame != "base_link":
         mounted.append((sensor.child_frame, (sensor.mount_x_m, sensor.mount_y_m), sensor.mount_yaw_rad))
     return [
-        Sheet(
+        Messages(
             "/tf_static",
             "tf2_msgs/msg/TFMessage",
             np.zeros(1),
@@ -393,7 +397,7 @@ def _name_pose(
     return fields
 
 
-def _write_tf(run: SimulatedRun, topic: str) -> list[Sheet]:
+def _write_tf(run: SimulatedRun, topic: str) -> list[Messages]:
     poses = run.poses
     odometry = _name_transform("odom", "base_link", poses.position, poses.quaternion)
     # Localization corrects at its own pace and dates its transform ahead, so that others can look it up.
@@ -403,8 +407,8 @@ def _write_tf(run: SimulatedRun, topic: str) -> list[Sheet]:
     corrections = _name_transform("map", "odom", poses.correction[which], turn)
     name = "tf2_msgs/msg/TFMessage"
     return [
-        Sheet(topic, name, poses.log_s, poses.stamp_s, odometry),
-        Sheet(topic, name, time + _LATE_S, time + _FUTURE_S, corrections),
+        Messages(topic, name, poses.log_s, poses.stamp_s, odometry),
+        Messages(topic, name, time + _LATE_S, time + _FUTURE_S, corrections),
     ]
 
 
@@ -415,7 +419,7 @@ def _name_transform(parent: str, child: str, position: Floats, quaternion: Float
     return fields
 
 
-def imu_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
+def imu_tables(run: SimulatedRun, layout: Layout) -> list[Messages]:
     """Messages of the inertial unit, if there is one; it estimates no orientation and says so."""
     if run.imu is None or not layout.imu:
         return []
@@ -427,10 +431,10 @@ def imu_sheets(run: SimulatedRun, layout: Layout) -> list[Sheet]:
     for i, axis in enumerate("xyz"):
         fields[f"angular_velocity.{axis}"] = imu.rates[:, i]
         fields[f"linear_acceleration.{axis}"] = imu.accelerations[:, i]
-    return [Sheet(layout.imu, "sensor_msgs/msg/Imu", imu.time_s + _LATE_S, imu.time_s, fields)]
+    return [Messages(layout.imu, "sensor_msgs/msg/Imu", imu.time_s + _LATE_S, imu.time_s, fields)]
 
 
-def state_sheets(run: SimulatedRun) -> list[Sheet]:
+def state_tables(run: SimulatedRun) -> list[Messages]:
     """Messages that say which part of the run counts, if a person drives first."""
     by_hand = run.scenario.recording.hand_driven_s
     if by_hand is None:
@@ -438,19 +442,19 @@ def state_sheets(run: SimulatedRun) -> list[Sheet]:
     time = np.arange(0.0, run.scenario.duration_s, 0.1)
     topic, name = "/drive/calib_state", "std_msgs/msg/String"
     return [
-        Sheet(topic, name, time[time < by_hand], None, {"data": "idle"}),
-        Sheet(topic, name, time[time >= by_hand], None, {"data": "calib"}),
+        Messages(topic, name, time[time < by_hand], None, {"data": "idle"}),
+        Messages(topic, name, time[time >= by_hand], None, {"data": "calib"}),
     ]
 
 
-def decoy_sheets(run: SimulatedRun) -> list[Sheet]:
+def decoy_tables(run: SimulatedRun) -> list[Messages]:
     """Messages that a hasty reader takes for the pose or the command."""
     scenario = run.scenario
-    sheets: list[Sheet] = []
+    tables: list[Messages] = []
     if scenario.recording.decoys in {"commands", "both"}:
         wished = make_wishes(scenario, "decoy")
         fields: dict[str, Field] = {"linear.x": wished.speed_mps, "angular.z": wished.turn}
-        sheets.append(Sheet("/navigation/cmd_vel", "geometry_msgs/msg/Twist", wished.time_s, None, fields))
+        tables.append(Messages("/navigation/cmd_vel", "geometry_msgs/msg/Twist", wished.time_s, None, fields))
     if scenario.recording.decoys in {"odometry", "both"} and run.wheels is not None:
         wheels = run.wheels
         path = integrate_odometry(scenario.vehicle, wheels, start=(0.0, 0.0, 0.0))
@@ -459,11 +463,11 @@ def decoy_sheets(run: SimulatedRun) -> list[Sheet]:
         fields |= {"header.frame_id": "odom", "child_frame_id": "base_link"}
         fields |= {"twist.twist.linear.x": speed, "twist.twist.angular.z": rate}
         time = wheels.time_s
-        sheets.append(Sheet("/platform/odom", "nav_msgs/msg/Odometry", time + _LATE_S, time, fields))
-    return sheets
+        tables.append(Messages("/platform/odom", "nav_msgs/msg/Odometry", time + _LATE_S, time, fields))
+    return tables
 
 
-def cut_gaps(run: SimulatedRun, sheets: list[Sheet]) -> list[Sheet]:
+def cut_gaps(run: SimulatedRun, tables: list[Messages]) -> list[Messages]:
     """Take out what the recorder missed, on every topic alike."""
     recording = run.scenario.recording
     starts = spread_times(
@@ -472,18 +476,18 @@ def cut_gaps(run: SimulatedRun, sheets: list[Sheet]) -> list[Sheet]:
         generator=open_stream(run.scenario.seed, "gaps"),
     )
     for start in starts.tolist():
-        sheets = [_cut_out(sheet, start, start + recording.gap_s) for sheet in sheets]
-    return sheets
+        tables = [_cut_out(table, start, start + recording.gap_s) for table in tables]
+    return tables
 
 
-def _cut_out(sheet: Sheet, start_s: float, end_s: float) -> Sheet:
-    mask = (sheet.log_s < start_s) | (sheet.log_s >= end_s)
+def _cut_out(table: Messages, start_s: float, end_s: float) -> Messages:
+    mask = (table.log_s < start_s) | (table.log_s >= end_s)
     return replace(
-        sheet,
-        log_s=sheet.log_s[mask],
-        header_s=None if sheet.header_s is None else sheet.header_s[mask],
+        table,
+        log_s=table.log_s[mask],
+        header_s=None if table.header_s is None else table.header_s[mask],
         fields={
             path: value[mask] if isinstance(value, np.ndarray) else value
-            for path, value in sheet.fields.items()
+            for path, value in table.fields.items()
         },
     )

@@ -41,7 +41,7 @@ _HINTS = {
 
 @dataclass(frozen=True, kw_only=True)
 class Errand(Task):
-    """A task of the workbench; ``basis`` is ``DIAGNOSE``, ``PLAN`` or ``ANALYZE``.
+    """A task of the workbench; its kind (`DIAGNOSE`, `PLAN`, `ANALYZE`) stands in place of a fingerprint.
 
     Attributes:
         notes: file in which the worker stores the name of the current stage; None if it has only one.
@@ -127,12 +127,12 @@ def work_on_errand(task: Task) -> Report:
     Raises:
         SlipError: it cannot be done.
     """
-    entry = Entry(log=task.log, basis=task.basis, state="failed", run=task.options.run or "")
+    entry = Entry(log=task.log, fingerprint=task.fingerprint, state="failed", run=task.options.run or "")
     try:
         store = Store(task.options.out)
-        if task.basis == DIAGNOSE:
+        if task.fingerprint == DIAGNOSE:
             write_diagnosis(task.options.out, find_run(store, entry.run))
-        elif isinstance(task, Errand) and task.basis == PLAN:
+        elif isinstance(task, Errand) and task.fingerprint == PLAN:
             write_run_plan(store, find_run(store, entry.run), task.area, partial(_note, task))
         else:
             return Report(entry=_analyze(task, entry))
@@ -357,7 +357,7 @@ class Jobs:
         """
         return self._begin_on(manifest, f"plan after {manifest.run}", "plan", PLAN, area)
 
-    def _begin_on(self, manifest: Manifest, name: str, stage: str, basis: str, area: str = "") -> Job:
+    def _begin_on(self, manifest: Manifest, name: str, stage: str, kind: str, area: str = "") -> Job:
         """Start a task on a stored run."""
         if any(job.name == name and not job.done for job in tuple(self._jobs.values())):
             raise WorkbenchError(
@@ -366,8 +366,8 @@ class Jobs:
         job = Job(secrets.token_hex(4), name, is_stored=True)
         job.notify(stage)
         self._add(job)
-        notes = Path(tempfile.mkdtemp(prefix="slip-")) / "stage" if basis == PLAN else None
-        self._begin(job, partial(self._make_errand, manifest, basis, area, notes), notes)
+        notes = Path(tempfile.mkdtemp(prefix="slip-")) / "stage" if kind == PLAN else None
+        self._begin(job, partial(self._make_errand, manifest, kind, area, notes), notes)
         return job
 
     def _add(self, job: Job) -> None:
@@ -425,9 +425,11 @@ class Jobs:
             diagnosis=self._diagnosis,
         )
         log = see_log(upload.path)
-        return Errand(path=upload.path, log=log, basis=ANALYZE, options=options, notes=upload.notes)
+        return Errand(path=upload.path, log=log, fingerprint=ANALYZE, options=options, notes=upload.notes)
 
-    def _make_errand(self, manifest: Manifest, basis: str, area: str, notes: Path | None) -> Errand:
+    def _make_errand(self, manifest: Manifest, kind: str, area: str, notes: Path | None) -> Errand:
         options = Options(out=self._results, run=manifest.run)
         log = LogSighting(path=manifest.run, size=0, mtime_ns=0, inode=0, seen_ns=0)
-        return Errand(path=manifest.folder, log=log, basis=basis, options=options, notes=notes, area=area)
+        return Errand(
+            path=manifest.folder, log=log, fingerprint=kind, options=options, notes=notes, area=area
+        )

@@ -51,7 +51,7 @@ def make(
 def record(scenario: Scenario, path: Path) -> Path:
     """The log of a scenario without its poses."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(messages, "pose_sheets", lambda _run, _topic: [])
+        patch.setattr(messages, "pose_tables", lambda _run, _topic: [])
         write_log(simulate_run(scenario), path)
     return path
 

@@ -91,7 +91,7 @@ def test_killed_at_random_moments(
     # A server that has loaded everything forks the batches: no round is spent on starting a program.
     server = multiprocessing.get_context("forkserver")
     server.set_forkserver_preload(
-        ["pytest", "pipeline.batch.season", "pipeline.analysis.analyze", "pipeline.report.page"]
+        ["pytest", "pipeline.batch.batch_run", "pipeline.analysis.analyze", "pipeline.report.page"]
     )
     # The first process waits for the server.
     for target, given in ((time.sleep, (0.0,)), (batch, (field, tmp_path / "timed"))):

@@ -11,7 +11,7 @@ from pipeline.analysis.analyze import analyze_log, update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import Pruning, Shard, batch_plan
 from pipeline.batch.batch_check import read_status, verify_results
-from pipeline.batch.season import run_batch
+from pipeline.batch.batch_run import run_batch
 from pipeline.store import Store
 
 
@@ -99,12 +99,12 @@ def read_files(out: Path, run: str) -> dict[str, bytes]:
 def test_a_new_version_of_a_stage_is_noticed(
     monkeypatch: pytest.MonkeyPatch, season: Path, tmp_path: Path
 ) -> None:
-    hasher = batch_plan.BasisHasher(ask(season, tmp_path).options)
-    before = hasher.hash_basis(season / "a.mcap")
+    hasher = batch_plan.Fingerprinter(ask(season, tmp_path).options)
+    before = hasher.find_fingerprint(season / "a.mcap")
     monkeypatch.setattr(batch_plan, "VERSIONS", dict(VERSIONS) | {"slip": 99})
     batch_plan._fingerprint_program.cache_clear()
     try:
-        after = batch_plan.BasisHasher(ask(season, tmp_path).options).hash_basis(season / "a.mcap")
+        after = batch_plan.Fingerprinter(ask(season, tmp_path).options).find_fingerprint(season / "a.mcap")
     finally:
         batch_plan._fingerprint_program.cache_clear()
     assert before != after

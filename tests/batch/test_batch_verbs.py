@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from verbs import run_slip
 
-from pipeline.batch.season import Line
+from pipeline.batch.batch_run import Line
 from pipeline.cli.screen import LineWatch
 
 INLINE = ("--executor", "inline", "--settle", "0")

@@ -26,7 +26,7 @@ from pipeline.simulate.facts import (
     open_stream,
     unknown_name,
 )
-from pipeline.simulate.messages import Field, Sheet, SimulatedRun
+from pipeline.simulate.messages import Field, Messages, SimulatedRun
 from pipeline.simulate.programs import make_wishes, walk_in_plane
 from pipeline.simulate.published import Json, Published, Q, Source, Value
 from pipeline.simulate.sensors import to_earth
@@ -45,14 +45,14 @@ _ENU_IN_NED = np.array([np.sqrt(0.5), np.sqrt(0.5), 0.0, 0.0])
 _FRD_IN_FLU = np.array([1.0, 0.0, 0.0, 0.0])
 
 
-def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
+def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Messages]:
     """Messages of every topic.
 
     Raises:
         SimulateError: ``encoders_needed``, a topic needs wheels or a gyro that the scenario leaves out.
     """
     known: dict[str, tuple[Floats, Floats, Series]] = {}
-    sheets = []
+    tables = []
     for one in topics:
         if one.source not in known:
             known[one.source] = _SOURCES[one.source](run)
@@ -60,8 +60,8 @@ def publish(run: SimulatedRun, topics: tuple[Published, ...]) -> list[Sheet]:
         rows = slice(None, None, one.every)
         fields = {path: _fill(value, series, rows) for path, value in one.fields.items()}
         header = None if one.stamp == "none" else stamp[rows]
-        sheets.append(Sheet(one.topic, one.type_name, log[rows], header, fields, one.stamp))
-    return sheets
+        tables.append(Messages(one.topic, one.type_name, log[rows], header, fields, one.stamp))
+    return tables
 
 
 def _fill(value: Value, series: Series, rows: slice) -> Field:

@@ -124,7 +124,7 @@ class _Run:
         return Task(
             path=item.path,
             log=item.log,
-            basis=item.basis,
+            fingerprint=item.fingerprint,
             options=replace(self._request.options, run=item.run),
             address=self._request.address,
         )
@@ -160,9 +160,9 @@ class _Run:
 
 
 def _kills_before(item: Item) -> int:
-    """Number of workers that the log killed in earlier batches, if neither it nor its basis has changed."""
+    """Number of workers that the log killed before, if neither it nor its fingerprint has changed."""
     before = item.before
-    if before is None or before.state == "quarantined" or not before.fits(item.log, item.basis):
+    if before is None or before.state == "quarantined" or not before.fits(item.log, item.fingerprint):
         return 0
     return before.kills
 
@@ -171,7 +171,7 @@ def _make_entry(item: Item, blame: Blame, kills: int) -> Entry:
     quarantined = kills >= FATAL_KILLS
     return Entry(
         log=item.log,
-        basis=item.basis,
+        fingerprint=item.fingerprint,
         state="quarantined" if quarantined else "failed",
         run=item.run,
         code=blame.code,
