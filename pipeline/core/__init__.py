@@ -29,7 +29,6 @@ if TYPE_CHECKING:
         number_stretches,
         robust_spread,
         robust_spreads,
-        solve_banded,
         spread_equal,
         student_quantile,
         turn_units,

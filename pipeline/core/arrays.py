@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
-Bytes = NDArray[np.uint8]
 Complex = NDArray[np.complex128]
 
 _POINTS = 4096
@@ -62,23 +61,11 @@ _FEWEST_POINTS = 4
 poses are smoothed more: the median slip of one recording falls by 0.2 % (`make bench NAME=constants`)."""
 _BLOCK = 4096
 """Number of queries fitted at a time, which limits memory; results do not depend on it."""
-_SHORTEST_HOLD_S = 0.5
-"""Default cmd_vel_timeout of diff_drive_controller [s]; `command.hold_s` of the configuration replaces it."""
 PERIODS = 5.0
 """Number of typical periods after which a message is missing, not late; with half of it, two lost messages
 stop a vehicle."""
-_SHORTEST_PERIOD = 1e-3
+SHORTEST_PERIOD = 1e-3
 """Assumed period of samples with equal stamps [s]."""
-
-
-def count_grid(start: float, end: float, rate: float) -> int:
-    """Number of uniform times from ``start`` to ``end`` inclusive in steps of 1/``rate``; see `make_grid`."""
-    return max(int(np.floor((end - start) * rate + 1e-6)) + 1, 0)
-
-
-def make_grid(start: float, end: float, rate: float) -> Floats:
-    """Uniform times from ``start`` to ``end`` inclusive in steps of 1/``rate``, tolerant of rounding."""
-    return start + np.arange(count_grid(start, end, rate)) / rate
 
 
 def hold_indices(at: Floats, times: Floats) -> Ints:
@@ -102,7 +89,7 @@ def count_steps(times: Floats, span: float) -> int:
         times: increasing [s], shape (n,), n >= 2.
         span: [s].
     """
-    return max(round(span / max(float(np.median(np.diff(times))), _SHORTEST_PERIOD)), 1)
+    return max(round(span / max(float(np.median(np.diff(times))), SHORTEST_PERIOD)), 1)
 
 
 def spread_equal(times: Floats) -> Floats:
@@ -110,17 +97,6 @@ def spread_equal(times: Floats) -> Floats:
     ordered = np.maximum.accumulate(times)
     least = max(1e-12, 4.0 * float(np.spacing(np.abs(ordered).max(initial=0.0))))
     return np.asarray(ordered + np.arange(times.size) * least, dtype=np.float64)
-
-
-def usual_hold(stamps: Floats) -> float:
-    """Default time for which a controller holds its last command [s]: five periods, at least half a second.
-
-    Args:
-        stamps: stamps of the commands [s], shape (n,).
-    """
-    # Two topics, one per side, have pairs of nearly equal stamps: their median period is almost zero.
-    period = float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0
-    return max(_SHORTEST_HOLD_S, PERIODS * period)
 
 
 def differentiate_locally(at: Floats, times: Floats, values: Floats, window: float) -> Floats:
@@ -202,30 +178,6 @@ def interpolate_linearly(at: Floats, times: Floats, values: Floats) -> Floats:
 def integrate_rate(times: Floats, rate: Floats) -> Floats:
     """Cumulative trapezoidal integral of ``rate`` (n,) over ``times`` (n,), starting at zero."""
     return np.asarray(scipy.integrate.cumulative_trapezoid(rate, times, initial=0.0))
-
-
-def integrate_between(start: Floats, end: Floats, times: Floats, rate: Floats) -> Floats:
-    """Integrals of a sampled rate over spans of time, shape (m,); NaN where readings are missing.
-
-    A missing reading is no rate of zero: rows that are not finite are left out, and a span that touches a
-    hole of more than `PERIODS` usual periods is unknown.
-
-    Args:
-        start: of each span [s], shape (m,).
-        end: of each span [s], shape (m,).
-        times: of the readings [s], shape (n,), increasing.
-        rate: the readings, NaN where missing, shape (n,).
-    """
-    known = np.isfinite(rate)
-    times, rate = times[known], rate[known]
-    if times.size < 2:  # noqa: PLR2004 - one reading has no duration
-        return np.full(start.shape, np.nan)
-    steps = np.diff(times)
-    holes = np.append(0.0, np.cumsum(steps > PERIODS * max(float(np.median(steps)), _SHORTEST_PERIOD)))
-    path = integrate_rate(times, rate)
-    moved, missing = (np.interp(end, times, sums) - np.interp(start, times, sums) for sums in (path, holes))
-    inside = (start >= times[0]) & (end <= times[-1]) & (missing == 0.0)
-    return np.where(inside, moved, np.nan)
 
 
 _GAUSSIAN = 1.4826
@@ -313,15 +265,3 @@ def jackknife_deviation(without: Floats) -> float:
     Source: Efron and Tibshirani, An Introduction to the Bootstrap, 1993, 11.5.
     """
     return math.sqrt((without.size - 1.0) * float(np.mean((without - without.mean()) ** 2)))
-
-
-def solve_banded(matrix: Floats, right: Floats) -> Floats:
-    """Solution of a symmetric positive definite banded system, shape (n,).
-
-    Args:
-        matrix: lower diagonals by row: ``matrix[k, i]`` is the element of row i and column i - k, zero where
-            i < k; shape (1 + bandwidth, n).
-        right: right-hand side, shape (n,).
-    """
-    # Lower diagonals by row are upper diagonals by column.
-    return np.asarray(scipy.linalg.solveh_banded(matrix[: right.size][::-1], right))

@@ -17,7 +17,7 @@ from pipeline.sources import Vehicle, VelocitySection
 from pipeline.stages.drive import Drive, interpolate_readings
 from pipeline.stages.drive_numbers import mark_late_starts
 from pipeline.stages.findings import Finding
-from pipeline.stages.inputs import interpolate_wheels
+from pipeline.stages.inputs import interpolate_wheels, usual_hold
 from pipeline.stages.pose_choice import find_steady_gain
 from pipeline.stages.pose_faults import align_poses
 from pipeline.stages.trust import LEAST_CORRELATION, ONE_SCALE, check_echo, estimate_delay
@@ -59,7 +59,7 @@ def align_tables(
         tables: `poses`, `commands`, `wheels`, `imu` as extracted; those that the log lacks may be missing.
         vehicle: as configured.
         known: what the examination of the log found: scale of the command, the controller's multiplier, and
-            how long a command is valid (by default `arrays.usual_hold`).
+            how long a command is valid (by default `usual_hold`).
         body_commanded: whether the command is a body command, which the controller converts to wheel speeds.
         where: the run, for error messages.
         is_drive_alone: whether the poses are the motion of the measured wheels, since none were recorded:
@@ -72,7 +72,7 @@ def align_tables(
     asked = correct_commands(commands, vehicle, known)
     asked, late_starts = mark_late_starts(asked, wheels, aligned_vehicle)
     if not commands.is_empty() and known.hold_s is None:
-        known = replace(known, hold_s=arrays.usual_hold(commands["t"].to_numpy()))
+        known = replace(known, hold_s=usual_hold(commands["t"].to_numpy()))
     multiplier = _find_body_multiplier(commands, vehicle, known, body_commanded=body_commanded)
     poses, alignment = align_poses(
         {**tables, "commands": asked, "wheels": wheels},

@@ -238,6 +238,19 @@ def _read_aligned(drive: pl.DataFrame, name: str) -> Floats:
     return drive[aligned if aligned in drive.columns else name].to_numpy()
 
 
+_SHORTEST_HOLD_S = 0.5
+"""Default cmd_vel_timeout of diff_drive_controller [s]; `command.hold_s` of the configuration replaces it."""
+
+
+def usual_hold(stamps: Floats) -> float:
+    """Default time for which a controller holds its last command [s]: five periods, at least half a second.
+
+    Args:
+        stamps: stamps of the commands [s], shape (n,).
+    """
+    return max(_SHORTEST_HOLD_S, arrays.PERIODS * _usual_period(stamps))
+
+
 def _usual_period(stamps: Floats) -> float:
     # Two topics, one per side, come in pairs of nearly equal stamps: their median period is almost zero.
     return float(np.quantile(np.diff(stamps), 0.75)) if stamps.size > 1 else 0.0

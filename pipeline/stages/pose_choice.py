@@ -305,6 +305,32 @@ def yaw_of(quaternion: Floats) -> Floats:
     return rigid.euler_from_quaternions(quaternion)[2]
 
 
+def integrate_between(start: Floats, end: Floats, times: Floats, rate: Floats) -> Floats:
+    """Integrals of a sampled rate over spans of time, shape (m,); NaN where readings are missing.
+
+    A missing reading is no rate of zero: rows that are not finite are left out, and a span that touches a
+    hole of more than `arrays.PERIODS` usual periods is unknown.
+
+    Args:
+        start: of each span [s], shape (m,).
+        end: of each span [s], shape (m,).
+        times: of the readings [s], shape (n,), increasing.
+        rate: the readings, NaN where missing, shape (n,).
+    """
+    known = np.isfinite(rate)
+    times, rate = times[known], rate[known]
+    if times.size < 2:  # noqa: PLR2004 - one reading has no duration
+        return np.full(start.shape, np.nan)
+    steps = np.diff(times)
+    holes = np.append(
+        0.0, np.cumsum(steps > arrays.PERIODS * max(float(np.median(steps)), arrays.SHORTEST_PERIOD))
+    )
+    path = arrays.integrate_rate(times, rate)
+    moved, missing = (np.interp(end, times, sums) - np.interp(start, times, sums) for sums in (path, holes))
+    inside = (start >= times[0]) & (end <= times[-1]) & (missing == 0.0)
+    return np.where(inside, moved, np.nan)
+
+
 def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | None:
     """Fraction of a pose's turning not explained by the gyro, for any sign, scale and mounting of it."""
     if imu.height < FEWEST_MESSAGES:
@@ -316,7 +342,7 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
         return None
     ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
     at = time[ends]
-    turned = arrays.integrate_between(at[:-1], at[1:], clock, imu["rate_z"].to_numpy())
+    turned = integrate_between(at[:-1], at[1:], clock, imu["rate_z"].to_numpy())
     known = np.isfinite(turned)
     if known.sum() < FEWEST_MESSAGES:
         return None

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.optimize import isotonic_regression
 
 from pipeline.core import (
@@ -18,7 +19,6 @@ from pipeline.core import (
     Ints,
     join_parts,
     robust_spread,
-    solve_banded,
 )
 from pipeline.models import LEAST_DELAY_S
 from pipeline.run import GyroFit, MotionRun, Track, align_heading, fit_gyro, mark_excluded
@@ -442,7 +442,8 @@ def _solve_equations(equations: Iterable[_Equations], poses: int) -> Floats:
             for other, second in equation.factors.items():
                 if other >= unknown:
                     matrix[other - unknown, start + other] += weighted * second
-    return solve_banded(matrix, right).reshape(poses, _STATES)
+    # Lower diagonals by row are upper diagonals by column.
+    return np.asarray(solveh_banded(matrix[: right.size][::-1], right)).reshape(poses, _STATES)
 
 
 def _measure_position_noise(track: Track) -> float:

@@ -9,9 +9,10 @@ import pytest
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
-from pipeline.core.arrays import Floats, integrate_between
+from pipeline.core.arrays import Floats
 from pipeline.simulate import Encoders, Recording, make_scenario, simulate_run, write_log
 from pipeline.stages.drive import differentiate_angle
+from pipeline.stages.pose_choice import integrate_between
 
 
 def fall_silent(time: Floats) -> Floats:

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from pipeline.core import arrays
 from pipeline.stages.drive import interpolate_repeats
+from pipeline.stages.velocity import make_grid
 
 WINDOW_S = 0.75
 
@@ -72,7 +73,7 @@ def test_the_derivative_keeps_what_the_published_spline_halves() -> None:
 
 @given(st.floats(-100.0, 100.0), st.floats(0.0, 50.0), st.sampled_from([10.0, 20.0, 33.0, 50.0]))
 def test_a_grid_spans_its_range_in_equal_steps(start: float, length: float, rate: float) -> None:
-    grid = arrays.make_grid(start, start + length, rate)
+    grid = make_grid(start, start + length, rate)
     assert grid[0] == start
     assert grid[-1] <= start + length + 1e-6
     assert grid[-1] > start + length - 1.0 / rate - 1e-6
@@ -80,7 +81,7 @@ def test_a_grid_spans_its_range_in_equal_steps(start: float, length: float, rate
 
 
 def test_a_grid_forgives_rounding_at_its_end() -> None:
-    assert arrays.make_grid(0.1, 0.1 + 0.05 * 3 - 1e-9, 20.0).size == 4
+    assert make_grid(0.1, 0.1 + 0.05 * 3 - 1e-9, 20.0).size == 4
 
 
 def test_a_held_value_is_the_last_one_known() -> None:

@@ -23,8 +23,8 @@ from pipeline.simulate import (
 from pipeline.simulate.signals import Commands
 from pipeline.sources import find_preset
 from pipeline.stages.inputs import Ideal
+from pipeline.stages.motion_events import find_events
 from pipeline.stages.spans import Spans
-from pipeline.stages.velocity import find_events
 
 STEP_S = 0.05
 LIMITS = vars(Limits(live=0.1, margin=0.25))
