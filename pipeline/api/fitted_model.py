@@ -19,6 +19,7 @@ from pipeline.estimation.additions import Tries
 from pipeline.estimation.comparison import choose_input
 from pipeline.estimation.estimates import list_parameters
 from pipeline.estimation.folds import errors_as_json
+from pipeline.estimation.ladder import find_share_removed
 from pipeline.estimation.problem import carry_over, fit_as_it_is, predict_at_from
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
 from pipeline.export import export_model, read_current
@@ -303,19 +304,21 @@ class Model:
         with threadpool_limits(1):
             tries = Tries(problem, model)
             helping = tries.fold([one for one in tries.try_each() if one is not None])
-        before = errors_as_json(tries.before)
-        rows = []
-        for one in helping:
-            after = errors_as_json(one.errors)
-            rows.append(
-                {
-                    "effect": one.effect.id,
-                    "sentence": one.effect.describe_motion(problem.vehicle, model),
-                    **{name: after[name] for name in _OVER_2S},
-                    **{f"{name[0]}_removed": _share_removed(before[name], after[name]) for name in _OVER_2S},
-                    "same_as": list(one.twins),
-                }
-            )
+        rows = [
+            {
+                "effect": one.effect.id,
+                "sentence": one.effect.describe_motion(problem.vehicle, model),
+                **{name: number for name, number in errors_as_json(one.errors).items() if name in _OVER_2S},
+                **{
+                    f"{name[0]}_removed": find_share_removed(
+                        getattr(one.errors, name), getattr(tries.before, name), 0.0
+                    )
+                    for name in _OVER_2S
+                },
+                "same_as": list(one.twins),
+            }
+            for one in helping
+        ]
         numbers = dict.fromkeys((*_OVER_2S, "t_removed", "r_removed"), pl.Float64)
         texts = {"effect": pl.String, "sentence": pl.String}
         return pl.DataFrame(rows, schema={**texts, **numbers, "same_as": pl.List(pl.String)})
@@ -368,12 +371,6 @@ class Model:
     def _repr_html_(self) -> str:
         ids = ", ".join(self.file.model.ids) or "the ideal model, no effect"
         return write_html(f"{self.file.model.vehicle.name}: {ids}", self.parameters)
-
-
-def _share_removed(before: object, after: object) -> float | None:
-    if not isinstance(before, float) or not isinstance(after, float) or before <= 0.0:
-        return None
-    return 1.0 - after / before
 
 
 def _take_effect(given: object) -> Effect:
