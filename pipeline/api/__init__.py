@@ -19,6 +19,7 @@ from pipeline.analysis.summary import find_peers
 from pipeline.api.fitted_model import (
     Fit,
     Model,
+    StoredRun,
     effect,
     tabulate_ladder,
     tabulate_parameters,
@@ -129,7 +130,7 @@ def table(name: str, *, results: str | Path = "results") -> pl.LazyFrame:
     return Store(Path(results)).scan(name)
 
 
-class Run:
+class Run(StoredRun):
     """An analyzed log.
 
     Attributes:
@@ -145,7 +146,8 @@ class Run:
     """
 
     def __init__(self, manifest: Manifest, store: Store) -> None:
-        self.manifest, self._store = manifest, store
+        super().__init__(manifest)
+        self._store = store
         self.name = manifest.run
         self.summary: Content = manifest.read_json(SUMMARY)
         self.verdict = str(self.summary.get("verdict") or "")
@@ -155,15 +157,6 @@ class Run:
         self.findings = objects_in(self.summary, "findings")
         self.report = manifest.path(REPORT) if REPORT in manifest.files else None
         self.tables = tuple(sorted(manifest.tables))
-
-    def table(self, name: str) -> pl.LazyFrame:
-        """One of its tables."""
-        return self.manifest.read(name).lazy()
-
-    @property
-    def slip(self) -> pl.LazyFrame:
-        """Slip per time step: the table ``slip`` without the rows that medians leave out."""
-        return self.table("slip").filter(~pl.col("suspect"))
 
     def to_xarray(self) -> xarray.Dataset:
         """`slip` as an ``xarray.Dataset``: a variable a column, over ``input`` and ``t``, with units.

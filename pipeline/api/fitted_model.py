@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Self, cast
+from typing import Literal, Self
 
 import polars as pl
 from threadpoolctl import threadpool_limits
@@ -40,13 +40,9 @@ from pipeline.report.page import ShownFigure, show_figures
 from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis, read_result
 from pipeline.run import HORIZON_S, MotionError, MotionRun
-from pipeline.sources import Vehicle, VehicleSection, resolve_vehicle
+from pipeline.sources import Owner, Vehicle, VehicleSection, resolve_vehicle
+from pipeline.store import Manifest
 from pipeline.words import format_ladder, format_parameters
-
-if TYPE_CHECKING:
-    from pipeline.api import Run
-    from pipeline.sources import Owner
-    from pipeline.store import Manifest
 
 _ERRORS = ("t_mrmse_m", "r_mrmse_rad", "explained_share")
 _DIGITS = 4
@@ -96,8 +92,7 @@ def _format_cell(value: object) -> str:
     return f"{value:.{_DIGITS}g}" if isinstance(value, float) else str(value)
 
 
-if TYPE_CHECKING:
-    Source = Literal["command", "measured"]
+Source = Literal["command", "measured"]
 
 _PARTS = 3
 _OVER_2S = ("t_mrmse_m", "r_mrmse_rad")
@@ -134,6 +129,26 @@ def effect(name: str, /, **values: float | str | tuple[str, float, float]) -> Ef
             raise MotionError("bad_value", what, where=f"effect {name}", hint=f'Write {key}=("m/s", -1, 1).')
     parameters = [make_parameter(key, unit, (low, high)) for key, (unit, low, high) in tuples.items()]
     return FormulaEffect(name, texts, tuple(parameters))
+
+
+class StoredRun:
+    """The tables of an analyzed run.
+
+    Args:
+        manifest: its results.
+    """
+
+    def __init__(self, manifest: Manifest) -> None:
+        self.manifest = manifest
+
+    def table(self, name: str) -> pl.LazyFrame:
+        """One of its tables."""
+        return self.manifest.read(name).lazy()
+
+    @property
+    def slip(self) -> pl.LazyFrame:
+        """Slip per time step: the table ``slip`` without the rows that medians leave out."""
+        return self.table("slip").filter(~pl.col("suspect"))
 
 
 class Model:
@@ -182,7 +197,7 @@ class Model:
 
     def fit(
         self,
-        runs: Run | Sequence[Run],
+        runs: StoredRun | Sequence[StoredRun],
         *,
         input: Source | None = None,
         vehicle_of: Owner | None = None,
@@ -200,7 +215,7 @@ class Model:
 
     def errors(
         self,
-        runs: Run | Sequence[Run],
+        runs: StoredRun | Sequence[StoredRun],
         *,
         input: Source | None = None,
         vehicle_of: Owner | None = None,
@@ -225,7 +240,7 @@ class Model:
 
     def limit_speed(
         self,
-        runs: Run | Sequence[Run],
+        runs: StoredRun | Sequence[StoredRun],
         *,
         within_m: float,
         ahead_s: float = HORIZON_S,
@@ -251,7 +266,7 @@ class Model:
             return pl.DataFrame(limits_as_json(limit_speeds(file, read, source, within_m, ahead_s)))
 
     def predict(
-        self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None
+        self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
     ) -> pl.DataFrame:
         """Velocities that it predicts for a run, with its values as they are, beside the measured ones.
 
@@ -278,7 +293,7 @@ class Model:
         return slip.select("t", *names).with_columns(made).with_columns(pl.col("^model_.$").fill_nan(None))
 
     def missing(
-        self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None
+        self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
     ) -> pl.DataFrame:
         """What it lacks to describe a run: the effects that help, the most helpful first.
 
@@ -323,7 +338,9 @@ class Model:
         texts = {"effect": pl.String, "sentence": pl.String}
         return pl.DataFrame(rows, schema={**texts, **numbers, "same_as": pl.List(pl.String)})
 
-    def view(self, run: Run, *, input: Source | None = None, vehicle_of: Owner | None = None) -> MotionView:
+    def view(
+        self, run: StoredRun, *, input: Source | None = None, vehicle_of: Owner | None = None
+    ) -> MotionView:
         """Its motion on a run, with its values as they are, as rows for figures."""
         problem, state = self._prepare(run, input, vehicle_of)
         known = run.manifest.tables
@@ -334,7 +351,7 @@ class Model:
         )
         return MotionStage(problem, places).view(state, (), None)
 
-    def _prepare(self, run: Run, input: Source | None, owner: Owner | None) -> tuple[Problem, State]:
+    def _prepare(self, run: StoredRun, input: Source | None, owner: Owner | None) -> tuple[Problem, State]:
         """The run as a problem, and the model on it: its values as they are, the run's own delays."""
         file, read = self._read(run, owner)
         source = choose_input(read, input, file.model, last=file.last_input).source
@@ -360,7 +377,9 @@ class Model:
         """
         return export_model(self.file, to, None if current is None else read_current(Path(current), to), gate)
 
-    def _read(self, runs: Run | Sequence[Run], owner: Owner | None) -> tuple[ModelFile, list[MotionRun]]:
+    def _read(
+        self, runs: StoredRun | Sequence[StoredRun], owner: Owner | None
+    ) -> tuple[ModelFile, list[MotionRun]]:
         vehicle, read = read_runs(_list_manifests(runs), self.file.model.vehicle, owner)
         return replace(self.file, model=replace(self.file.model, vehicle=vehicle)), read
 
@@ -384,11 +403,11 @@ def _take_effect(given: object) -> Effect:
 
 def _list_manifests(runs: object) -> list[Manifest]:
     opened = runs if isinstance(runs, Sequence) and not isinstance(runs, str) else [runs]
-    manifests = [getattr(run, "manifest", None) for run in opened]
-    if not manifests or None in manifests:
+    manifests = [run.manifest for run in opened if isinstance(run, StoredRun)]
+    if not manifests or len(manifests) < len(opened):
         hint = "Give what slip.analyze or slip.load returns."
         raise MotionError("bad_value", f"{runs!r} is not a run", where="Model", hint=hint)
-    return cast("list[Manifest]", manifests)
+    return manifests
 
 
 def take_file(model: object) -> ModelFile:

@@ -38,6 +38,7 @@ from pipeline.report import (
 from pipeline.report.figures import Section, draw_figure, list_figures
 from pipeline.report.scene import RunReport, Scene
 from pipeline.report.sections_why import (
+    Page,
     format_remaining,
     list_findings,
     summarise_health,
@@ -243,21 +244,6 @@ def view_rest(page: Page) -> dict[str, object]:
 # folded behind a line that says what is there.
 #
 # A section is a function from the page to values, and a template that shows them; empty sections are omitted.
-
-
-@dataclass(frozen=True)
-class Page:
-    """Run with its figures drawn.
-
-    Attributes:
-        report: the run.
-        scene: its tables, joined and thinned.
-        pictures: figures with something to draw by section, in the order of the page.
-    """
-
-    report: RunReport
-    scene: Scene
-    pictures: Mapping[Section, Sequence[Picture]]
 
 
 @dataclass(frozen=True)

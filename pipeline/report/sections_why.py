@@ -1,11 +1,9 @@
 """Sections of the page: causes of slip, data health, provenance."""
 
-from __future__ import annotations
-
 import json
 import math
-from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 
 from pipeline.core import format_size, mapping_in, number_in, objects_in, split_interval
 from pipeline.models import AT_BOUND, UNDETERMINED, list_effects, name_term, suggest_manoeuvre
@@ -13,6 +11,7 @@ from pipeline.report import (
     MISSING,
     Cell,
     Column,
+    Picture,
     Table,
     begin_large,
     count_serious,
@@ -22,7 +21,7 @@ from pipeline.report import (
     set_squares,
 )
 from pipeline.report.figures import Section
-from pipeline.report.scene import RunReport
+from pipeline.report.scene import RunReport, Scene
 from pipeline.results import Named
 from pipeline.words import (
     describe_cause,
@@ -37,9 +36,6 @@ from pipeline.words import (
     list_terms,
 )
 
-if TYPE_CHECKING:
-    from pipeline.report.page import Page
-
 _RANK = {"error": 0, "warning": 1, "info": 2}
 _SEVERITY_WORDS = {"error": "do not trust", "warning": "take care", "info": "note"}
 _TOPICS = {
@@ -49,6 +45,21 @@ _TOPICS = {
     "imu": "IMU",
     "interval": "interval",
 }
+
+
+@dataclass(frozen=True)
+class Page:
+    """Run with its figures drawn.
+
+    Attributes:
+        report: the run.
+        scene: its tables, joined and thinned.
+        pictures: figures with something to draw by section, in the order of the page.
+    """
+
+    report: RunReport
+    scene: Scene
+    pictures: Mapping[Section, Sequence[Picture]]
 
 
 def view_health(page: Page) -> dict[str, object]:
