@@ -21,7 +21,7 @@ from pipeline.cli.conventions import (
     print_note,
     print_result,
 )
-from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError
+from pipeline.core import INPUT_WORDS, NORMAL_95, SlipError, format_count
 
 if TYPE_CHECKING:
     from pipeline.datasets import Forecast
@@ -441,7 +441,7 @@ def _as_json(model: LiteratureModel) -> dict[str, object]:
 
 def _list_model(model: LiteratureModel) -> str:
     number = model.count_numbers()
-    count = f"{number} number{'s' * (number != 1)}"
+    count = format_count(number, "number")
     return f"{model.name:<28} {count:<14} {model.title}"
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Self, cast
 from pipeline.cli.conventions import format_vehicle_source, print_note, tidy_line
 from pipeline.core import (
     INPUT_WORDS,
+    format_count,
     format_duration,
     format_interval,
     format_recorded,
@@ -60,7 +61,7 @@ class LineWatch(SilentWatch):
     def plan(self, todo: int, settled: int, size: int) -> None:
         """Say how much there is to do."""
         self._begin(todo, size)
-        print_note(f"{todo} log{'s' * (todo != 1)} to work on ({format_size(size)}), {settled} already done")
+        print_note(f"{format_count(todo, 'log')} to work on ({format_size(size)}), {settled} already done")
 
     def notify(self, line: Line, size: int) -> None:
         """Say what came of a log and how long the rest may take."""

@@ -16,6 +16,7 @@ from pipeline.core import (
     FigureFormat,
     SlipError,
     align_rows,
+    format_count,
     format_part,
     split_interval,
 )
@@ -109,7 +110,7 @@ def _compare_causes(
     lines = [f"slip {INPUT_WORDS[causes.input]} by cause, shares of its mean square"]
     for budget in causes.budgets:
         parts = ", ".join(f"{names.get(one.name, one.name)} {format_part(one.share)}" for one in budget.parts)
-        runs = f"{budget.runs} run{'s' * (budget.runs != 1)}"
+        runs = format_count(budget.runs, "run")
         lines += [
             "",
             f"{budget.dataset}: root mean square {budget.total**0.5:.3g} m/s, {runs}",

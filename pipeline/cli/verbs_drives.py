@@ -25,7 +25,7 @@ from pipeline.cli.conventions import (
     show_progress,
     spell_choices,
 )
-from pipeline.core import SlipError, align_rows, finite_or_none
+from pipeline.core import SlipError, align_rows, finite_or_none, format_count
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -183,7 +183,7 @@ def _known_as_json(forecast: Forecast | None) -> dict[str, object]:
 def _format_known(forecast: Forecast | None) -> list[str]:
     if forecast is None:
         return []
-    here = f"{len(forecast.here)} run{'s' * (len(forecast.here) != 1)} there"
+    here = f"{format_count(len(forecast.here), 'run')} there"
     runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
     return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
 

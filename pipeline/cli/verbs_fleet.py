@@ -31,7 +31,7 @@ from pipeline.cli.conventions import (
     summarize_error,
 )
 from pipeline.cli.model_runs import open_model
-from pipeline.core import TREND_THRESHOLD, SlipError, format_interval, suffix_unit
+from pipeline.core import TREND_THRESHOLD, SlipError, format_count, format_interval, suffix_unit
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
@@ -253,7 +253,7 @@ def _format_fleet(content: Mapping[str, object]) -> list[str]:
     lines = []
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
-        lines.append(f"{vehicle}: {len(names)} run{'s' * (len(names) != 1)}")
+        lines.append(f"{vehicle}: {format_count(len(names), 'run')}")
         lines += [line for row in own for line in _format_number(row)]
         lines += [] if own else ["  no significant effect in any of them"]
     # Fleet models of earlier versions have no summary.
@@ -333,7 +333,7 @@ def _format_forecast(content: Mapping[str, object]) -> list[str]:
     from pipeline.models import find_effect  # noqa: PLC0415 - heavy
 
     here, elsewhere = content["runs_on_terrain"], content["runs_elsewhere"]
-    there = f"{here} run{'s' * (here != 1)} there, {elsewhere} elsewhere"
+    there = f"{format_count(cast('int', here), 'run')} there, {elsewhere} elsewhere"
     lines = [f"{content['vehicle']} on {content['terrain']}: {there}"]
     lines += [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
     numbers: dict[str, str] = {}

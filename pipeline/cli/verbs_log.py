@@ -40,6 +40,7 @@ from pipeline.core import (
     FigureFormat,
     SlipError,
     align_rows,
+    format_count,
     format_duration,
     format_share,
     format_size,
@@ -269,7 +270,7 @@ def _format_count(seen: Inspection) -> str:
     """Number of messages that can be read, of how many where some cannot, and in how many chunks."""
     stated, chunks = seen.index.message_count, seen.index.chunk_count
     some = f" of {stated}" if seen.messages < stated else ""
-    parts = f" in {chunks} chunk{'s' * (chunks != 1)}" if chunks else ""
+    parts = f" in {format_count(chunks, 'chunk')}" if chunks else ""
     return f"{seen.messages}{some} messages{parts}"
 
 

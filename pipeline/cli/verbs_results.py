@@ -24,7 +24,7 @@ from pipeline.cli.conventions import (
     summarize_error,
     tidy_line,
 )
-from pipeline.core import INPUT_WORDS, SlipError, format_size
+from pipeline.core import INPUT_WORDS, SlipError, format_count, format_size
 
 if TYPE_CHECKING:
     import polars as pl
@@ -186,7 +186,7 @@ def _format_status(status_now: Status) -> list[str]:
         if status_now.last is None
         else f"{datetime.fromtimestamp(status_now.last).astimezone():%Y-%m-%d %H:%M}"
     )
-    old = f"{status_now.old_generations} old generation{'s' * (status_now.old_generations != 1)}"
+    old = format_count(status_now.old_generations, "old generation")
     lines = [
         f"runs          {status_now.runs}, {format_size(status_now.bytes)}, {old}",
         f"last batch    {last}",

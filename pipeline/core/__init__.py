@@ -101,6 +101,7 @@ if TYPE_CHECKING:
         count_places,
         enumerate_texts,
         format_angle,
+        format_count,
         format_digits,
         format_duration,
         format_errors,

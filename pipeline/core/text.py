@@ -86,6 +86,11 @@ def naming_os_errors(
         raise make(code, f"{what}: {error.strerror or error}", where=str(where), hint=hint) from error
 
 
+def format_count(number: int, word: str) -> str:
+    """A number of things in words: `1 run`, `3 runs`."""
+    return f"{number} {word}{'s' * (number != 1)}"
+
+
 def align_rows(rows: Sequence[Sequence[str]], *, right: Collection[int] = (), gap: int = 2) -> list[str]:
     """Rows of texts as lines with aligned columns; those in ``right`` at their right ends."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

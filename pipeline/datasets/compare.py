@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, Ints
+from pipeline.core import FEWEST_OF_SPREAD, Ints, format_count
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -423,7 +423,7 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str
             silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
     sentences = []
     for note, (first, *others) in sorted(silent.items()):
-        count_text = f", and {len(others)} more pair{'s' * (len(others) > 1)}" if others else ""
+        count_text = f", and {format_count(len(others), 'more pair')}" if others else ""
         sentences.append(f"{first}{count_text}, {of}: {note}")
     single = sorted({group.name for pair in pairs if pair.unit == BLOCKS for group in (pair.a, pair.b)})
     if single:

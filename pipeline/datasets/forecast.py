@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Floats, format_interval
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, Floats, format_count, format_interval
 from pipeline.datasets.levels import (
     LevelFit,
     RunEvidence,
@@ -206,7 +206,7 @@ def _fit_number(vehicle: str, effect: str, parameter: str, rows: pl.DataFrame, w
     if odd:
         because += f"; {', '.join(odd)} stand{'s' * (len(odd) == 1)} apart from it"
     if without:
-        because += f"; not in the models of {without} other run{'s' * (without != 1)}"
+        because += f"; not in the models of {format_count(without, 'other run')}"
     # A clock offset determined by a gyro was corrected before the fit: no written model contains it.
     is_dated = find_effect(effect).late is Late.POSES and not used["in_model"].any()
     readings = {} if is_dated else {reading.level: reading.name for reading in find_effect(effect).readings}
@@ -258,7 +258,9 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         return None, reason
     if fit.p_groups < SURE:
         ends = sorted(fit.groups.items(), key=lambda one: one[1].value)
-        means = ", ".join(f"{name} {mean.value:.3g} ({_count_runs(mean.runs)})" for name, mean in ends)
+        means = ", ".join(
+            f"{name} {mean.value:.3g} ({format_count(mean.runs, 'run')})" for name, mean in ends
+        )
         return Level.TERRAIN, f"terrains differ by more than runs do (p = {fit.p_groups:.1g}): {means}"
     alike = f"{len(fit.groups)} terrains not shown to differ by more than runs do (p = {fit.p_groups:.2g})"
     inside = fit.interval
@@ -268,10 +270,6 @@ def decide_level(fit: LevelFit, neutral: float) -> tuple[Level | None, str]:
         spread = f"scatter by {fit.spread_run:.2g} about {fit.value:.3g}"
         return Level.RUN, f"{alike}, and runs {spread} (p = {fit.p_runs:.1g})"
     return None, f"{alike}, and the mean is not significantly different from neutral: more runs are needed"
-
-
-def _count_runs(runs: int) -> str:
-    return f"{runs} run{'s' * (runs != 1)}"
 
 
 def _find_open(fit: LevelFit) -> str | None:

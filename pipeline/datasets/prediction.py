@@ -21,6 +21,7 @@ from pipeline.core import (
     SlipError,
     enumerate_texts,
     finite_or_none,
+    format_count,
     guess_names,
     pick,
     read_bounded,
@@ -153,7 +154,7 @@ def _summarize(model: FleetModel) -> str:
     """Summarize in one or two sentences: levels of the parameters, and the data needed for open ones."""
     counts = Counter("" if number.level is None else number.level.value for number in model.numbers)
     runs = sum(map(len, model.runs.values()))
-    fitted = f"{_count(runs, 'run')} of {_count(len(model.runs), 'vehicle')}"
+    fitted = f"{format_count(runs, 'run')} of {format_count(len(model.runs), 'vehicle')}"
     if not counts:
         return f"No significant effect in {fitted}."
     owners = [
@@ -166,7 +167,7 @@ def _summarize(model: FleetModel) -> str:
         if counts[level]
     ]
     source = f": {enumerate_texts(owners)}" if owners else ""
-    first = f"{_count(len(model.numbers), 'parameter')} in {fitted}{source}."
+    first = f"{format_count(len(model.numbers), 'parameter')} in {fitted}{source}."
     if not counts[""]:
         return first
     verb = "remains" if counts[""] == 1 else "remain"
@@ -174,10 +175,6 @@ def _summarize(model: FleetModel) -> str:
         f"{first} {counts['']} {verb} open between these levels: to decide, diagnose more runs, "
         "several on each of two or more terrains."
     )
-
-
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'s' * (number != 1)}"
 
 
 def _summarize_number(number: FleetNumber) -> dict[str, object]:

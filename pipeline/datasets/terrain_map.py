@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 
-from pipeline.core import Floats, SlipError, finite_or_none, format_share, interpolate_linearly
+from pipeline.core import Floats, SlipError, finite_or_none, format_count, format_share, interpolate_linearly
 from pipeline.datasets.compared_runs import find_material, measure_runs
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.datasets.terrain import (
@@ -441,7 +441,7 @@ def list_lines(drawn: TerrainMap, written: Mapping[str, Path]) -> list[str]:
         mine = drawn.cell_table.filter(pl.col("frame") == frame)
         slip = float(np.median(mine["slip"].to_numpy()))
         most = int(mine["passes"].to_numpy().max())
-        count = f"{len(members)} run{'s' * (len(members) != 1)}"
+        count = format_count(len(members), "run")
         size = f"{mine.height} cells of {drawn.cell_m:g} m"
         lines.append(f"{frame}: {count}, {size}, up to {most} passes, median slip {format_share(slip)}")
     lines += [effect.describe() for effect in drawn.effects]

@@ -8,7 +8,7 @@ from itertools import compress
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, guess_names, pick, suffix_unit
+from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, format_count, guess_names, pick, suffix_unit
 from pipeline.datasets.compared_runs import ComparedRuns, find_material
 from pipeline.datasets.forecast import leave_out_odd, list_numbers
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError, gather_runs
@@ -222,7 +222,7 @@ def _follow(
         used, search.shifts, lambda before, after: _find_likely(effect, terrains[before], terrains[after])
     )
     missing = FEWEST_FREE - search.freedom
-    need = f"{missing} more run{'s' * (missing > 1)} on a terrain driven before" if missing > 0 else ""
+    need = f"{format_count(missing, 'more run')} on a terrain driven before" if missing > 0 else ""
     return ParameterTrend(
         vehicle, effect, parameter, str(rows["unit"][0]), points, changes, search.least, need, odd,
         undetermined, int(rows["named"].sum()), 0.0 if number.least is None else number.least.size, *last,

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from pipeline.core import Floats, SlipError
+from pipeline.core import Floats, SlipError, format_count
 from pipeline.datasets import (
     Forecast,
     RunEvidence,
@@ -80,7 +80,7 @@ def forecast_deployment(
     runs = list(_load_runs(store, start))
     if not start.numbers or not runs:
         return start
-    notify(f"fitting {len(runs)} run{'s' * (len(runs) > 1)} jointly")
+    notify(f"fitting {format_count(len(runs), 'run')} jointly")
     geometry, held = runs[0][1], list_held(estimates, vehicle, source)
     problem = Problem([run for run, _ in runs], geometry, Input(source))
     clocks = [effect for effect in held if effect.late is Late.POSES]

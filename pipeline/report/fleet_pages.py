@@ -13,6 +13,7 @@ import polars as pl
 from pipeline.core import (
     INPUT_WORDS,
     FigureFormat,
+    format_count,
     format_share,
     mapping_in,
     number_in,
@@ -194,7 +195,7 @@ def render_terrain(drawn: TerrainMap) -> str:
         [picture for _, _, pictures in groups for picture in pictures] + repeated,
         title="What to expect by place",
         facts=[
-            f"{count} run{'s' * (count != 1)}",
+            format_count(count, "run"),
             f"{drawn.cell_table.height} cells of {drawn.cell_m:g} m",
             f"{drawn.crossings} crossings",
             f"slip {INPUT_WORDS[drawn.input]}",
@@ -220,7 +221,7 @@ def _group_maps(drawn: TerrainMap) -> list[tuple[str, str, list[Picture]]]:
         # A run without a shared frame has one of its own, called after it.
         is_own = row["frame"] == f"run {next(iter(drawn.frames[row['frame']]))}"
         name = f"{row['vehicle']}, {row['frame']}"
-        name += "" if is_own else f", {members} run{'s' * (members != 1)}"
+        name += "" if is_own else f", {format_count(members, 'run')}"
         pictures = [
             Picture(f"map-{number}-{column}", title, _draw_cells(mine, drawn.cell_m, number, shown), "half")
             for shown in _SHOWN
@@ -405,8 +406,8 @@ def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
         [draw_causes(budgets, names)],
         title="Deployments compared by cause",
         facts=[
-            f"{len(budgets)} dataset{'s' * (len(budgets) != 1)}",
-            f"{len(keys)} run{'s' * (len(keys) != 1)}",
+            format_count(len(budgets), "dataset"),
+            format_count(len(keys), "run"),
             f"slip {INPUT_WORDS[causes.input]}",
         ],
         sentence_list=sentences,

@@ -4,13 +4,13 @@ import contextlib
 import itertools
 import json
 import math
-from collections.abc import Mapping, Sequence, Sized
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import polars as pl
 
-from pipeline.core import TREND_THRESHOLD, Floats, read_bounded
+from pipeline.core import TREND_THRESHOLD, Floats, format_count, read_bounded
 from pipeline.datasets import (
     TREND,
     WHISKER_REACH,
@@ -66,10 +66,10 @@ def render_trend(trend: Trend) -> str:
         [picture for *_, pictures in groups for picture in pictures],
         title="Trends",
         facts=[
-            f"{_count(parameters, 'parameter')} of {_count(vehicles, 'vehicle')}",
-            f"{len(series)} series of {_count(names, 'group')}",
-            _count(keys, "run"),
-            _count(alerts, "alert"),
+            f"{format_count(len(parameters), 'parameter')} of {format_count(len(vehicles), 'vehicle')}",
+            f"{len(series)} series of {format_count(len(names), 'group')}",
+            format_count(len(keys), "run"),
+            format_count(len(alerts), "alert"),
         ],
         alerts=[alert.text for alert in alerts],
         quiet=begin_large(format_quiet(series, parameters)),
@@ -77,10 +77,6 @@ def render_trend(trend: Trend) -> str:
         groups=[group for group in groups if group[-1]],
         runs=keys,
     )
-
-
-def _count(what: Sized, word: str) -> str:
-    return f"{len(what)} {word}{'s' * (len(what) != 1)}"
 
 
 def _draw_vehicle(

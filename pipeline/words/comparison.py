@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, enumerate_texts, format_share, number_in
+from pipeline.core import INPUT_WORDS, enumerate_texts, format_count, format_share, number_in
 from pipeline.datasets import (
     ALIKE,
     AS_PUBLISHED,
@@ -217,7 +217,7 @@ def list_pairs(answer: Answer, input_name: str) -> list[PairLine]:
 
 
 def _format_overlap(share: float, bins: int) -> str:
-    return f"{format_share(share)}, {bins} cell{'s' * (bins != 1)}" if bins else "none"
+    return f"{format_share(share)}, {format_count(bins, 'cell')}" if bins else "none"
 
 
 def _format_two(value: float) -> str:

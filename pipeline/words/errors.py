@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pipeline.core import (
     enumerate_texts,
     format_angle,
+    format_count,
     format_digits,
     format_errors,
     format_length,
@@ -254,7 +255,7 @@ def describe_need(run: RunDiagnosis) -> str:
     others = "the others" if known else "it" if count == 1 else "them"
     if need.vague and not is_brief:
         sentences.append(
-            f"{need.minutes} more minute{'s' * (need.minutes > 1)} of such driving for {_GOAL} of all"
+            f"{format_count(need.minutes, 'more minute')} of such driving for {_GOAL} of all"
             if need.minutes
             else f"more such driving does not narrow {others}"
         )

@@ -4,7 +4,15 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.core import format_angle, format_digits, format_length, format_share, number_in, split_interval
+from pipeline.core import (
+    format_angle,
+    format_count,
+    format_digits,
+    format_length,
+    format_share,
+    number_in,
+    split_interval,
+)
 from pipeline.estimation.folds import Errors
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
@@ -128,7 +136,7 @@ def _describe_limit(limit: SpeedLimit, terrain: str) -> str:
     """One terrain's highest speed, or why there is none."""
     where = "" if terrain == "unknown" else f" on {terrain}"
     if limit.answer is Answer.TOO_FEW:
-        count = f"{limit.predictions} prediction{'s' * (limit.predictions != 1)} while driving"
+        count = f"{format_count(limit.predictions, 'prediction')} while driving"
         return f"unknown{where}: {count}, and {FEWEST_PREDICTIONS} are needed; drive longer"
     fastest, slowest = (f"{format_digits(one)} m/s" for one in (limit.fastest, limit.slowest))
     if limit.answer is Answer.NONE:
