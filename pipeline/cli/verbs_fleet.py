@@ -256,13 +256,8 @@ def _format_fleet(content: Mapping[str, object]) -> list[str]:
         lines.append(f"{vehicle}: {format_count(len(names), 'run')}")
         lines += [line for row in own for line in _format_number(row)]
         lines += [] if own else ["  no significant effect in any of them"]
-    # Fleet models of earlier versions have no summary.
-    summary = str(content.get("summary") or "")
-    return [
-        *lines,
-        *(f"! {note}" for note in cast("Sequence[str]", content["notes"])),
-        *filter(None, [summary]),
-    ]
+    notes = [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
+    return [*lines, *notes, str(content["summary"])]
 
 
 def _format_number(row: Mapping[str, object]) -> list[str]:

@@ -16,7 +16,6 @@ import numpy as np
 from pipeline.core import INPUTS, NORMAL_95, Floats, SlipError, finite_or_none, read_bounded, shorten
 from pipeline.datasets.changes import AFTER, BEFORE, RunNumbers, Side
 from pipeline.datasets.check_readings import (
-    COMMANDED,
     LOGARITHMS,
     Label,
     RunReading,
@@ -418,28 +417,22 @@ def read_baseline(path: Path) -> Baseline:
         raise ComparisonError("bad_baseline", what, where=str(path), hint=hint) from error
     file = parse_model(stored.model, path)
     names = (*(label.name for label in list_labels(file.model, file.per_run)), *LOGARITHMS)
-    # Baselines of before the commanded rate end with the errors.
-    known = tuple(stored.numbers)
-    count = len(known)
+    count = len(names)
     fits = all(
         len(run.values) == count and [len(row) for row in run.covariance] == [count] * count
         for run in stored.runs
     )
-    is_ours = stored.format == BASELINE_FORMAT and known in {names, names[: -len(COMMANDED)]}
-    readings = tuple(_open_run(run, len(names)) for run in stored.runs) if fits and is_ours else ()
-    if not (is_ours and readings and all(map(_is_sound, readings))):
+    is_ours = stored.format == BASELINE_FORMAT and tuple(stored.numbers) == names
+    readings = tuple(map(_open_run, stored.runs)) if fits and is_ours else ()
+    if not (readings and all(map(_is_sound, readings))):
         what = "the baseline is of another version, or its numbers are not those of fits of its model"
         raise ComparisonError("bad_baseline", what, where=str(path), hint=hint)
     return Baseline(file, Input(stored.input), names, readings)
 
 
-def _open_run(run: _StoredRun, size: int) -> RunReading:
-    """A stored run; quantities that its baseline lacks are unknown."""
-    lacking = size - len(run.values)
-    values = np.pad(_array(run.values), (0, lacking), constant_values=math.nan)
-    covariance = np.pad(_array(run.covariance), (0, lacking), constant_values=math.nan)
+def _open_run(run: _StoredRun) -> RunReading:
     slip = _array(run.slip)
-    numbers = RunNumbers(run.run, BEFORE, values, covariance)
+    numbers = RunNumbers(run.run, BEFORE, _array(run.values), _array(run.covariance))
     return RunReading(numbers, run.sha256, run.terrain, run.pace, (float(slip[0]), float(slip[1])))
 
 

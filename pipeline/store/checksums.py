@@ -14,8 +14,7 @@ from pipeline.store.names import StoreError, is_file_name, is_key, join_inside
 
 # Small JSON files that carry a checksum of themselves, so that no byte of them changes unnoticed.
 #
-# The checksum stands first and covers every other byte. Files of before there were checksums have none and
-# are read as they are.
+# The checksum stands first and covers every other byte.
 
 _START = b'{"checksum": "'
 _DIGITS = 64
@@ -39,39 +38,29 @@ def encode_checked(content: Mapping[str, object], *, indent: int | None = None) 
     return _START + hash_bytes(body).encode() + _END + body[1:]
 
 
-def has_checksum(data: bytes) -> bool:
-    """Whether the content of a file carries a checksum.
+def check_checksum(data: bytes) -> None:
+    """Refuse the content of a file that is not what was written.
 
-    Returns:
-        True when it does, and is what was written; False when it never had one.
+    Raises:
+        ValueError: it has no checksum, or another one.
+    """
+    body = b"{" + data[len(_START) + _DIGITS + len(_END) :]
+    if data != _START + hash_bytes(body).encode() + _END + body[1:]:
+        raise ValueError("its checksum is not that of its content")
+
+
+def decode_checked(data: bytes) -> dict[str, object]:
+    """The content of a file with a checksum.
 
     Raises:
         ValueError: it is not what was written.
     """
-    start, rest = data[: len(_START)], data[len(_START) :]
-    # One changed byte must not make it a file of before there were checksums.
-    if 2 * sum(one == other for one, other in zip(start, _START, strict=False)) < len(_START):
-        return False
-    body = b"{" + rest[_DIGITS + len(_END) :]
-    if start + rest[:_DIGITS] + rest[_DIGITS:][: len(_END)] != _START + hash_bytes(body).encode() + _END:
-        raise ValueError("its checksum is not that of its content")
-    return True
-
-
-def decode_checked(data: bytes) -> dict[str, object]:
-    """The content of a file with a checksum, or of one of before there were checksums.
-
-    Raises:
-        ValueError: it is not a JSON object, or not what was written.
-    """
-    has_checksum(data)
+    check_checksum(data)
     try:
-        content = json.loads(data.decode())
+        content: dict[str, object] = json.loads(data)
     except RecursionError as error:
         raise ValueError("it is nested too deeply") from error
-    if not isinstance(content, dict):
-        raise ValueError("it is not a JSON object")  # noqa: TRY004 - wrong content, not a wrong call
-    content.pop("checksum", None)
+    content.pop("checksum")
     return content
 
 
@@ -134,7 +123,7 @@ def parse_manifest(data: bytes, home: Path) -> Manifest:
                 raise
         if written_in <= FORMAT:
             _check_names(stored)
-            has_checksum(data)
+            check_checksum(data)
             folder = resolve_inside(home, stored.folder)
     except (msgspec.DecodeError, ValueError, RecursionError, PathError) as error:
         said = error.what if isinstance(error, PathError) else " ".join(str(error).split())

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from pipeline.core import read_bounded, walk_files
-from pipeline.store.checksums import NOTES, decode_checked, has_checksum, parse_manifest, parse_marker
+from pipeline.store.checksums import NOTES, decode_checked, encode_marker, parse_manifest, parse_marker
 from pipeline.store.files import MANIFEST, MARKER, Manifest, hash_file
 from pipeline.store.generation import LATEST
 from pipeline.store.names import Sample, StoreError, Tally, check_home, is_file_name
@@ -18,8 +18,6 @@ ABSENT = ""
 """Stands for the hash of a file that is not there."""
 _RUN_DEPTHS = (1, 2)
 """Slashes in the folder of a run, ``runs/stem`` or ``runs/folder/stem``."""
-_OF_BEFORE = ("listed.json", "sealed.json", "mirror.json")
-"""Files over all runs of earlier versions; nothing reads them any more."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -50,7 +48,7 @@ class Examination:
     Attributes:
         problems: what is not what was written.
         unchecked: names in the results that no checksum covers: tables and pages over all runs, which are
-            made of the runs, and old generations of versions without checksums.
+            made of the runs.
         files: how many files of how many were hashed.
     """
 
@@ -131,7 +129,6 @@ class _Examiner:
         self._unread: list[Problem] = []
         self._names = files.names(self._leave_out)
         self._sorted = sorted(self._names)
-        self._unchecked: list[str] = []
         self._sample, self._tally = sample, Tally()
         # A generation's folder may hold a file of any name, and runs may stand beside it.
         self._folders = {name.rpartition("/")[0] for name in self._names if name.endswith(f"/{MARKER}")}
@@ -143,11 +140,7 @@ class _Examiner:
             problems += [replace(problem, home=home) for problem in self._examine_run(home)]
         problems += self._examine_notes()
         of_all = {name for name in self._names if is_file_name(name) and "/" not in name}
-        return Examination(
-            problems=tuple(problems),
-            unchecked=(*sorted(of_all - {*_OF_BEFORE}), *self._unchecked),
-            files=self._tally,
-        )
+        return Examination(problems=tuple(problems), unchecked=tuple(sorted(of_all)), files=self._tally)
 
     def _find_folders(self, name: str) -> set[str]:
         """Folders of runs that hold a name."""
@@ -162,7 +155,6 @@ class _Examiner:
         """Problems of a run; looked at again when somebody has written it meanwhile."""
         name = f"{home}/{MANIFEST}"
         while True:
-            unchecked = len(self._unchecked)
             try:
                 data = self._files.read(name)
                 problems = self._judge_run(name, data)
@@ -171,7 +163,6 @@ class _Examiner:
             except OSError as error:
                 code = "manifest_damaged" if error.errno == errno.EFBIG else "disk_error"
                 return [self._problem(_folder_of(name), name, code, _format_os_error(error))]
-            del self._unchecked[unchecked:]
 
     def _judge_run(self, name: str, data: bytes | None) -> list[Problem]:
         run = _folder_of(name)
@@ -186,23 +177,16 @@ class _Examiner:
             check_home(manifest.run, home, top=self._files.locate(RUNS))
         except StoreError as error:
             return [Problem(run=run, path=home / MANIFEST, code=error.code, what=error.what)]
-        return [*self._judge_files(manifest, run, has_marker=has_checksum(data))]
+        return [*self._judge_files(manifest, run)]
 
-    def _judge_files(self, manifest: Manifest, locate: str, *, has_marker: bool) -> Iterator[Problem]:
+    def _judge_files(self, manifest: Manifest, locate: str) -> Iterator[Problem]:
         folder = f"{RUNS}/{locate}/{manifest.folder.name}"
         marker = self._files.read(f"{folder}/{MARKER}")
-        if marker:
-            try:
-                is_right = parse_marker(marker) == manifest.hashes()
-            except ValueError:
-                is_right = False
-            if not is_right:
-                what = "the file has changed since it was written"
-                yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
-        elif marker is None and has_marker:
+        if marker is None:
             yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_missing", "the file is gone")
-        elif marker is None:
-            self._unchecked.append(f"{folder}/{MARKER}")
+        elif marker != encode_marker(manifest.run, manifest.hashes()):
+            what = "the file has changed since it was written"
+            yield self._problem(manifest.run, f"{folder}/{MARKER}", "file_damaged", what)
         yield from self._compare(manifest.run, folder, manifest.hashes())
         for earlier in manifest.earlier:
             yield from self._judge_earlier(manifest, f"{RUNS}/{locate}/{earlier}")
@@ -210,10 +194,7 @@ class _Examiner:
     def _judge_earlier(self, manifest: Manifest, folder: str) -> Iterator[Problem]:
         """Problems of a generation that is not current, all of one kind: nothing is made of it any more."""
         marker = self._files.read(f"{folder}/{MARKER}")
-        if not marker:
-            if marker is not None:
-                self._unchecked.append(f"{folder}/{MARKER}")
-                return
+        if marker is None:
             gone, what = folder, "the old generation is gone"
             if any(self._list_inside(folder)):
                 gone, what = f"{folder}/{MARKER}", "in an old generation: the file is gone"

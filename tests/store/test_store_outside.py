@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shutil
 from dataclasses import asdict
@@ -14,6 +13,7 @@ import pytest
 from store_samples import read_seed, write_generation
 
 from pipeline.store import Store, StoreError
+from pipeline.store.checksums import decode_checked, encode_checked
 from pipeline.store.files import hash_bytes
 from pipeline.store.mirror import Mirror
 
@@ -145,10 +145,8 @@ def test_a_run_is_fetched_as_it_was_written(
 
 
 def edit(path: Path, changes: dict[str, object]) -> None:
-    """Change a manifest as somebody would who knows how it is made: as one of before there were checksums."""
-    content = json.loads(path.read_text())
-    del content["checksum"]
-    path.write_text(json.dumps(content | changes))
+    """Change a manifest as somebody would who knows how it is made."""
+    path.write_bytes(encode_checked(decode_checked(path.read_bytes()) | changes))
 
 
 ENTRY = {"bytes": 1, "sha256": "0" * 64}

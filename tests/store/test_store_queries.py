@@ -1,8 +1,8 @@
 """Tables over all runs: lazily, in SQL, across versions of a contract; tables of the whole results."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -13,7 +13,7 @@ from polars.testing import assert_frame_equal
 from store_samples import break_windows, make_slip, make_windows, write_generation
 
 from pipeline.store import Store, StoreError
-from pipeline.store.checksums import encode_manifest
+from pipeline.store.checksums import decode_checked, encode_checked, encode_manifest
 from pipeline.store.files import MANIFEST
 from pipeline.store.parquet_tables import check_table, schema_of
 from schemas import list_contracts
@@ -130,10 +130,9 @@ def test_tables_of_an_older_contract_are_fitted(store: Store) -> None:
     older = manifest.read("windows").drop("samples").with_columns(gone=1, segment=pl.lit(3, pl.Int64))
     older.write_parquet(manifest.path("windows"))
     path = manifest.folder.parent / "manifest.json"
-    content = json.loads(path.read_text())
-    del content["checksum"]
+    content: Any = decode_checked(path.read_bytes())
     content["tables"]["windows"]["contract_version"] = 0
-    path.write_text(json.dumps(content))
+    path.write_bytes(encode_checked(content))
 
     found = store.scan("windows").collect()
     assert found.schema == schema_of("windows")
