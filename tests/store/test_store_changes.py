@@ -6,8 +6,8 @@ from itertools import cycle
 from pathlib import Path
 
 import pytest
-from conftest import StartWriter
 from store_samples import write_generation
+from store_writer import StartWriter
 
 from pipeline.store import Store
 from pipeline.store.names import Sample

@@ -6,8 +6,8 @@ import time
 from pathlib import Path
 
 import pytest
-from conftest import StartWriter
 from store_samples import read_seed, write_generation
+from store_writer import StartWriter
 
 from pipeline.store import STEPS, Store
 

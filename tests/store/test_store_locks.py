@@ -9,8 +9,8 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
-from conftest import StartWriter
 from store_samples import read_seed, write_generation
+from store_writer import StartWriter
 
 from pipeline.store import Store, StoreError
 from pipeline.store.files import hold_lock
