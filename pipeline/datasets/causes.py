@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -20,6 +20,7 @@ from pipeline.core import FEWEST_OF_SPREAD, Floats, finite_or_none, format_share
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
     Question,
+    choose_input,
     choose_runs,
     find_material,
     find_untested,
@@ -140,15 +141,9 @@ def compare_causes(
             ``low``, ``high`` (bounds of the share).
         untested: pairs of deployments that are not compared.
     """
-    own = rows.sort("group", "run").partition_by("group", maintain_order=True)
-    groups = [_Group.gather(str(one["group"][0]), one) for one in own]
-    budgets = tuple(group.describe() for group in groups)
-    pairs = [
-        _compare(*sorted(pair, key=lambda group: group.mean_square))
-        for pair in combinations(groups, 2)
-        if frozenset(group.name for group in pair) not in untested
-    ]
-    return budgets, tuple(pairs)
+    groups = _gather(rows)
+    pairs = [(a, b) for a, b in _pair(groups) if frozenset((a.name, b.name)) not in untested]
+    return tuple(group.describe() for group in groups), tuple(_compare(a, b) for a, b in pairs)
 
 
 @dataclass(frozen=True)
@@ -170,16 +165,11 @@ def find_carriers(rows: pl.DataFrame) -> dict[frozenset[str], Carrier]:
     Args:
         rows: as for `compare_causes`.
     """
-    parts = rows.sort("group", "run").partition_by("group", maintain_order=True)
-    groups = [_Group.gather(str(one["group"][0]), one) for one in parts]
     carriers = {}
-    for pair in combinations(groups, 2):
-        a, b = sorted(pair, key=lambda group: group.mean_square)
-        scale = 1.0 / max(math.sqrt(a.mean_square) + math.sqrt(b.mean_square), 1e-300)
-        causes = list(dict.fromkeys((*a.causes, *b.causes)))
-        differences = {cause: float(b.take(cause)[0].mean() - a.take(cause)[0].mean()) for cause in causes}
-        largest = max(causes, key=lambda cause: differences[cause])
-        carriers[frozenset((a.name, b.name))] = Carrier(largest[0], scale * differences[largest])
+    for a, b in _pair(_gather(rows)):
+        differences = _subtract(a, b)
+        largest = max(differences, key=lambda cause: differences[cause])
+        carriers[frozenset((a.name, b.name))] = Carrier(largest[0], _scale(a, b) * differences[largest])
     return carriers
 
 
@@ -234,15 +224,35 @@ class _Group:
         return Budget(self.name, whole.size, float(whole.mean()), tuple(parts), unit)
 
 
+def _gather(rows: pl.DataFrame) -> list[_Group]:
+    own = rows.sort("group", "run").partition_by("group", maintain_order=True)
+    return [_Group.gather(str(one["group"][0]), one) for one in own]
+
+
+def _pair(groups: Sequence[_Group]) -> Iterator[tuple[_Group, _Group]]:
+    """Every two groups, the one with less slip first."""
+    for pair in combinations(groups, 2):
+        less, more = sorted(pair, key=lambda group: group.mean_square)
+        yield less, more
+
+
+def _subtract(a: _Group, b: _Group) -> dict[tuple[str, str], float]:
+    """Difference of the mean squares of ``b`` and ``a`` by cause [m^2/s^2]."""
+    causes = dict.fromkeys((*a.causes, *b.causes))
+    return {cause: float(b.take(cause)[0].mean() - a.take(cause)[0].mean()) for cause in causes}
+
+
+def _scale(a: _Group, b: _Group) -> float:
+    """Factor from differences of mean squares to those of root mean squares [s/m]."""
+    return 1.0 / max(math.sqrt(a.mean_square) + math.sqrt(b.mean_square), 1e-300)
+
+
 def _compare(a: _Group, b: _Group) -> Difference:
-    roots = [math.sqrt(group.mean_square) for group in (a, b)]
-    scale = 1.0 / max(sum(roots), 1e-300)
+    total, scale = math.sqrt(b.mean_square) - math.sqrt(a.mean_square), _scale(a, b)
     single = a.table.shape[0] == b.table.shape[0] == 1
-    causes = list(dict.fromkeys((*a.causes, *b.causes)))
     differences, smallest = [], 0.0
-    for cause in causes:
+    for cause, difference in _subtract(a, b).items():
         (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
-        difference = float(second.mean() - first.mean())
         if single:
             half, p = float(np.hypot(half_first[0], half_second[0])), math.nan
             ends = (difference - half, difference + half)
@@ -257,12 +267,12 @@ def _compare(a: _Group, b: _Group) -> Difference:
         parts.append(CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q))
     parts.sort(key=lambda part: -abs(part.difference))
     note = ABOUT_BLOCKS if single else ""
-    if not single and smallest * len(causes) > LEVEL:
+    if not single and smallest * len(parts) > LEVEL:
         note = (
             f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
-            f"{runs_needed(len(causes))} per side are needed"
+            f"{runs_needed(len(parts))} per side are needed"
         )
-    return Difference(a.name, b.name, roots[1] - roots[0], tuple(parts), BLOCKS if single else RUNS, note)
+    return Difference(a.name, b.name, total, tuple(parts), BLOCKS if single else RUNS, note)
 
 
 @dataclass(frozen=True)
@@ -344,8 +354,7 @@ def find_causes(store: Store, question: Question) -> Causes:
         hint = "Analyze logs with their diagnosis: slip analyze LOG... --terrain NAME."
         what = "no run has a budget of its slip"
         raise lack_runs("nothing_to_compare", what, store.root, hint, compared.notes)
-    on_command = rows.filter(pl.col("input") == "command")["run"].n_unique()
-    source = question.input or ("command" if on_command == rows["run"].n_unique() else "measured")
+    source = question.input or choose_input(rows)
     own = rows.filter(pl.col("input") == source)
     compared = keep_runs(compared, own["run"].unique().to_list(), f"no budget of its slip on {source}")
     if own.is_empty():
