@@ -319,14 +319,15 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
     shown = answer.datasets.filter(pl.col("input") == answer.input)
     facts = [f"{shown.height} datasets", f"{shown['runs'].sum()} runs", answer.measure]
     pictures = list_pictures(answer)
-    published = [picture for picture in pictures if picture.id == _PUBLISHED]
+    published, driving = ([one for one in pictures if one.id == name] for name in (_PUBLISHED, _DRIVING))
     return render_figures(
         "report/templates/comparison.html",
         pictures,
         title="Deployments compared",
         facts=facts,
         answers=_list_answers(answer),
-        main_pictures=[picture for picture in pictures if picture.id != _PUBLISHED],
+        main_pictures=[picture for picture in pictures if picture.id not in {_PUBLISHED, _DRIVING}],
+        driving=driving,
         ratios=[table for name in answer.inputs if (table := _tabulate_ratios(answer, name))],
         published=published,
         unit=ABOUT_UNIT,
@@ -350,6 +351,7 @@ def _list_answers(answer: Answer) -> list[dict[str, object]]:
 
 
 _PUBLISHED = "window_norms_by_dataset"
+_DRIVING = "driving"
 _TITLES = {
     AS_DRIVEN: "How hard it was, as driven",
     EQUAL_DRIVING: "How hard the ground is, at equal driving",
@@ -373,7 +375,7 @@ def list_pictures(answer: Answer) -> list[Picture]:
         pictures.append(Picture(name, f"{_TITLES[view.quantity]}, {words}", drawing, width="half"))
     if not answer.bins.is_empty():
         title = f"Equal driving: the same place in every panel, {INPUT_WORDS[answer.input]}"
-        pictures.append(Picture("driving", title, draw_driving(answer.bins, answer.input, answer.families)))
+        pictures.append(Picture(_DRIVING, title, draw_driving(answer.bins, answer.input, answer.families)))
     boxes = answer.windows.filter(pl.col("input") == answer.input)
     if not boxes.is_empty():
         published = answer.quantity == AS_PUBLISHED

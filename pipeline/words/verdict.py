@@ -27,6 +27,7 @@ from pipeline.words.errors import format_excess, format_step
 NOT_FITTED_TO_RUN = "the data of this run do not support a fit"
 NOTHING_MISSING = "No effect is missing"
 NO_GROUND = "the log holds no pose: slip is that of the wheels against their commands, not that of the ground"
+_UNKNOWN = "no known effect explains the rest"
 _MOST_CLAUSES = 3
 """Effects that a verdict names; others are in the table below it."""
 _SAME_MULTIPLIER = 0.05
@@ -69,7 +70,8 @@ def format_verdict(run: RunDiagnosis) -> str:
         )
         if len(verdict) <= _LONGEST:
             break
-    return verdict
+    suggested = f"{verdict[:-1]}{_suggest(run)}."
+    return suggested if verdict.endswith(f"{_UNKNOWN[1:]}.") and len(suggested) <= _LONGEST else verdict
 
 
 def _list_commanded(run: RunDiagnosis) -> list[str]:
@@ -92,7 +94,7 @@ def _list_open_ends(run: RunDiagnosis) -> tuple[str, str, str]:
     elif SEARCH_CUT in noted:
         why = "the budget ended the search for effects early"
     elif CHANGE not in noted and measure_excess(run) >= ABOVE_FLOOR:
-        why = "no known effect explains the rest"
+        why = _UNKNOWN
     return _describe_choice(run), noted.get(CHANGE, ""), why
 
 
@@ -114,7 +116,15 @@ def _format_nothing(run: RunDiagnosis) -> list[str]:
             *sentences,
             f"The cause is {name_group(run.undecided[0].candidates)}, which this log does not separate",
         ]
-    return [*sentences, "No known effect explains the error"]
+    return [*sentences, f"No known effect explains the error{_suggest(run)}"]
+
+
+def _suggest(run: RunDiagnosis) -> str:
+    """What a suggested formula would leave of the error, as the end of a sentence; empty without one."""
+    rest = run.unexplained
+    if rest is None or rest.with_formula is None:
+        return ""
+    return f": a suggested term would leave {format_step(rest.with_formula)}"
 
 
 def _list_clauses(run: RunDiagnosis) -> list[str]:

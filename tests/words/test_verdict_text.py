@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 from drawn_diagnoses import FLOOR, check_form, check_verdict, draw_diagnosis
+from msgspec.structs import replace
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.models import find_effect, list_effects
-from pipeline.results import RunDiagnosis, read_result
+from pipeline.results import Errors, RunDiagnosis, Unexplained, read_result
 from pipeline.results.reading import ABOVE_FLOOR, split_main
 from pipeline.sources import list_presets
 from pipeline.sources.one_vehicle import load_vehicle
@@ -44,6 +45,14 @@ def test_every_effect_reads_well_in_a_verdict(kind: type[Any]) -> None:
     assert _NUMBER.search(clause)
     assert len(clause) < 80
     assert re.search(r"\. (The robot [a-z]+s |The [a-z]+ )", verdict)
+
+
+def test_a_verdict_says_what_a_suggested_term_would_leave() -> None:
+    drawn = draw_diagnosis({"drive_lag": {"tau": 0.3}}, [(1.0, 0.5), (0.4, 0.3)])
+    assert "No known effect explains the rest." in format_verdict(drawn)
+    term = Unexplained(with_formula=Errors(t_mrmse_m=0.05, r_mrmse_rad=0.02))
+    suggested = format_verdict(replace(drawn, unexplained=term))
+    assert suggested.endswith("explains the rest: a suggested term would leave 5 cm and 1.1 degrees.")
 
 
 def test_a_verdict_is_never_too_long() -> None:
