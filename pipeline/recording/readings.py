@@ -220,6 +220,10 @@ class Explained:
         return int(np.sign(one.gains[0]))
 
 
+_HALF_TRACK_M = 2.0
+"""Half the track of the widest vehicle [m]."""
+
+
 @dataclass
 class Reading:
     """Two inputs that may explain a motion.
@@ -294,6 +298,10 @@ class Reading:
         may_cross = may_cross and (self.third is None or self.third_crossed is not None)
         patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
+        # With a side reversed, a commanded yaw rate drives the body ahead by half the track: in laps of one
+        # radius, where speed and yaw rate are proportional, that radius would stand in its place.
+        if may_cross and self.form == "body" and abs(float(tried[True].ahead.gains[0])) > _HALF_TRACK_M:
+            del tried[True]
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
         if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:
             best = False

@@ -36,6 +36,20 @@ def test_gain_and_delay_of_a_command_are_recovered() -> None:
     assert made.lag + made.delay == pytest.approx(LAG, abs=0.06)
 
 
+def test_laps_of_one_radius_reverse_no_side_of_the_drive() -> None:
+    """Speed and yaw rate are proportional there: either explains the other, but for half a track of 8 m."""
+    drive, radius = draw(), 8.0
+    turned = drive.speed + 0.05 * draw(2).speed
+    yaw = np.cumsum(turned / radius) * STEP
+    place = np.cumsum(drive.speed * np.exp(1j * yaw)) * STEP
+    asked = np.stack([turned, drive.speed / radius], axis=1)
+    laps = replace(drive, asked=asked, place=place[drive.rows], yaw=yaw[drive.rows])
+    made = command(laps).explain(measured(tabulate(laps)))
+    assert made is not None
+    assert not made.crossed
+    assert made.sign_margin == np.inf
+
+
 def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None:
     drive = draw(2)
     motion = measured(tabulate(drive))
