@@ -241,6 +241,8 @@ export class Pane {
   // What remains, and where to look; green only at the noise floor.
   sayEnd({ done, remains }) {
     const place = this.glance.querySelector(".end");
+    // Of a run that cannot show slip, an error says nothing.
+    place.hidden = Boolean(this.state.run.refusal);
     place.classList.toggle("done", done);
     const span = done ? null : this.largest;
     place.replaceChildren(remains, ...(span ? [`; largest from ${span.map(Math.round).join(" to ")} s: `, h("button", { type: "button", class: "look", data: { keep: "look" }, onclick: () => this.look(span) }, "look")] : []));

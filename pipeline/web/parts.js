@@ -70,7 +70,7 @@ export const say = (value, digits = 3) => {
 };
 
 // Metres and radians as people read them: the text, and its unit.
-export const inLength = (metres) => (Math.abs(metres) >= 1 ? { factor: 1, unit: "m" } : { factor: 100, unit: "cm" });
+export const inLength = (metres) => (Math.abs(metres) >= 1 ? { factor: 1, unit: "m" } : Math.abs(metres) >= 0.01 || metres === 0 ? { factor: 100, unit: "cm" } : { factor: 1000, unit: "mm" });
 export const inAngle = () => ({ factor: 180 / Math.PI, unit: "°" });
 // Two digits in words, as on the screen; three in the large numbers, so that one sees them move.
 const sayIn = (value, { factor, unit }, gap) => (Number.isFinite(value) ? `${say(value * factor, Math.abs(value * factor) >= 1 && unit === "m" ? 3 : 2)}${gap}${unit}` : "–");

@@ -92,6 +92,18 @@ def test_why_a_formula_was_refused_stays_until_the_next_step(chrome: Chrome, wor
     chrome.errors.clear()
 
 
+def test_of_a_run_that_cannot_show_slip_no_error_is_said_to_remain(chrome: Chrome, tmp_path: Path) -> None:
+    log = simulate_case(None, {"wheel_radius": 0.0}, out=tmp_path / "field" / "lifted.mcap", duration_s=40.0)
+    husky = {"vehicle": {"preset": "husky_a200"}}
+    analyze_log(log, Options(out=tmp_path / "out", report=False, diagnosis=False, overrides=husky))
+    with closing(Workbench(tmp_path / "out")) as server:
+        chrome.size(LAPTOP, 900)
+        chrome.open(server.address)
+        chrome.wait(f"{SHOWN} && document.querySelector('.no-help')")
+        assert chrome.run(f"{END}.offsetHeight") == 0
+        chrome.open("about:blank")
+
+
 def test_it_opens_with_the_run_that_was_analyzed_last(chrome: Chrome, results: Path, tmp_path: Path) -> None:
     log = simulate_case("husky_tile", out=tmp_path / "field" / "later.mcap", duration_s=30.0)
     analyze_log(log, Options(out=results, report=False, diagnosis=False))
