@@ -220,8 +220,8 @@ class Explained:
         return int(np.sign(one.gains[0]))
 
 
-_HALF_TRACK_M = 2.0
-"""Half the track of the widest vehicle [m]."""
+_AS_IT_IS = 0.5
+"""Least share of both channels that a command explains as it is: near zero where a side is reversed."""
 
 
 @dataclass
@@ -298,9 +298,9 @@ class Reading:
         may_cross = may_cross and (self.third is None or self.third_crossed is not None)
         patterns = (False, True) if may_cross else (False,)
         tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
-        # With a side reversed, a commanded yaw rate drives the body ahead by half the track: in laps of one
-        # radius, where speed and yaw rate are proportional, that radius would stand in its place.
-        if may_cross and self.form == "body" and abs(float(tried[True].ahead.gains[0])) > _HALF_TRACK_M:
+        # Laps of one radius are explained either way, for speed and yaw rate are proportional: where the
+        # command explains the motion as it is, nothing is reversed.
+        if may_cross and self.form == "body" and min(tried[False].shares) > _AS_IT_IS:
             del tried[True]
         best = max(tried, key=lambda crossed: float(tried[crossed].blocks.sum()))
         if best and compare(tried[True].blocks, tried[False].blocks) < CLEAR:

@@ -37,7 +37,7 @@ def test_gain_and_delay_of_a_command_are_recovered() -> None:
 
 
 def test_laps_of_one_radius_reverse_no_side_of_the_drive() -> None:
-    """Speed and yaw rate are proportional there: either explains the other, but for half a track of 8 m."""
+    """Speed and yaw rate are proportional there, so that either explains what the other does."""
     drive, radius = draw(), 8.0
     turned = drive.speed + 0.05 * draw(2).speed
     yaw = np.cumsum(turned / radius) * STEP
