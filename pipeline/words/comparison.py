@@ -280,7 +280,8 @@ def _split_difference(
     easiest, hardest = extremes
     whole, ground = driven.divide(easiest, hardest), equal.divide(easiest, hardest)
     a, b = labels[easiest], labels[hardest]
-    if whole is None:
+    # Of a difference that may be chance, no part is anything's.
+    if whole is None or judge_pair(whole[1]) == ALIKE:
         return ""
     if ground is None:
         return f"{b} and {a} have no driving in common, so the two cannot be separated"
