@@ -81,25 +81,27 @@ def diagnose(  # noqa: D417 - the shared choices document themselves
         check_target(apply)
     known = _open_model(model, trust_code=trust_code)
     budget_s = None if budget is None else parse_budget(budget)
-    found = Diagnosed()
+    diagnosed = Diagnosed()
 
     def conclude(error: SlipError) -> None:
         if json:
-            row = summarize_error(found.at_work, error)
-            print_json({**found.to_json(), "errors": [row]})
+            row = summarize_error(diagnosed.at_work, error)
+            print_json({**diagnosed.to_json(), "errors": [row]})
 
-    with limited_memory(memory, lambda: found.at_work, conclude):
-        diagnose_logs(found, logs, build_options(choices), known, vehicle_of, budget_s, quiet=quiet or json)
+    with limited_memory(memory, lambda: diagnosed.at_work, conclude):
+        diagnose_logs(
+            diagnosed, logs, build_options(choices), known, vehicle_of, budget_s, quiet=quiet or json
+        )
     if apply is not None:
-        found.errors += _apply(found.answers, apply, quiet=quiet or json)
+        diagnosed.errors += _apply(diagnosed.answers, apply, quiet=quiet or json)
     if json:
         omitted = {"warnings": list(known.warnings)} if known is not None and known.warnings else {}
-        print_json({**found.to_json(), **omitted})
+        print_json({**diagnosed.to_json(), **omitted})
     elif not quiet:
         chosen = {"model": model, "vehicle_of": vehicle_of, "memory": memory, "budget": budget}
         said = spell_choices(choices) + spell_flags(chosen) + " --trust-code" * trust_code
-        print_lines(found.list_lines(logs, said, apply, everything=everything))
-    return found.end(quiet=quiet)
+        print_lines(diagnosed.list_lines(logs, said, apply, everything=everything))
+    return diagnosed.end(quiet=quiet)
 
 
 @dataclass
@@ -159,7 +161,7 @@ class Diagnosed:
 
 
 def diagnose_logs(
-    found: Diagnosed,
+    diagnosed: Diagnosed,
     logs: Sequence[str],
     options: Options,
     known: ModelFile | None = None,
@@ -171,7 +173,7 @@ def diagnose_logs(
     """Diagnose logs, folders of logs or stored runs, those of one vehicle jointly.
 
     Args:
-        found: receives the answers, and what could not be answered.
+        diagnosed: receives the answers, and what could not be answered.
         logs: logs, folders of logs, or names of runs.
         options: of the analyses.
         known: model that is known; only effects beyond it are estimated.
@@ -181,22 +183,22 @@ def diagnose_logs(
     """
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
 
-    found.at_work = logs[0]
+    diagnosed.at_work = logs[0]
     opened: dict[str, _Opened] = {}
     # A diagnosis with default options is unique, and is stored for later requests.
     is_plain = known is None and budget_s is None and options.inputs == INPUTS
     named = [name for log in logs for name in list_named(log)]
-    for vehicle, recordings in _gather(named, options, found, opened, quiet=quiet).values():
-        found.at_work = recordings[0].path
+    for vehicle, recordings in _gather(named, options, diagnosed, opened, quiet=quiet).values():
+        diagnosed.at_work = recordings[0].path
         try:
             agreed = _agree(known, vehicle, recordings, owner)
             search = partial(_judge, recordings, agreed, options, known, budget_s, quiet=quiet)
             asked = [opened[recording.name] for recording in recordings]
             keeps = is_plain and len(recordings) == 1
-            found.answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet))
+            diagnosed.answers.append(_answer(search, asked, options.out, keeps=keeps, quiet=quiet))
         except SlipError as error:
             print_error(error)
-            found.errors.append(summarize_error(recordings[0].path, error))
+            diagnosed.errors.append(summarize_error(recordings[0].path, error))
 
 
 def _suggest_next(runs: Sequence[RunDiagnosis], applying: str, applied: Path | None) -> str:
@@ -218,7 +220,7 @@ def _open_model(path: Path | None, *, trust_code: bool) -> ModelFile | None:
 
 
 def _gather(
-    logs: Sequence[str], options: Options, found: Diagnosed, opened: dict[str, _Opened], *, quiet: bool
+    logs: Sequence[str], options: Options, diagnosed: Diagnosed, opened: dict[str, _Opened], *, quiet: bool
 ) -> dict[str, tuple[Vehicle, list[Recording]]]:
     """Recordings by vehicle; ``opened`` receives the data read of each run."""
     from pipeline.estimation.stored_diagnosis import read_recording  # noqa: PLC0415 - heavy
@@ -226,16 +228,16 @@ def _gather(
 
     gathered: dict[str, tuple[Vehicle, list[Recording]]] = {}
     for log in logs:
-        found.at_work = log
+        diagnosed.at_work = log
         try:
             with open_shown(log, options, quiet=quiet) as run:
                 vehicle, recording = read_recording(run.manifest)
                 opened[recording.name] = _Opened(run.manifest, read_choices(run.manifest))
         except SlipError as error:
             print_error(error)
-            found.errors.append(summarize_error(log, error))
+            diagnosed.errors.append(summarize_error(log, error))
             continue
-        found.lossy += [log] if run.lossy else []
+        diagnosed.lossy += [log] if run.lossy else []
         gathered.setdefault(repr(vehicle), (vehicle, []))[1].append(recording)
     return gathered
 

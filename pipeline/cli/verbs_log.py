@@ -492,15 +492,15 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     from pipeline.live.running_log import list_alarms  # noqa: PLC0415 - heavy
     from pipeline.live.watch import write_statement  # noqa: PLC0415 - heavy
 
-    found, logs = Diagnosed(), [str(watched.path)]
+    diagnosed, logs = Diagnosed(), [str(watched.path)]
     with limited_memory(None, lambda: logs[0], lambda _: None):
-        diagnose_logs(found, logs, build_options(choices), quiet=json)
-    alarms = [alarm for run in found.runs for alarm in list_alarms(run.effects)]
-    lines = found.list_lines(logs, spell_choices(choices))
+        diagnose_logs(diagnosed, logs, build_options(choices), quiet=json)
+    alarms = [alarm for run in diagnosed.runs for alarm in list_alarms(run.effects)]
+    lines = diagnosed.list_lines(logs, spell_choices(choices))
     lines += [f"alarm     {alarm['text']}" for alarm in alarms]
     rows = [("", line) for line in lines]
     if json:
-        answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **found.to_json()}
+        answer = {"kind": "final", "stopped": stopped, "alarms": alarms, **diagnosed.to_json()}
         sys.stdout.write(json_format.dumps(answer) + "\n")
         rows = list_statements(watched.to_json())
     else:
@@ -510,4 +510,4 @@ def _conclude(watched: Watch, choices: Choices, page: Path | None, *, json: bool
     write_statement(choices.results, watched.path, rows, ended=True)
     if not stopped:
         watched.forget()
-    return found.end(quiet=False)
+    return diagnosed.end(quiet=False)

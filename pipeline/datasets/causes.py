@@ -232,8 +232,8 @@ def _gather(rows: pl.DataFrame) -> list[_Group]:
 def _pair(groups: Sequence[_Group]) -> Iterator[tuple[_Group, _Group]]:
     """Every two groups, the one with less slip first."""
     for pair in combinations(groups, 2):
-        less, more = sorted(pair, key=lambda group: group.mean_square)
-        yield less, more
+        easier, harder = sorted(pair, key=lambda group: group.mean_square)
+        yield easier, harder
 
 
 def _subtract(a: _Group, b: _Group) -> dict[tuple[str, str], float]:

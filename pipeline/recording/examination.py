@@ -564,7 +564,7 @@ class Examination:
         if not steered:
             return False
         text = (
-            f"not used: {wheels.source}: {enumerate_texts(steered)} steer, so that this is no differential "
+            f"not used: {wheels.source}: {enumerate_texts(steered)} steer, so this is not a differential "
             "drive, and it does not turn as a car that steers by the middle of them (several axles steer, or "
             "each wheel by itself); steering_joint and left and right under [wheels] and "
             '[vehicle] kind = "ackermann" in run.toml take it for a car'

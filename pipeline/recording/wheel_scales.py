@@ -94,11 +94,11 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     """Scale of the left side's encoder over the right one's; None if it is the same, or not clear."""
     if not (left.follows and right.follows):
         return None
-    of_way, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
-    if of_way <= 0.0 or abs(np.log(of_way)) < np.log(_SAME):
+    of_speed, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
+    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME):
         return None
     turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
     # A body that turns by something else than its wheels shows two scales.
-    if turns and (of_turn >= 0.0 or abs(np.log(-of_turn / of_way)) > np.log(_AGREE)):
+    if turns and (of_turn >= 0.0 or abs(np.log(-of_turn / of_speed)) > np.log(_AGREE)):
         return None
-    return of_way
+    return of_speed

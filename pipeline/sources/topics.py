@@ -404,8 +404,8 @@ class _Chooser:
             return None
         pose = find_type(self.types[topic]).pose
         if pose is not None and not (pose.orientation or pose.angle):
-            is_place = LOCALIZED.search(name) or _PLACE.search(name)
-            return (1.0, PoseSource(topic, "positions by its type and name")) if is_place else None
+            is_position = LOCALIZED.search(name) or _PLACE.search(name)
+            return (1.0, PoseSource(topic, "positions by its type and name")) if is_position else None
         if DEAD_RECKONED.search(name):
             return 0.5, PoseSource(topic, "an odometry whose name says it comes from the wheels")
         if LOCALIZED.search(name):

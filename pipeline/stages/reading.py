@@ -462,8 +462,8 @@ def find_angle_unit(columns: TopicColumns, pose: PoseFields) -> Literal["rad", "
         pose: its fields, with an angle.
     """
     x, y = (numbers(columns, name) for name in axis_fields(pose.position, "xy")[:2])
-    angle, place = numbers(columns, pose.angle), x + 1j * y
-    moved, heading = place[2 * _APART :] - place[: -2 * _APART], angle[_APART:-_APART]
+    angle, position = numbers(columns, pose.angle), x + 1j * y
+    moved, heading = position[2 * _APART :] - position[: -2 * _APART], angle[_APART:-_APART]
     known = np.isfinite(moved) & np.isfinite(heading)
     moved, heading = moved[known], heading[known]
     if pose.angle_unit == "deg" or moved.size < FEWEST_MESSAGES:

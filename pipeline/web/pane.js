@@ -67,7 +67,7 @@ export class Pane {
 
   async ask(action, more = {}) {
     const run = more.run ?? this.run;
-    // What was said of the step before does not stand over this one; a trial is no step.
+    // What was said of the step before does not stand over this one; a trial leaves it.
     if (action !== "try") untoast();
     this.busy(true);
     try {

@@ -15,6 +15,7 @@ from pipeline.run import load_motion_run
 from pipeline.sources.one_vehicle import load_vehicle
 from pipeline.stages.slip_stage import find_residual_modulus
 from pipeline.store import Store
+from pipeline.store.checksums import encode_checked
 
 Rows = dict[str, dict[str, list[float | None]]]
 
@@ -33,7 +34,7 @@ def write_diagnosis(workbench: Workbench, told: dict[str, object]) -> None:
     del manifest["checksum"]
     (home / manifest["folder"] / "diagnosis.json").write_text(json.dumps(told))
     manifest["files"]["diagnosis.json"] = manifest["files"]["summary.json"]
-    (home / "manifest.json").write_text(json.dumps(manifest))
+    (home / "manifest.json").write_bytes(encode_checked(manifest))
 
 
 def test_map_and_commands_show_what_the_model_leaves_of_the_slip(workbench: Workbench) -> None:
