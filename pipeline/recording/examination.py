@@ -632,14 +632,15 @@ class Examination:
         return signed
 
     def _report_gyro(self, gyro: Reading | None) -> None:
-        """A gyro in degrees per second, whose scale is fitted."""
+        """A gyro in degrees per second."""
         made = None if gyro is None else gyro.explained
-        if gyro is None or made is None or not made.sign("turned"):
+        is_given = self.configuration.imu.unit is not None
+        if gyro is None or made is None or not made.sign("turned") or is_given:
             return
         apart = np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])
         if abs(apart) < 4.0 * _NEAR:
-            text = f"the gyro of {gyro.name} is in degrees per second: its scale is fitted to the poses"
-            self.findings.append(Finding("gyro_unit", "info", text, where="imu"))
+            what = f"the gyro of {gyro.name} is in degrees per second"
+            self._correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
 
     # Sides and signs.
 
@@ -1163,7 +1164,7 @@ class Examination:
             for key in change
             if getattr(getattr(self.configuration, section), key) != getattr(default, key)
         ]
-        names = {"pose": "pose_turned", "wheels": "wheels_corrected", "command": "command_corrected"}
+        name = "pose_turned" if section == "pose" else f"{section}_corrected"
         if "up" in change and not given and self.configuration.pose.axes != default.axes:
             given = ["axes"]
         if given and section == "pose":
@@ -1178,7 +1179,7 @@ class Examination:
         settled = [text for key, text in _AS_RECORDED[section].items() if key in change]
         otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
         text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
-        self.findings.append(Finding(names[section], "warning", text, where=section, value=margin))
+        self.findings.append(Finding(name, "warning", text, where=section, value=margin))
 
     def _complete(self) -> Configuration:
         sections = {
@@ -1190,6 +1191,7 @@ class Examination:
 
 _HALF_TURN = 180.0
 _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
+    "imu": {"unit": 'unit = "rad/s"'},
     "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0", "unit": 'unit = "m"'},
     "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
     "command": {

@@ -204,9 +204,16 @@ class PoseSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
 
 
 class ImuSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """``[imu]``: the gyro."""
+    """``[imu]``: the gyro.
+
+    Attributes:
+        topic: with the rates of turning.
+        unit: of the rates; by default that of the message type.
+        time: which of the message's times to use.
+    """
 
     topic: str | None = None
+    unit: Literal["rad/s", "deg/s"] | None = None
     time: Clock | None = None
 
 

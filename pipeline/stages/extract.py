@@ -680,6 +680,8 @@ class Extraction:
             return pl.DataFrame()
         columns, clock, order = ordered
         rates, forces = reading.read_imu(columns)
+        if self.configuration.imu.unit == "deg/s":
+            rates = np.radians(rates)
         times = self._seconds(clock.stamp[order])
         return pl.DataFrame(
             {
