@@ -190,11 +190,23 @@ def cut_track(
     if good.size == 0:
         return Track(position, unit, valid, held, segment, tuple(findings))
     t, p, q = times[good], position[good], unit[good]
-    held[good] = rigid.find_held(p, q)
     # A break before a pose that was left out moves to the next remaining one.
     counted = np.cumsum(clock_breaks)[good]
     clock = np.concatenate(([False], np.diff(counted) > 0))
     gaps = rigid.find_gaps(t, settings.gap_s)
+    apart = _find_apart(t, p, q, gaps | clock, settings)
+    if apart.any():
+        count = int(apart.sum())
+        text = (
+            f"{count} pose{'s' * (count > 1)} of {topic} lie{'s' * (count == 1)} far from those before and "
+            "after: quarantined"
+        )
+        findings.append(Finding("poses_apart", "warning", text, where=topic, count=count))
+        position, valid[good[apart]] = position.copy(), False
+        position[good[apart]] = np.nan
+        good, t, p, q = good[~apart], t[~apart], p[~apart], q[~apart]
+        gaps, clock = gaps[~apart], clock[~apart]
+    held[good] = rigid.find_held(p, q)
     jumps = _find_pose_jumps(t, p, q, held[good], gaps | clock, settings)
     segment[good] = rigid.number_segments(gaps | clock | jumps)
     findings += _report_stamps(t, gaps, jumps, held[good], topic)
@@ -220,6 +232,45 @@ def _find_pose_jumps(
         )
         jumps[keep] = jumped | np.concatenate(([False], too_fast))
     return jumps
+
+
+_APART = 3
+"""Greatest number of poses in a row that lie apart: more are a map that was corrected for a while."""
+_FAST = 3.0
+"""Change over the usual largest one, beside the smallest jump, up to which a pose may go on."""
+
+
+def _find_apart(t: Floats, p: Floats, q: Floats, breaks: Flags, settings: VelocitySection) -> Flags:
+    """Poses that lie away from those before them, and from those after them, which go on, as flags."""
+    apart, last = np.zeros(t.size, dtype=bool), t.size - 1
+    if t.size < FEWEST_MESSAGES:
+        return apart
+    stretch = np.cumsum(breaks)
+    least = np.array([settings.jump_m, settings.jump_rad])
+    usual = np.zeros(2)
+
+    def measure(first: Ints, second: Ints) -> Floats:
+        """Distance and angle from one pose to another, shape (n, 2) [m, rad]."""
+        moved = np.linalg.norm(p[second] - p[first], axis=1)
+        dot = np.abs(np.sum(q[first] * q[second], axis=1))
+        return np.column_stack((moved, 2.0 * np.arccos(np.minimum(dot, 1.0))))
+
+    def is_far(first: Ints, second: Ints) -> Flags:
+        elapsed = t[second] - t[first]
+        limits = least + _FAST * usual * elapsed[:, None]
+        return np.asarray((measure(first, second) > limits).any(axis=1) | (stretch[first] != stretch[second]))
+
+    every = np.arange(last)
+    elapsed = np.diff(t)
+    rates = measure(every, every + 1)[elapsed > 0.0] / elapsed[elapsed > 0.0, None]
+    usual = np.quantile(rates, 0.9, axis=0)
+    for count in range(1, _APART + 1):
+        before = np.arange(last - count)
+        after = before + count + 1
+        away = is_far(before, before + 1) & is_far(after - 1, after) & ~is_far(before, after)
+        for number in range(count):
+            apart[before[away] + 1 + number] = True
+    return apart
 
 
 def _stretches(breaks: Flags) -> list[tuple[int, int]]:

@@ -118,6 +118,23 @@ def test_trap_12_a_correction_of_the_map_is_a_cut_not_a_velocity(drive: TakeThro
     assert float(np.abs(taken.velocities["v_x"].to_numpy()).max()) < 1.3
 
 
+@pytest.mark.parametrize(("run", "count"), [(1, 1), (3, 3), (6, 0)])
+def test_poses_that_lie_apart_are_left_out_and_cut_nothing(run: int, count: int) -> None:
+    times = np.arange(0.0, 40.0, 0.1)
+    yaw = 0.5 * np.sin(0.3 * times)
+    place = np.cumsum(0.1 * np.exp(1j * yaw))
+    away = slice(200, 200 + run)
+    place[away] += 2.0 - 1.0j
+    position = np.column_stack([place.real, place.imag, np.zeros(times.size)])
+    quaternion = np.column_stack([np.zeros((times.size, 2)), np.sin(0.5 * yaw), np.cos(0.5 * yaw)])
+    track = cut_track(times, position, quaternion, np.zeros(times.size, dtype=bool), SETTINGS, "/pose")
+    told = {one.id: one.count for one in track.findings}
+    # A map that is off for longer is a jump of the map, and back.
+    assert told == ({"poses_apart": count} if count else {"pose_jump": 2})
+    assert int((~track.valid).sum()) == count
+    assert np.unique(track.segment[track.valid]).size == (1 if count else 3)
+
+
 def test_trap_17_jitter_of_the_stamps_cuts_nothing(drive: TakeThrough) -> None:
     jittery = replace(ICP, rate_hz=10.0, jitter_s=0.02, stamp_jitter_s=0.01)
     taken = drive(replace(PLAIN, pose=jittery))
