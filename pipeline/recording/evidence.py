@@ -264,6 +264,11 @@ def find_body_units(gains: Sequence[float | None], shares: Sequence[float], name
     return Units(usual, min(rivals, key=lambda pair: costs[pair], default=None))
 
 
+def is_unit_exact(gain: float, unit: str) -> bool:
+    """Whether a body moves as far as a speed says in a unit, so that it is no number without one."""
+    return abs(float(np.log(abs(gain) / SPEEDS[unit]))) < 4.0 * _EXACT
+
+
 def _is_named(unit: str, name: str) -> bool:
     """Whether the name of a signal says its unit."""
     word = {"km/h": "km_?p?_?h|kph", "deg/s": "deg", "deg": "deg", "rpm": "rpm"}.get(unit)

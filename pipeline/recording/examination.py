@@ -27,6 +27,7 @@ from pipeline.recording.evidence import (
     find_steering_unit,
     find_wheel_unit,
     is_named_measured,
+    is_unit_exact,
     rate_command,
 )
 from pipeline.recording.geometry import (
@@ -1008,7 +1009,11 @@ class Examination:
             if getattr(section, key) is not None or not unit:
                 continue
             if unit not in USUAL:
-                self._correct(role, f"{of} is in {unit}", f'{key} = "{unit}"', {key: unit})
+                speed, gain = units.likeliest[0], gains[0]
+                is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
+                unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
+                found = f"{of} is in {unit}{'' if is_sure else unsure}"
+                self._correct(role, found, f'{key} = "{unit}"', {key: unit})
             elif units.rival is not None and units.rival[index] != unit:
                 other, gain = units.rival[index], gains[index]
                 seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"

@@ -139,6 +139,13 @@ def test_a_situation_is_told_and_corrected(
     assert not [one for one in setup.choice.findings if one.severity == "error"]
 
 
+def test_of_commands_in_percent_no_unit_is_sure(tmp_path: Path) -> None:
+    drive = draw(54)
+    log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked * [125.0, 140.0])
+    told = [one.text for one in set_up_log(log, Options(out=tmp_path)).choice.findings]
+    assert any("or has no unit, as percent of a throttle" in text for text in told)
+
+
 def test_wheels_that_several_axles_steer_are_no_differential_drive(tmp_path: Path) -> None:
     drive = draw(53)
     at = slice(None, None, 5)
