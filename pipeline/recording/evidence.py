@@ -386,7 +386,8 @@ def find_wheel_unit(gain: float, share: float, name: str, radius: float | None =
     costs["m/s"] = rate(1.0, 1.0, _OF_METRES) + _METRES
     if radius is None:
         costs[""] = float(np.log(_ANY / np.sqrt(2.0 * np.pi))) + _UNUSUAL
-    costs = {unit: cost + _NAMED * bool(named - {unit}) for unit, cost in costs.items()}
+    # Of turns before a gear the name is right, and the unit none of the wheels.
+    costs = {unit: cost + _NAMED * bool(unit and named - {unit}) for unit, cost in costs.items()}
     best = min(costs, key=lambda unit: costs[unit])
     least = _CLEAR if best == "m/s" else _WIN
     return best if best in named or costs["rad/s"] - costs[best] > least else "rad/s"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import msgspec
 import numpy as np
@@ -160,7 +161,20 @@ def examine(
     except SlipError:
         # The stage `extract` raises it again.
         return Recording(sources, configuration)
-    return examination.run()
+    made = examination.run()
+    unit = made.configuration.imu.unit
+    if unit is None or unit == configuration.imu.unit:
+        return made
+    # Headings of positions alone are made of the gyro.
+    told = next(one for one in made.findings if one.where == "imu")
+    again = examine(data, sources, made_of_imu(configuration, unit), vehicle, is_known=is_known, where=where)
+    return replace(again, findings=(told, *again.findings))
+
+
+def made_of_imu(configuration: Configuration, unit: Literal["rad/s", "deg/s"]) -> Configuration:
+    """A configuration with the unit of the gyro."""
+    imu = msgspec.structs.replace(configuration.imu, unit=unit)
+    return msgspec.structs.replace(configuration, imu=imu)
 
 
 @dataclass
@@ -1052,7 +1066,7 @@ class Examination:
             "" if radius is not None else f": taken as those of wheels of {_TAKEN_M} m, which alters no slip"
         )
         if not unit:
-            what += f"no usual unit (ticks of an encoder?){taken}"
+            what += f"no usual unit (ticks, or turns before a gear?){taken}"
             scale = float(f"{gain / _TAKEN_M:.4g}")
             self._correct("wheels", what, f"scale = {scale:g}", {"scale": scale})
         elif unit != "rad/s":

@@ -133,7 +133,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         yaw_unit: unit of the yaw rate of a body command; by default that of the message type.
         steering_unit: unit of the steering angle; by default that of the message type.
         sign: -1 if forward is recorded as negative.
-        reversed: side that counts backward.
+        reversed: side that counts backward, by its name.
         exchanged: whether left and right are exchanged.
         scale: factor on recorded speeds, where encoders count low or high.
         factors: the same of a side (``left``, ``right``) or of a joint, below zero where it counts backward.

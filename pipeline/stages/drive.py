@@ -26,6 +26,7 @@ from pipeline.sources import (
 from pipeline.stages import reading
 from pipeline.stages.findings import Finding, StageError
 
+SIDES = ("left", "right")
 _LEFT = re.compile(r"left|(^|[_/])(l|lf|fl|rl|bl|ml|lb)([_/\d]|$)")
 _RIGHT = re.compile(r"right|(^|[_/])(r|rf|fr|rr|br|mr|rb)([_/\d]|$)")
 _FRONT = re.compile(r"front|(^|[_/])(f|fl|fr|lf|rf)([_/\d]|$)")
@@ -98,7 +99,8 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
         raise _no_wheels(columns.topic, ())
     velocity, position = _read_series(columns)
     joints = sorted(set(velocity) | set(position))
-    left, right = choose_sides(joints, section).values()
+    chosen = choose_sides(joints, section)
+    left, right = (chosen[side] for side in (SIDES[::-1] if section.exchanged else SIDES))
     findings: list[Finding] = []
     missing = [joint for joint in (*left, *right) if not _is_known(joint, velocity, position)]
     if missing:
@@ -111,7 +113,7 @@ def read_joints(columns: TopicColumns, times: Floats, section: DriveSection, veh
     recorded = [joint for joint in (*left, *right) if joint not in missing]
     section, converted = _convert_unit(columns.topic, times, section, velocity, position, recorded)
     findings += converted
-    for side, joints_of_it in (("left", left), ("right", right)):
+    for side, joints_of_it in chosen.items():
         for joint in joints_of_it:
             velocity[joint] = velocity[joint] * _find_factor(section, side, joint)
     if vehicle.kinematics.has_inputs("steering"):
@@ -324,11 +326,11 @@ def list_steered(columns: TopicColumns) -> list[str]:
 
 
 def choose_sides(joints: Sequence[str], section: DriveSection) -> dict[str, list[str]]:
-    """The joints of each side, ``left`` and ``right``, that drive and do not steer."""
+    """The joints of each side by their names, ``left`` and ``right``, that drive and do not steer."""
     rolling = [joint for joint in joints if joint != section.steering_joint and not _is_steered(joint)]
     left = _choose_joints(rolling, section.left, _LEFT, _RIGHT)
     right = _choose_joints(rolling, section.right, _RIGHT, _LEFT)
-    return {"left": right, "right": left} if section.exchanged else {"left": left, "right": right}
+    return {"left": left, "right": right}
 
 
 def _choose_joints(
@@ -453,10 +455,9 @@ def read_pair(
         StageError: the drive of this kind of vehicle has other inputs.
     """
     if form is DriveForm.SIDES:
-        if section.exchanged:
-            first, second = second, first
-        left, right = (section.sign * _find_factor(section, side) for side in ("left", "right"))
-        return read_sides(first * left, second * right, vehicle)
+        left, right = (section.sign * _find_factor(section, side) for side in SIDES)
+        first, second = first * left, second * right
+        return read_sides(*((second, first) if section.exchanged else (first, second)), vehicle)
     if form is DriveForm.STEERING:
         return read_steering(first * section.sign, second, vehicle)
     if nominal:

@@ -137,6 +137,12 @@ class Extraction:
                 recorded.setdefault(columns.topic, []).append(columns)
         joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
         self.columns = {columns.topic: columns for columns in joined if columns is not None}
+        if sources.imu is not None and configuration.imu.unit == "deg/s":
+            self.columns |= {
+                topic: reading.turn_to_radians(one)
+                for topic, one in self.columns.items()
+                if topic == sources.imu.topic
+            }
         used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
         self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
         pose = sources.pose
@@ -680,8 +686,6 @@ class Extraction:
             return pl.DataFrame()
         columns, clock, order = ordered
         rates, forces = reading.read_imu(columns)
-        if self.configuration.imu.unit == "deg/s":
-            rates = np.radians(rates)
         times = self._seconds(clock.stamp[order])
         return pl.DataFrame(
             {

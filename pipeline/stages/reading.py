@@ -561,6 +561,15 @@ def read_imu(columns: TopicColumns) -> tuple[Floats, Floats]:
     return rates, forces
 
 
+def turn_to_radians(columns: TopicColumns) -> TopicColumns:
+    """An IMU topic whose rates were recorded in degrees."""
+    imu = find_type(columns.type_name).imu
+    names = [] if imu is None else [name for name in axis_fields(imu.rate, "xyz") if name in columns.fields]
+    return replace(
+        columns, fields={**columns.fields, **{name: np.radians(numbers(columns, name)) for name in names}}
+    )
+
+
 def _holds_no(what: str, columns: TopicColumns, role: str) -> StageError:
     said, hint = f"{columns.type_name} holds no {what}", f"Name another {role}.topic."
     return StageError(f"no_{role}", said, where=columns.topic, hint=hint)

@@ -72,6 +72,19 @@ def with_a_left_encoder_that_counts_double(path: Path, drive: Drive) -> Path:
     return write_log(path, drive, wheels=replace(read, first=first))
 
 
+def exchanged_and_one_counting_double(path: Path, drive: Drive) -> Path:
+    """Plugs exchanged, and what is called left has twice the resolution."""
+    read = change(sides(drive), lambda speed: speed, exchanged=True)
+    assert read.first is not None
+    return write_log(path, drive, wheels=replace(read, first=Held(read.first.times, 2.0 * read.first.values)))
+
+
+def turns_before_a_gear(path: Path, drive: Drive) -> Path:
+    """Turns a minute of the motors, 36 of which are one of a wheel."""
+    wheels = change(sides(drive), lambda speed: 36.0 * speed * 30.0 / np.pi)
+    return write_log(path, drive, wheels=wheels, wheel_topic="/motor/{}/rpm")
+
+
 def four_wheels(drive: Drive, factors: tuple[float, float, float, float]) -> dict[str, Held]:
     """Front left and right, rear left and right."""
     read = sides(drive)
@@ -105,6 +118,8 @@ def stamped_in_the_future(path: Path, drive: Drive) -> Path:
     ("make", "said", "keys"),
     [
         (stamped_in_the_future, ["its clock runs ahead"], {"command.time": "log"}),
+        (exchanged_and_one_counting_double, ["exchanged", "2 times"], {"wheels.exchanged": True}),
+        (turns_before_a_gear, ["turns before a gear"], {}),
         (with_a_left_encoder_that_counts_double, ["left wheels' encoder counts 2 times"], {}),
         (
             with_one_wheel_backward,
