@@ -289,11 +289,7 @@ def update_datasets(store: Store) -> None:
 
     Columns that only `slip compare` computes are null until it has run.
     """
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        find_material,
-        gather_runs,
-        pool_runs,
-    )
+    from pipeline.datasets import find_material, gather_runs, pool_runs  # noqa: PLC0415 - heavy
     from pipeline.report import CATALOGUE, render_catalogue, write_page  # noqa: PLC0415 - heavy
 
     write_page(store, CATALOGUE, render_catalogue(store))

@@ -58,8 +58,6 @@ from schemas import contract_of
 if TYPE_CHECKING:
     import xarray
 
-
-if TYPE_CHECKING:
     Content = Mapping[str, object]
     Given: TypeAlias = "str | Path | Run | Iterable[str | Path | Run]"
 

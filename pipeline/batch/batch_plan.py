@@ -383,10 +383,7 @@ def refresh_remote_pools(mirror: Mirror) -> None:
     A requested fleet model or trend fetches the tables that it needs. All pages are published, as the
     catalogue links them.
     """
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        FLEET,
-        TREND,
-    )
+    from pipeline.datasets import FLEET, TREND  # noqa: PLC0415 - heavy
     from pipeline.report import PAGES  # noqa: PLC0415 - heavy
 
     mirror.pull_index()

@@ -327,10 +327,7 @@ class ResultsLocation:
         Raises:
             StoreError: ``no_results``, there is no such folder; or the object store does not answer.
         """
-        from pipeline.store import (  # noqa: PLC0415 - heavy
-            Store,
-            no_results,
-        )
+        from pipeline.store import Store, no_results  # noqa: PLC0415 - heavy
 
         if self.mirror is None:
             if not self.root.is_dir():

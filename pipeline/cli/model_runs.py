@@ -73,11 +73,7 @@ def open_to_change(path: Path, *, trust_code: bool, names: Sequence[str] = ()) -
         MotionError: the file is wrong, effects of it would be lost, or Python that is not trusted may define
             one of the names.
     """
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        format_model,
-        list_effects,
-        read_model,
-    )
+    from pipeline.models import format_model, list_effects, read_model  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
 
     trust_named(path, wanted=trust_code)
@@ -103,10 +99,7 @@ def new_effect(file: Path, /, *, force: bool = False, quiet: bool = False) -> in
         force: replace a file that is there.
         quiet: print nothing.
     """
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        draft_effect,
-        write_text,
-    )
+    from pipeline.models import draft_effect, write_text  # noqa: PLC0415 - heavy
     from pipeline.run import MotionError  # noqa: PLC0415
 
     text = draft_effect(file)
@@ -152,11 +145,7 @@ def untrust(codes: list[str], /, *, json: bool = False) -> int:
         codes: model files, Python files, or hashes (or how they begin) as `slip model trusted` lists them.
         json: print one JSON object.
     """
-    from pipeline.models import (  # noqa: PLC0415
-        distrust,
-        list_code,
-        list_trusted,
-    )
+    from pipeline.models import distrust, list_code, list_trusted  # noqa: PLC0415
 
     gone: dict[str, str] = {}
     known = list_trusted()
@@ -358,10 +347,7 @@ def expect_model(names: Sequence[str], source: str | None, out: Path, *, quiet: 
         SlipError: a log cannot be read, runs are of several vehicles, or there is no fleet.
     """
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        Model,
-        ModelFile,
-    )
+    from pipeline.models import Model, ModelFile  # noqa: PLC0415 - heavy
 
     vehicle, runs = gather_runs(names, None, None, out, quiet=quiet)
     chosen = choose_input(runs, source)
@@ -382,10 +368,7 @@ def tie_to_fleet(problem: Problem, model: Model, out: Path) -> Problem:
 
 def prior_as_json(problem: Problem) -> dict[str, dict[str, object]]:
     """What was known of the numbers before the fit, by label: value and 95 % interval; empty if nothing."""
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        cut_interval,
-        find_effect,
-    )
+    from pipeline.models import cut_interval, find_effect  # noqa: PLC0415 - heavy
 
     values: dict[str, dict[str, object]] = {}
     for label, (mean, deviation) in problem.parts[0].prior.numbers.items():

@@ -93,10 +93,7 @@ def new(
         write_model,
     )
     from pipeline.run import MotionError  # noqa: PLC0415
-    from pipeline.sources import (  # noqa: PLC0415 - heavy
-        VehicleSection,
-        resolve_vehicle,
-    )
+    from pipeline.sources import VehicleSection, resolve_vehicle  # noqa: PLC0415 - heavy
 
     if model.exists() and not force:
         raise MotionError(
@@ -467,7 +464,7 @@ def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
 
 def _format_change(fit: ModelFit, refusals: Mapping[str, str]) -> list[str]:
     from pipeline.estimation.estimates import parameters_as_json  # noqa: PLC0415 - heavy
-    from pipeline.words import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+    from pipeline.words import (  # noqa: PLC0415 - heavy
         describe_step,
         format_ladder,
         format_parameters,

@@ -70,10 +70,7 @@ def compare(  # noqa: D417 - arguments document themselves
         json: print one JSON object in place of the tables.
         quiet: print nothing.
     """
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        Question,
-        compare_results,
-    )
+    from pipeline.datasets import Question, compare_results  # noqa: PLC0415 - heavy
     from pipeline.report.comparison_page import write_answer  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
     from pipeline.words import summarize_answer  # noqa: PLC0415 - heavy
@@ -129,10 +126,7 @@ _MOST_PAIRS = 10
 
 
 def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        MEASURES,
-        compare_orders,
-    )
+    from pipeline.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
     from pipeline.words import list_shown_notes, title_line  # noqa: PLC0415 - heavy
     from pipeline.words.comparison import list_lines  # noqa: PLC0415 - heavy
 
@@ -267,11 +261,7 @@ def draw(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    from pipeline.datasets import (  # noqa: PLC0415 - heavy
-        ZONES,
-        draw_up_map,
-        read_features,
-    )
+    from pipeline.datasets import ZONES, draw_up_map, read_features  # noqa: PLC0415 - heavy
     from pipeline.report.map_page import write_map  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
 

@@ -99,7 +99,7 @@ def plan(  # noqa: D417 - the runs document themselves
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
     from pipeline.models import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.plan import (  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy  # noqa: PLC0415 - heavy
+    from pipeline.plan import (  # noqa: PLC0415 - heavy
         ALL,
         UNDECIDED,
         Wish,

@@ -428,10 +428,7 @@ def export(  # noqa: D417 - the results folder documents itself
     from pipeline.report import viewer_files  # noqa: PLC0415
     from pipeline.report.export_source import ExportSource  # noqa: PLC0415
     from pipeline.report.viewer_files import write_csv, write_derived_log  # noqa: PLC0415 - heavy
-    from pipeline.store import (  # noqa: PLC0415 - heavy
-        Store,
-        find_run,
-    )
+    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
     known = _open_model(model, trust_code=trust_code)

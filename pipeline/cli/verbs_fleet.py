@@ -81,10 +81,7 @@ def check(  # noqa: D417 - the arguments document themselves
     from pipeline.datasets import check_as_json, check_runs, keep_baseline, read_limits  # noqa: PLC0415 - heavy
     from pipeline.models import write_text  # noqa: PLC0415 - heavy
     from pipeline.store import Store  # noqa: PLC0415 - heavy
-    from pipeline.words import (  # noqa: PLC0415 - heavy
-        format_lines,
-        list_lines,
-    )
+    from pipeline.words import format_lines, list_lines  # noqa: PLC0415 - heavy
 
     bounds = None if limits is None else read_limits(limits)
     options = build_options(Choices(results=results))

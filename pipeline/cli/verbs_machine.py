@@ -63,10 +63,7 @@ def serve(  # noqa: D417 - the results folder documents itself
     """
     for package in ("uvicorn", "starlette", "numba", "vl_convert"):
         require_package(package, "serve", "the workbench")
-    from pipeline.store import (  # noqa: PLC0415 - heavy
-        Store,
-        find_run,
-    )
+    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
     from pipeline.web import Limits, is_loopback  # noqa: PLC0415 - heavy
     from pipeline.web.server import serve as serve_workbench  # noqa: PLC0415 - heavy
 

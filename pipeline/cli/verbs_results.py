@@ -336,10 +336,7 @@ def explain(  # noqa: D417 - arguments document themselves
     Args:
         json: print one JSON object.
     """
-    from pipeline.store import (  # noqa: PLC0415 - heavy
-        Store,
-        find_run,
-    )
+    from pipeline.store import Store, find_run  # noqa: PLC0415 - heavy
 
     manifest = find_run(run, Store(results))
     about = _list_column(column) if column else {}

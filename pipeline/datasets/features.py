@@ -64,10 +64,7 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``.
     """
-    from pipeline.store import (  # noqa: PLC0415 - heavy
-        encode_parquet,
-        replace_file,
-    )
+    from pipeline.store import encode_parquet, replace_file  # noqa: PLC0415 - heavy
 
     what, hint = "the file cannot be written", "Choose another file."
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):

@@ -216,10 +216,7 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
     """Ends of an interval, cut to the bounds of the parameter."""
-    from pipeline.models import (  # noqa: PLC0415 - heavy
-        cut_interval,
-        find_effect,
-    )
+    from pipeline.models import cut_interval, find_effect  # noqa: PLC0415 - heavy
 
     if interval is None:
         return {"low": None, "high": None}

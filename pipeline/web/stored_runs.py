@@ -147,7 +147,7 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     Raises:
         SlipError: the run cannot be diagnosed, or no drive fits into the area.
     """
-    from pipeline.plan import Wish, parse_area, parse_time, plan_drive, read_command, study  # noqa: PLC0415  # noqa: PLC0415 - heavy
+    from pipeline.plan import Wish, parse_area, parse_time, plan_drive, read_command, study  # noqa: PLC0415
 
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))
