@@ -42,7 +42,7 @@ def find_undecided(search: Search, outcome: SearchResult) -> Iterator[Undecided]
         rivals = {
             one.judged.added[0]: one.judged.fit
             for one in outcome.rivals
-            if one.effect == name and len(one.judged.added) == 1 and not one.judged.refusal
+            if one.effect == name and len(one.judged.added) == 1
         }
         largest = search.conditions.largest
         same = effect.same_in_one_motion if largest.is_one_motion else ()

@@ -15,9 +15,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.special import stdtr
 
-from pipeline.core import Budget, format_share
+from pipeline.core import NORMAL_95, Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
 from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.parts import HORIZONS_S
 from pipeline.estimation.plausibility import is_nameable, is_too_small
@@ -163,7 +164,7 @@ class Search:
 
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
-        first = current = self._fit(start)
+        first = current = self.fit(start)
         refused = list[Judged]()
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
@@ -193,7 +194,8 @@ class Search:
         for name, one in judged.items():
             for other in self.list_rivals(current, one.base, [name]):
                 behind = other.cost - find_cost(current)
-                if behind < EQUAL and not set(other.added) & set(current.ids):
+                is_new = behind < EQUAL and not set(other.added) & set(current.ids)
+                if is_new and not other.refusal and self.replaces(current, other):
                     rivals.append(Rival(name, other, behind))
         new = tuple(judged)
         return SearchResult(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
@@ -210,14 +212,15 @@ class Search:
         new = [effect for effect in judged.fit.state.effects if effect.id in judged.added]
         return bool(new) and all(is_too_small(effect, self.conditions) for effect in new)
 
-    def _fit(self, state: State, noise: Noise | None = None) -> PartFit:
+    def fit(self, state: State, noise: Noise | None = None) -> PartFit:
+        """The fit from a state; made once."""
         key = (*(effect.key for effect in state.effects), repr(state.own))
         if key not in self._fits:
             self._fits[key] = fit_part(self.part, state, noise=noise)
         return self._fits[key]
 
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:
-        return self._fit(fit.state.drop(names))
+        return self.fit(fit.state.drop(names))
 
     def screen(self, fit: PartFit, without: Collection[str] = ()) -> Screen:
         """What could be added to a model; special cases of its effects are in it already."""
@@ -261,7 +264,7 @@ class Search:
         for start in sorted(rough, key=find_cost):
             if find_cost(start) > reached + _NEAR * max(before - reached, 0.0):
                 break
-            fit = self._reduce(self._fit(start.state, start.noise), base)
+            fit = self._reduce(self.fit(start.state, start.noise), base)
             if set(fit.ids) == set(base.ids):
                 continue
             one = self._judge(base, fit, is_final=False)
@@ -279,7 +282,7 @@ class Search:
             simpler = effect.collapse() if effect.is_degenerate(self.conditions) else None
             known = {one.id for one in self.candidates} - set(fit.ids)
             if simpler is not None and simpler.id in known:
-                return self._reduce(self._fit(fit.state.drop([effect.id]).add(simpler)), base)
+                return self._reduce(self.fit(fit.state.drop([effect.id]).add(simpler)), base)
             if effect.id in base.ids:
                 # An effect that another one makes superfluous goes with it.
                 return self._reduce(self._drop(fit, [effect.id]), base)
@@ -295,15 +298,20 @@ class Search:
             fit = self._drop(fit, [min(weak)[1]])
 
     def _refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
-        """The model without effects that are not accepted beside its others, and how each was judged."""
+        """The model without effects that are not accepted beside its others, and how each was judged.
+
+        Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
+        """
         while True:
-            free = [name for name in fit.ids if name not in self.given]
-            judged = {name: self._judge(self._drop(fit, [name]), fit, is_final=True) for name in free}
-            refused = [(float(np.nan_to_num(one.gain)), name) for name, one in judged.items() if one.refusal]
+            judged = dict[str, Judged]()
+            for names in self._list_groups(fit):
+                one = self._judge(self._drop(fit, names), fit, is_final=True)
+                judged |= {name: one for name in names if one.refusal or len(names) == 1}
+            refused = [(float(np.nan_to_num(one.gain)), one.added) for one in judged.values() if one.refusal]
             if not refused:
                 return fit, judged
             # The least gain goes first.
-            fit = self._drop(fit, [min(refused)[1]])
+            fit = self._drop(fit, min(refused)[1])
 
     def _exchange(self, current: PartFit) -> PartFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
@@ -338,6 +346,22 @@ class Search:
         wanted = 0.3 * own - PRICE * len(names)
         return self._judge_extensions(without, screen, 2, 1, wanted, find_cost(current))
 
+    def replaces(self, current: PartFit, other: Judged, margin: float = 0.0) -> bool:
+        """Whether other effects do what one of a model does, and not only something else.
+
+        Beside them it adds nothing then, and no part of them beside it is as good as they are.
+
+        Args:
+            current: the model.
+            other: the others in the place of one of its effects.
+            margin: by how much they must be better than each of them beside it.
+        """
+        new = [effect for effect in other.fit.state.effects if effect.id in other.added]
+        if find_cost(self.fit(current.state.add(*new))) < other.cost - EQUAL:
+            return False
+        parts = new if len(new) > 1 else []
+        return all(find_cost(self.fit(current.state.add(one))) > other.cost + margin for one in parts)
+
     def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""
         effect = candidate()
@@ -350,7 +374,7 @@ class Search:
         # Some steps show whether it may come near what its special cases explain.
         rough = [fit_part(self.part, state, noise=base.noise, most=_ROUGH) for state in starts]
         own, explained = find_cost(current), find_cost(base) - find_cost(current)
-        fits = [self._fit(one.state, one.noise) for one in rough if find_cost(one) < own + _NEAR * explained]
+        fits = [self.fit(one.state, one.noise) for one in rough if find_cost(one) < own + _NEAR * explained]
         fit = min(fits, key=find_cost, default=base)
         if find_cost(fit) > own - EQUAL:
             return None
@@ -365,7 +389,9 @@ def _choose(judged: Sequence[Judged]) -> Judged | None:
     return min(near, key=lambda one: (one.fit.numbers, one.cost), default=None)
 
 
-def measure_t(fit: PartFit, effect: Effect, base: PartFit | None = None) -> float:
+def measure_t(
+    fit: PartFit, effect: Effect, base: PartFit | None = None, covariance: Floats | None = None
+) -> float:
     """Standard errors by which the numbers of an effect are away from none, together.
 
     A limit acts in proportion to its inverse. Numbers that only say where an effect begins do not count. Of
@@ -375,7 +401,10 @@ def measure_t(fit: PartFit, effect: Effect, base: PartFit | None = None) -> floa
         fit: a model with the effect.
         effect: as it is there.
         base: the model without it; without one, an effect without derivatives counts as evident.
+        covariance: of the fit's numbers, shape (p, p); that of the fit by default, in which clocks and lengths
+            are known.
     """
+    covariance = fit.covariance if covariance is None else covariance
     own = [number for number in fit.free if number.effect == effect.id]
     if own and not any(number.is_smooth for number in own):
         if base is None:
@@ -393,7 +422,7 @@ def measure_t(fit: PartFit, effect: Effect, base: PartFit | None = None) -> floa
         aways.append(value if math.isinf(neutral) else value - neutral)
     if not indices:
         return 0.0
-    away, covariance = np.array(aways), fit.covariance[np.ix_(indices, indices)]
+    away, covariance = np.array(aways), covariance[np.ix_(indices, indices)]
     size = np.sqrt(np.maximum(np.diag(covariance), 1e-300))
     scaled = covariance / np.outer(size, size) + 1e-9 * np.eye(size.size)
     total = float((away / size) @ np.linalg.solve(scaled, away / size))
@@ -428,6 +457,8 @@ def judge(
         t = measure_t(fit, effect, base)
         if t < least_t:
             return Judged(base, fit, added, f"{effect.id}: t = {t:.1f}")
+        if is_final and measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
+            return Judged(base, fit, added, f"{effect.id}: its interval holds no effect")
     part, noise = fit.part, fit.noise
     costs = [list_costs(part, noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)

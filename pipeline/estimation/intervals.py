@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import Free
 
-_ALWAYS_CARRIED = 0.25
-"""Share of an error invisible in residuals: lines between readings miss up to an eighth of a bend."""
 _RISEN = 3.84
 """Rise of chi-square at the ends of a 95 % interval."""
 _STRONG = 0.8
@@ -132,9 +130,8 @@ def estimate_intervals(fitted: Fitted) -> Estimates:
     """Intervals of all parameters of a fit.
 
     Innovations are independent, so that the inverse of their information is the covariance, widened where
-    blocks differ by more (`fit.join_covariance`). A clock with a known standard error is one more parameter
-    of the same equations, with that error as its prior: it widens an interval as far as both change the
-    residuals alike, and by a share of its error in any case.
+    blocks differ by more (`fit.join_covariance`). What the fit takes as given, a clock or a dimension of the
+    vehicle, widens an interval by what its standard error would change of the number.
 
     Args:
         fitted: a converged fit.
@@ -153,14 +150,11 @@ def estimate_intervals(fitted: Fitted) -> Estimates:
 def estimate_part(fit: PartFit) -> Estimates:
     """Intervals of the free parameters of one part, with the other parts unchanged."""
     count, part = len(fit.free), fit.part
-    known = fit.normal
-    information = np.diag(known)
+    information = np.diag(fit.normal)
     observable = information > _SMALLEST**2 * float(information.max(initial=0.0))
-    # Without it a poorly determined parameter moves far beyond its range and takes correlated ones along.
-    ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
-    plain = join_covariance(fit, known + np.diag(1.0 / ranges**2))
-    carried = carry_clocks(fit, plain)
-    variance = np.diag(plain) + carried + carry_lengths(fit, plain)
+    known = _bound_information(fit)
+    plain, carried = join_covariance(fit, known), carry_clocks(fit, known)
+    variance = np.diag(plain) + carried + carry_lengths(fit, known)
     errors = np.where(observable, np.sqrt(variance), math.nan)
     for index, number in enumerate(fit.free):
         if not number.is_smooth:
@@ -182,6 +176,19 @@ def estimate_part(fit: PartFit) -> Estimates:
     return Estimates(tuple(items), correlation if count else np.zeros((0, 0)), int(part.block.max()) + 1)
 
 
+def _bound_information(fit: PartFit) -> Floats:
+    """Information on the numbers (p, p), each known to be within its bounds."""
+    # Without it a poorly determined parameter moves far beyond its range and takes correlated ones along.
+    ranges = np.array([np.subtract(*number.bounds) for number in fit.free])
+    return np.asarray(fit.normal + np.diag(1.0 / ranges**2))
+
+
+def find_covariance(fit: PartFit) -> Floats:
+    """Covariance of the numbers of a fit with the errors of clocks and lengths, shape (p, p)."""
+    known = _bound_information(fit)
+    return join_covariance(fit, known) + np.diag(carry_clocks(fit, known) + carry_lengths(fit, known))
+
+
 def _find_width(fit: PartFit, number: Free) -> float:
     """Half of the interval of a number that is not smooth, by the likelihood on either side of it."""
     value, (low, high), part = fit.state.get(number), number.bounds, fit.part
@@ -198,7 +205,7 @@ def _find_width(fit: PartFit, number: Free) -> float:
     return max(widths)
 
 
-def carry_clocks(fit: PartFit, covariance: Floats) -> Floats:
+def carry_clocks(fit: PartFit, information: Floats) -> Floats:
     """Variance of each number by clocks that the fit takes as given, shape (p,)."""
     part, carried = fit.part, np.zeros(len(fit.free))
     for run, error in enumerate(part.list_clock_errors().tolist()):
@@ -207,34 +214,28 @@ def carry_clocks(fit: PartFit, covariance: Floats) -> Floats:
         mine, change = part.run == run, np.zeros((*fit.residual.shape, 1))
         late = part.shift_clock(fit.state, run, CLOCK_STEP_S) - fit.residual[mine]
         change[mine, :, 0] = -error * late / CLOCK_STEP_S
-        carried += _carry(fit, covariance, change)
+        carried += _carry(fit, information, change)
     return carried
 
 
-def carry_lengths(fit: PartFit, covariance: Floats) -> Floats:
+def carry_lengths(fit: PartFit, information: Floats) -> Floats:
     """Variance of each number by dimensions of the vehicle that were estimated from the log, shape (p,)."""
     shifts = fit.part.list_length_shifts(fit.state)
     return np.asarray(
-        sum((_carry(fit, covariance, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))
+        sum((_carry(fit, information, shift[:, :, None]) for shift in shifts), np.zeros(len(fit.free)))
     )
 
 
-def _carry(fit: PartFit, covariance: Floats, change: Floats) -> Floats:
+def _carry(fit: PartFit, information: Floats, change: Floats) -> Floats:
     """Variance of each number by one that the fit takes as given, shape (p,).
 
     Args:
         fit: the fit.
-        covariance: of its numbers, shape (p, p).
+        information: on its numbers, shape (p, p).
         change: of the residuals by one standard error of what is given, shape (n, 3, 1).
     """
     white = whiten_columns(fit, change)[:, 0]
-    influence = covariance @ (fit.white.columns.T @ white) / fit.overdispersion
-    # What the residuals say of it beside the numbers: its error after them.
-    shared = fit.white.columns.T @ white
-    alone = float(white @ white) - float(shared @ influence)
-    rest = 1.0 / (1.0 + max(alone, 0.0) / fit.overdispersion)
-    carried: Floats = influence**2 * max(rest, _ALWAYS_CARRIED**2)
-    return carried
+    return np.asarray((invert(information) @ (fit.white.columns.T @ white)) ** 2)
 
 
 def narrow_part(fit: PartFit) -> tuple[Floats, Floats]:

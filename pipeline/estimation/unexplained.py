@@ -63,9 +63,13 @@ def search_formula(
     for name in outcome.new:
         # In the place of an effect it must be far better than beside it.
         rivals = wide.list_rivals(final, outcome.judged[name].base, [name])
-        offers += [(one.fit, one.base, 2.0 * PRICE) for one in rivals if not one.refusal]
+        offers += [
+            (one.fit, one.base, 2.0 * PRICE)
+            for one in rivals
+            if not one.refusal and wide.replaces(final, one, 2.0 * PRICE)
+        ]
     for fit, without, margin in offers:
-        new = [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
+        new = _list_terms(fit)
         cost = find_cost(fit) + 2.0 * math.log(_SHAPES) * len(new)
         if new and cost < least - margin:
             least, base, added = cost, without, new
@@ -76,6 +80,10 @@ def search_formula(
     ):
         return outcome, None
     return replace(outcome, final=base), join_formula(added)
+
+
+def _list_terms(fit: PartFit) -> list[FormulaEffect]:
+    return [cast("FormulaEffect", one) for one in fit.state.effects if is_term(one.id)]
 
 
 def suggest(judgement: Judgement, formula: FormulaEffect) -> Unexplained | None:
