@@ -178,7 +178,7 @@ class Search:
                 current = small.fit
                 self.given |= set(small.added)
                 continue
-            better = None if chosen is None else self._prune(chosen.fit)
+            better = None if chosen is None else self.prune(chosen.fit)
             if better is None or not find_cost(better) < find_cost(current):
                 # What an extension makes superfluous may have been worth more than it.
                 better = self._exchange(current)
@@ -288,7 +288,7 @@ class Search:
                 return self._reduce(self._drop(fit, [effect.id]), base)
         return fit
 
-    def _prune(self, fit: PartFit) -> PartFit:
+    def prune(self, fit: PartFit) -> PartFit:
         """The model without effects that its others have made superfluous, the least evident first."""
         while True:
             free = [effect for effect in fit.state.effects if effect.id not in self.given]
@@ -303,13 +303,17 @@ class Search:
         Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
         """
         while True:
-            judged = dict[str, Judged]()
+            alone, pairs = list[Judged](), list[Judged]()
             for names in self._list_groups(fit):
+                if len(names) > 1 and any(one.refusal for one in alone):
+                    break
                 one = self._judge(self._drop(fit, names), fit, is_final=True)
-                judged |= {name: one for name in names if one.refusal or len(names) == 1}
-            refused = [(float(np.nan_to_num(one.gain)), one.added) for one in judged.values() if one.refusal]
+                (alone if len(names) == 1 else pairs).append(one)
+            refused = [
+                (float(np.nan_to_num(one.gain)), one.added) for one in (*alone, *pairs) if one.refusal
+            ]
             if not refused:
-                return fit, judged
+                return fit, {name: one for one in alone for name in one.added}
             # The least gain goes first.
             fit = self._drop(fit, min(refused)[1])
 
@@ -321,7 +325,7 @@ class Search:
             without = self._drop(current, names)
             best = _choose([one for one in self.list_rivals(current, without, names) if not one.refusal])
             if best is not None and best.cost < find_cost(current) - EQUAL:
-                return self._prune(best.fit)
+                return self.prune(best.fit)
         for candidate in self.candidates:
             whole = self._try_whole(current, candidate)
             if whole is not None:
@@ -379,7 +383,7 @@ class Search:
         if find_cost(fit) > own - EQUAL:
             return None
         judged = self._judge(base, fit, is_final=False)
-        return None if judged.refusal else self._prune(fit)
+        return None if judged.refusal else self.prune(fit)
 
 
 def _choose(judged: Sequence[Judged]) -> Judged | None:

@@ -58,8 +58,14 @@ def search_formula(
     final, least, base = outcome.final, find_cost(outcome.final), outcome.final
     wide = replace(search, candidates=terms, given=frozenset(final.ids), shapes=_SHAPES)
     added: list[FormulaEffect] = []
-    beside = [wide.run(final.state).final] if wide.screen(final).list_singles() else []
-    offers = [(fit, final, EQUAL) for fit in beside]
+    offers: list[tuple[PartFit, PartFit, float]] = []
+    if wide.screen(final).list_singles():
+        beside = wide.run(final.state)
+        for fit in (beside.final, *(rival.judged.fit for rival in beside.rivals)):
+            # An effect that only imitated what a formula describes goes.
+            offer = search.prune(fit)
+            gone = set(final.ids) - set(offer.ids)
+            offers.append((offer, search.fit(final.state.drop(gone)), 2.0 * PRICE if gone else EQUAL))
     for name in outcome.new:
         # In the place of an effect it must be far better than beside it.
         rivals = wide.list_rivals(final, outcome.judged[name].base, [name])
