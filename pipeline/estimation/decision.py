@@ -40,10 +40,11 @@ STABLE_T = 0.5 * LEAST_T
 EQUAL = 12.0
 """Difference of two models' scores below which the data do not decide between them."""
 LEAST_WAY_SHARE = 0.005
-"""Share of the distance driven in 2 s that an effect must move: half a 5 cm cell after 5 m."""
+"""Share of the distance driven that an effect must move: half a 5 cm cell after 5 m."""
 LEAST_TURN_RAD = 0.0025
-"""Heading change over 2 s that it must make otherwise [rad]: a quarter of such a cell beside the path."""
-_FELT_S = 2.0
+"""Heading change that it must make otherwise [rad]: a quarter of such a cell beside the path."""
+_FELT_S = (2.0, 10.0)
+"""Horizons over which it may: a track that is off by 1 % is felt after a turn, not in two seconds of it."""
 _UNUSUAL = 8.0
 """Cost of an effect that no controller has a parameter for: before any data it is e^4 times less common than
 a wrong track, a lag or a limit."""
@@ -195,7 +196,9 @@ class Search:
             for other in self.list_rivals(current, one.base, [name]):
                 behind = other.cost - find_cost(current)
                 is_new = behind < EQUAL and not set(other.added) & set(current.ids)
-                if is_new and not other.refusal and self.replaces(current, other):
+                # An error of the data sheet, too small for a name, may be as good an explanation as a name.
+                is_possible = not other.refusal or self._is_unnamed(other)
+                if is_new and is_possible and self.replaces(current, other):
                     rivals.append(Rival(name, other, behind))
         new = tuple(judged)
         return SearchResult(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
@@ -489,13 +492,14 @@ def judge(
 
 
 def _is_material(part: Part, change: Floats) -> bool:
-    """Whether a change of the predicted increments is felt over two seconds, as its rms over the run."""
-    length = max(round(_FELT_S / float(np.median(part.spans))), 1)
+    """Whether a change of the predicted increments is felt over one of `_FELT_S`, as its rms over the run."""
     sums = np.cumsum(np.concatenate((np.zeros((1, 3)), change)), axis=0)
-    length = min(length, change.shape[0])
-    x, y, turn = np.sqrt(np.mean((sums[length:] - sums[:-length]) ** 2, axis=0)).tolist()
-    distance = _FELT_S * part.speed
-    return math.hypot(x, y) >= LEAST_WAY_SHARE * distance or turn >= LEAST_TURN_RAD
+    for horizon in _FELT_S:
+        length = min(max(round(horizon / float(np.median(part.spans))), 1), change.shape[0])
+        x, y, turn = np.sqrt(np.mean((sums[length:] - sums[:-length]) ** 2, axis=0)).tolist()
+        if math.hypot(x, y) >= LEAST_WAY_SHARE * horizon * part.speed or turn >= LEAST_TURN_RAD:
+            return True
+    return False
 
 
 def list_costs(part: Part, noise: Noise, residual: Floats) -> Floats:
