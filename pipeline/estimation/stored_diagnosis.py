@@ -106,7 +106,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 48
+VERSION = 49
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
