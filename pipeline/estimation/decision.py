@@ -312,9 +312,7 @@ class Search:
                     break
                 one = self._judge(self._drop(fit, names), fit, is_final=True)
                 (alone if len(names) == 1 else pairs).append(one)
-            refused = [
-                (float(np.nan_to_num(one.gain)), one.added) for one in (*alone, *pairs) if one.refusal
-            ]
+            refused = [(float(np.nan_to_num(one.gain)), one.added) for one in (*alone, *pairs) if one.refusal]
             if not refused:
                 return fit, {name: one for one in alone for name in one.added}
             # The least gain goes first.
@@ -408,8 +406,7 @@ def measure_t(
         fit: a model with the effect.
         effect: as it is there.
         base: the model without it; without one, an effect without derivatives counts as evident.
-        covariance: of the fit's numbers, shape (p, p); that of the fit by default, in which clocks and lengths
-            are known.
+        covariance: of the fit's numbers, shape (p, p); by default as if clocks and lengths were exact.
     """
     covariance = fit.covariance if covariance is None else covariance
     own = [number for number in fit.free if number.effect == effect.id]
@@ -454,18 +451,9 @@ def judge(
     added = tuple(name for name in fit.ids if name not in base.ids)
     new = [effect for effect in fit.state.effects if effect.id in added]
     for effect in new:
-        acting = fit.state.list_as_it_acts(effect)
-        if len(acting) > 1 and effect.late is not None:
-            # Clocks of several runs are told by their differences: what they have in common may be a delay.
-            delays = [one.delay for one in acting]
-            acting.append(effect.of_delay(min(delays) - max(delays)))
-        if not any(is_nameable(one, conditions) for one in acting):
-            return Judged(base, fit, added, f"{effect.id}: its values are not possible")
-        t = measure_t(fit, effect, base)
-        if t < least_t:
-            return Judged(base, fit, added, f"{effect.id}: t = {t:.1f}")
-        if is_final and measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
-            return Judged(base, fit, added, f"{effect.id}: its interval holds no effect")
+        wrong = _refuse_numbers(base, fit, effect, conditions, least_t, is_final=is_final)
+        if wrong:
+            return Judged(base, fit, added, f"{effect.id}: {wrong}")
     part, noise = fit.part, fit.noise
     costs = [list_costs(part, noise, one.held_out) for one in (base, fit)]
     gain = 1.0 - float(costs[1].sum()) / max(float(costs[0].sum()), 1e-300)
@@ -489,6 +477,25 @@ def judge(
     draws = np.random.default_rng(0).integers(0, sums[0].size, (_DRAWS, sums[0].size))
     frequency = float(np.mean(sums[1][draws].sum(axis=1) < sums[0][draws].sum(axis=1)))
     return Judged(base, fit, added, refusal, gain, frequency, by_unit, falls)
+
+
+def _refuse_numbers(
+    base: PartFit, fit: PartFit, effect: Effect, conditions: Conditions, least_t: float, *, is_final: bool
+) -> str:
+    """Why an effect's numbers do not allow a name, empty where they do; see `judge`."""
+    acting = fit.state.list_as_it_acts(effect)
+    if len(acting) > 1 and effect.late is not None:
+        # Clocks of several runs are told by their differences: what they have in common may be a delay.
+        delays = [one.delay for one in acting]
+        acting.append(effect.of_delay(min(delays) - max(delays)))
+    if not any(is_nameable(one, conditions) for one in acting):
+        return "its values are not possible"
+    t = measure_t(fit, effect, base)
+    if t < least_t:
+        return f"t = {t:.1f}"
+    if is_final and measure_t(fit, effect, base, find_covariance(fit)) < NORMAL_95:
+        return "its interval holds no effect"
+    return ""
 
 
 def _is_material(part: Part, change: Floats) -> bool:
