@@ -166,9 +166,9 @@ def examine(
     if unit is None or unit == configuration.imu.unit:
         return made
     # Headings of positions alone are made of the gyro.
-    told = next(one for one in made.findings if one.where == "imu")
+    unit_finding = next(one for one in made.findings if one.where == "imu")
     again = examine(data, sources, made_of_imu(configuration, unit), vehicle, is_known=is_known, where=where)
-    return replace(again, findings=(told, *again.findings))
+    return replace(again, findings=(unit_finding, *again.findings))
 
 
 def made_of_imu(configuration: Configuration, unit: Literal["rad/s", "deg/s"]) -> Configuration:
@@ -1026,8 +1026,8 @@ class Examination:
                 speed, gain = units.likeliest[0], gains[0]
                 is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
                 unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
-                found = f"{of} is in {unit}{'' if is_sure else unsure}"
-                self._correct(role, found, f'{key} = "{unit}"', {key: unit})
+                text = f"{of} is in {unit}{'' if is_sure else unsure}"
+                self._correct(role, text, f'{key} = "{unit}"', {key: unit})
             elif units.rival is not None and units.rival[index] != unit:
                 other, gain = units.rival[index], gains[index]
                 seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"
