@@ -95,7 +95,9 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     if not (left.follows and right.follows):
         return None
     of_speed, of_turn = (float(one / other) for one, other in zip(left.gains, right.gains, strict=True))
-    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME):
+    # Laps of one radius do not tell what drives from what turns.
+    error = np.hypot(1.0 / left.t[0], 1.0 / right.t[0])
+    if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME) + CLEAR * error:
         return None
     turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
     # A body that turns by something else than its wheels shows two scales.

@@ -188,6 +188,30 @@ def test_what_only_a_formula_explains_is_one() -> None:
     assert formula.values["k_1"] == pytest.approx(0.15, abs=0.03)
 
 
+def _turn_short_to_the_right(moment: Moment) -> tuple[float, float, float]:
+    """What a track that depends on the speed imitates, and does worse."""
+    return 0.0, 0.0, -0.3 * min(moment.w0, 0.0)
+
+
+def test_effects_that_only_imitate_what_a_formula_describes_go() -> None:
+    made, found, _ = search(drive({}, duration_s=180.0, extra=_turn_short_to_the_right))
+    assert found.new
+    kept, formula = search_formula(made, found, sideways=False)
+    assert kept.final.ids == ()
+    assert formula is not None
+    assert formula.formulas == {"v_w": "k_1 * (w0 - abs(w0))"}
+    assert formula.values["k_1"] == pytest.approx(-0.15, abs=0.02)
+
+
+def test_a_formula_takes_the_place_of_what_imitates_it_and_of_nothing_else() -> None:
+    made, found, _ = search(drive({"effective_track": 1.3}, duration_s=150.0, extra=_push_sideways))
+    assert {"effective_track", "lateral_drift"} <= set(found.new)
+    kept, formula = search_formula(made, found, sideways=False)
+    assert kept.final.ids == ("effective_track",)
+    assert formula is not None
+    assert formula.formulas == {"v_y": "k_1 * abs(w0)"}
+
+
 def test_a_term_that_an_effect_of_the_catalogue_explains_as_well_is_no_formula() -> None:
     made, found, _ = search(drive({"turning_resistance": 0.2}))
     assert found.new == ("turning_resistance",)

@@ -74,6 +74,29 @@ def test_models_are_off_by_what_was_published(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not published.PUBLISHED.is_dir(), reason="../shared/published is not here")
+def test_circles_one_way_round_do_not_tell_a_track_from_unequal_wheels(tmp_path: Path) -> None:
+    """Wheels as unequal as a data sheet allows turn the robot as a wider track would."""
+    circles = sorted((published.PUBLISHED / "optiodom_differential").glob("diff_circular_*.mcap"))
+    content = published.ask(published.analyze(circles[:3], tmp_path))
+    assert published.judge_undecided("", {"effective_track", "wheel_asymmetry"}, content).verdict == "right"
+
+
+@pytest.mark.long
+@pytest.mark.skipif(not published.PUBLISHED.is_dir(), reason="../shared/published is not here")
+def test_an_effect_that_undoes_another_is_not_named_and_no_formula_hides_the_offset(tmp_path: Path) -> None:
+    logs = sorted((published.PUBLISHED / "optiodom_tricycle").glob("tri_*.mcap"))
+    runs = published.analyze(logs, tmp_path)
+    numbers = published.read_numbers(published.ask(runs))
+    assert numbers["steering_sensor_offset.o"] == pytest.approx(
+        published.STEERING_RAD[0], abs=published.STEERING_RAD[1]
+    )
+    (free,) = (run for run in runs if "140120211508" in str(run))
+    assert published.read_numbers(published.ask([free])).keys() == {
+        "steering_sensor_offset.o", "effective_wheelbase.k"
+    }  # fmt: skip
+
+
+@pytest.mark.skipif(not published.PUBLISHED.is_dir(), reason="../shared/published is not here")
 @pytest.mark.parametrize("run", ["green_06", "green_48"])
 def test_wheels_that_slip_on_a_smooth_floor_are_not_said_to_count_backward(run: str) -> None:
     """They turn the body three to five times as far as their odometry says, and the other way."""

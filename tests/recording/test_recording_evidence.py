@@ -23,6 +23,7 @@ from pipeline.recording.geometry import measure_controller, measure_geometry
 from pipeline.recording.motion import measure_motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit
+from pipeline.recording.wheel_scales import Turning, compare_sides
 
 
 def test_gain_and_delay_of_a_command_are_recovered() -> None:
@@ -325,3 +326,10 @@ def test_a_stamp_of_another_epoch_is_left_out() -> None:
     held = Held(np.sort(times), values)
     assert held.times[-1] < 100.0
     assert held.grid.size < 10_000
+
+
+@pytest.mark.parametrize(("t", "scale"), [(100.0, 0.5), (6.0, None)])
+def test_laps_of_one_radius_tell_no_scale_of_a_side(t: float, scale: float | None) -> None:
+    """What drives and what turns are one there, and neither is known."""
+    left, right = (Turning(np.array([gain, 1.0]), np.array([t, 0.5]), follows=True) for gain in (5.0, 10.0))
+    assert compare_sides(left, right) == scale
