@@ -65,7 +65,9 @@ def test_the_catalogue_leads_to_reports_alone_and_says_why_a_log_has_no_run(tmp_
     log.write_bytes(b"nothing")
     store = make_results(tmp_path / "results")
     sighting = see_log(log)
-    Ledger(store).write(Entry(log=sighting, basis="", state="failed", reason="no poses", hint="Look at it."))
+    Ledger(store).write(
+        Entry(log=sighting, fingerprint="", state="failed", reason="no poses", hint="Look at it.")
+    )
     update_datasets(store)
     page = (tmp_path / "results" / "index.html").read_text(encoding="utf-8")
     assert "broken &lt;b&gt;.mcap" in page
