@@ -42,7 +42,7 @@ from pipeline.recording.geometry import (
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.outages import find_outages
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
-from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, compare, fit
 from pipeline.recording.wheel_scales import compare_sides, find_odd_joints, measure_wheel
 from pipeline.run import LIVE_SHARE, Alignment
 from pipeline.sources import (
@@ -187,6 +187,7 @@ class Candidate:
         rank: its place by type and name among those of its role.
         is_measured: whether type and name say that it is measured.
         steering: unit of its steering angle.
+        is_angle: whether a type of body commands holds speed and steering angle.
     """
 
     source: DriveSource
@@ -194,6 +195,7 @@ class Candidate:
     rank: int
     is_measured: bool
     steering: Units = field(default_factory=lambda: Units(("", "rad")))
+    is_angle: bool = False
 
     @property
     def is_sure(self) -> bool:
@@ -271,16 +273,20 @@ class Examination:
             one.explain(motion)
         for drive in drives:
             self._settle_steering(drive, motion)
+            self._settle_turn(drive, motion)
         drives = self._leave_out_sizes(drives)
         motion = self._turn(motion, readings)
         command, wheels = self._choose_roles(drives)
         self._settle_stamps(command)
+        self._report_turn(command)
         motion = self._settle_lengths(motion, readings, command, wheels)
         self._report_gyro(gyro)
         is_judged = self._settle_wheels(command, wheels, motion)
         kind = self._find_kind(wheels, motion)
         if wheels is not None and not kind and self._leave_out_steered(wheels):
             wheels = None
+        if command is not None and command.reading.form == "steering":
+            kind = kind or "ackermann"
         if not is_judged:
             self._report_signs(motion, command, wheels, gyro)
         if wheels is not None and self.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
@@ -982,6 +988,35 @@ class Examination:
         drive.steering = find_steering_unit(nats, lengths, known, str(drive.source))
         if drive.steering.likeliest[1] == "deg":
             reading.second, reading.explained = tried["deg"].second, tried["deg"].explained
+
+    def _settle_turn(self, drive: Candidate, motion: Motion) -> None:
+        """Read a body command as speed and steering angle where the body turns by these, as some cars do."""
+        reading, made = drive.reading, drive.reading.explained
+        first, second = reading.first, reading.second
+        is_open = not (self.is_known or self.moves_sideways or drive.is_measured or reading.form != "body")
+        if not is_open or first is None or second is None or made is None or len(reading.inputs) < len(SIDES):
+            return
+        bent = Bent(first, second.times, second.values)
+        steered = Reading("steering", reading.name, first, bent)
+        other = steered.explain(motion)
+        if other is None or not other.sign("turned") or made.crossed:
+            return
+        one, two = ((each.turned.blocks, each.none[1]) for each in (other, made))
+        if one[0].size == two[0].size and compare(one[0] - one[1], two[0] - two[1]) > CLEAR:
+            drive.reading, drive.source = steered, replace(drive.source, form=DriveForm.STEERING)
+            drive.is_angle = True
+
+    def _report_turn(self, command: Candidate | None) -> None:
+        """A body command that holds steering angles; see `_settle_turn`."""
+        if command is None or not command.is_angle:
+            return
+        speed, turn = command.source.signals
+        text = (
+            f"{command.source} holds steering angles in place of yaw rates: the vehicle turns by the speed "
+            f'times their tangent: read so, as speed_topic = "{speed}" and steering_topic = "{turn}" under '
+            "[command] in run.toml do"
+        )
+        self.findings.append(Finding("command_corrected", "warning", text, where="command"))
 
     def _find_units(self, command: Candidate | None, wheels: Candidate | None) -> None:
         for role, one in (("command", command), ("wheels", wheels)):

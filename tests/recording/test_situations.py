@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from drawn_motion import Drive, draw, sides
+from drawn_motion import STEP, Drive, draw, sides
 from written_logs import write_log
 
 from pipeline.analysis import Options
@@ -159,6 +159,22 @@ def test_of_commands_in_percent_no_unit_is_sure(tmp_path: Path) -> None:
     log = write_log(tmp_path / "log.mcap", drive, asked=drive.asked * [125.0, 140.0])
     told = [one.text for one in set_up_log(log, Options(out=tmp_path)).choice.findings]
     assert any("or has no unit, as percent of a throttle" in text for text in told)
+
+
+def test_a_car_that_takes_a_twist_for_a_steering_angle_is_read_so(tmp_path: Path) -> None:
+    drive, wheelbase = draw(55), 1.2
+    asked = drive.asked * [1.0, 0.4]
+    yaw = np.cumsum(asked[:, 0] * np.tan(asked[:, 1]) / wheelbase) * STEP
+    place = np.cumsum(asked[:, 0] * np.exp(1j * yaw)) * STEP
+    noise = np.random.default_rng(55).normal(0.0, 0.002, (3, drive.rows.size))
+    body = replace(drive, place=place[drive.rows] + noise[0] + 1j * noise[1], yaw=yaw[drive.rows] + noise[2])
+    still = {"mast": Held(drive.time[::5], 0.0 * drive.time[::5])}
+    setup = set_up_log(
+        write_log(tmp_path / "log.mcap", body, asked=asked, joints=still), Options(out=tmp_path)
+    )
+    assert setup.vehicle.kind == "ackermann"
+    assert setup.vehicle.wheelbase_m == pytest.approx(wheelbase, rel=0.03)
+    assert any("steering angles in place of yaw rates" in one.text for one in setup.choice.findings)
 
 
 def test_wheels_that_several_axles_steer_are_no_differential_drive(tmp_path: Path) -> None:
