@@ -173,6 +173,7 @@ def list_changes() -> list[Change]:
         Change("left encoder dead", _on_wheels(0.0, 1.0), "left wheels' encoder"),
         Change("left encoder dies", _die("left", 0.0), "left wheels' encoder reads nothing"),
         Change("right encoder holds", _die("right", None), "right wheels' encoder reads nothing"),
+        Change("left encoder counts double", _on_wheels(2.0, 1.0), "counts? 2 times|low against the other"),
         Change("wheels in rpm", _on_wheels(30.0 / math.pi, 30.0 / math.pi), "rpm"),
         Change("wheels x 3", _on_wheels(3.0, 3.0), "radius|unit"),
         Change("command reversed", _on_command(-1.0, 1.0), "linear.x|sign"),

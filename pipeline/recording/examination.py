@@ -43,7 +43,7 @@ from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.outages import find_outages
 from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, compare, fit
-from pipeline.recording.wheel_scales import compare_sides, find_odd_joints, measure_wheel
+from pipeline.recording.wheel_scales import compare_sides, find_odd_joints, measure_wheel, snap
 from pipeline.run import LIVE_SHARE, Alignment
 from pipeline.sources import (
     CONFIGURED,
@@ -782,11 +782,10 @@ class Examination:
         counts = {"left": abs(float(left.gains[0])), "right": abs(float(right.gains[0]))}
         side, other = ("left", "right") if scale > 1.0 else ("right", "left")
         if self.is_known:
-            # Which of them is right changes the radius of both, and slip of a radius that is not known not at
-            # all.
-            apart = {name: abs(np.log(one * self.vehicle.wheel_radius_m)) for name, one in counts.items()}
-            side, other = sorted(SIDES, key=lambda name: -apart[name])
-        factor = float(f"{counts[other] / counts[side]:.4g}")
+            # What does not explain all of a wheel's turning makes both seem low.
+            high, low = (abs(np.log(counts[one] * self.vehicle.wheel_radius_m)) for one in (side, other))
+            side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
+        factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
         what = (
             f"the {side} wheels' encoder counts {1.0 / factor:.3g} times as much as the {other} one for "
             "the same motion (another gear or resolution?)"

@@ -14,8 +14,13 @@ _FOLLOWS = 0.5
 """Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
 _SAME = 1.25
 """Ratio of two wheels' scales up to which tyres, loads and the ground may make it."""
-_AGREE = 1.15
-"""Ratio within which driving and turning show the same scale."""
+_AGREE = 1.5
+"""Ratio within which driving and turning show the same scale: on grass the sides of a Warthog turn it by 1.26
+of each other."""
+_EDGES = (2.0, 4.0)
+"""Counts of a pulse by decoders that look at two or four of its edges, over those of one."""
+_NEAR = 0.05
+"""Deviation of the logarithm of a scale from such a ratio that is the ground's."""
 _IDLE = 0.1
 """Turning over that of the others below which a wheel's encoder is not turned by the drive."""
 
@@ -83,7 +88,8 @@ def find_odd_joints(
         ratio = float(one.gains[0]) / usual if usual else 0.0
         others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
         if one.follows and (ratio < 0.0 or abs(np.log(ratio)) > np.log(_SAME)):
-            factors[name] = -1.0 if -_SAME < ratio < -1.0 / _SAME else 1.0 / ratio
+            size = snap(abs(ratio)) if abs(np.log(abs(ratio))) > np.log(_SAME) else 1.0
+            factors[name] = float(np.sign(ratio)) / size
         elif not one.follows and abs(ratio) < _IDLE and any(other.follows for other in others):
             idle.append(name)
     # More than half of them that differ are a vehicle of another kind.
@@ -103,4 +109,10 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     # A body that turns by something else than its wheels shows two scales.
     if turns and (of_turn >= 0.0 or abs(np.log(-of_turn / of_speed)) > np.log(_AGREE)):
         return None
-    return of_speed
+    return snap(of_speed)
+
+
+def snap(scale: float) -> float:
+    """A scale above zero, or the ratio of decoders that it is near to."""
+    ratios = [ratio for edge in _EDGES for ratio in (edge, 1.0 / edge)]
+    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < _NEAR), scale)
