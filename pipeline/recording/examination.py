@@ -489,8 +489,12 @@ class Examination:
             default=0.0,
         )
         named = command = self._find(drives, self.sources.command)
-        # Plain numbers have their roles by name alone.
-        rivals = [one for one in sure if not one.is_measured or one.source.form is DriveForm.SIDES]
+        # Plain numbers have their roles by name alone: the motion may follow both, and tell them apart. Where
+        # it does not follow the command, the vehicle is driven by other means.
+        is_followed = any(one is command for one in sure)
+        rivals = [
+            one for one in sure if not one.is_measured or (is_followed and one.source.form is DriveForm.SIDES)
+        ]
         if rivals and (command is None or command.source.reason != CONFIGURED):
             rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
             best = max(rivals, key=lambda one: rates[id(one)])
