@@ -195,7 +195,7 @@ def cut_track(
     clock = np.concatenate(([False], np.diff(counted) > 0))
     gaps = rigid.find_gaps(t, settings.gap_s)
     apart = _find_apart(t, p, q, gaps | clock, settings)
-    if apart.any():
+    if apart.any() and rigid.find_held(p, q).mean() <= _REPEATED:
         count = int(apart.sum())
         text = (
             f"{count} pose{'s' * (count > 1)} of {topic} lie{'s' * (count == 1)} far from those before and "
@@ -236,6 +236,8 @@ def _find_pose_jumps(
 
 _APART = 3
 """Greatest number of poses in a row that lie apart: more are a map that was corrected for a while."""
+_REPEATED = 0.05
+"""Share of poses that repeat the one before, from which on a late localization that catches up lies apart."""
 _FAST = 3.0
 """Change over the usual largest one, beside the smallest jump, up to which a pose may go on."""
 

@@ -414,6 +414,10 @@ def _solve(columns: Floats, values: Floats) -> tuple[Floats, Floats]:
     return gains / size, rest
 
 
+_LONG_PAUSE_S = 2.0
+"""Pause of a command from which on what moves the vehicle may be another command, and no way to a stop."""
+
+
 def _moves_otherwise(
     blocks: _Blocks, asked: Floats, last: Floats, target: Floats, is_known: Flags, inside: Flags
 ) -> bool:
@@ -455,7 +459,7 @@ def _compare_command(rims: Rims, blocks: _Blocks, hold_s: float | None) -> tuple
         keeps = _fit(blocks, asked + last, target, known, is_command=True)
         longest = max(end - start for start, end in pauses)
         inside = known & (np.abs(last).sum(axis=1) > 0.0)
-        if _moves_otherwise(blocks, asked, last, target, known, inside):
+        if longest > _LONG_PAUSE_S and _moves_otherwise(blocks, asked, last, target, known, inside):
             text = (
                 f"in {len(pauses)} pauses of the command, of up to {longest:.1f} s, the vehicle moves "
                 "otherwise than by its last one: another topic or a remote control commands it there, and "
