@@ -65,7 +65,9 @@ def search_formula(
             # An effect that only imitated what a formula describes goes.
             offer = search.prune(fit)
             gone = set(final.ids) - set(offer.ids)
-            offers.append((offer, search.fit(final.state.drop(gone)), 2.0 * PRICE if gone else EQUAL))
+            offers.append(
+                (offer, search.fit(final.state.drop(gone)), 2.0 * PRICE) if gone else (offer, final, EQUAL)
+            )
     for name in outcome.new:
         # In the place of an effect it must be far better than beside it.
         rivals = wide.list_rivals(final, outcome.judged[name].base, [name])
