@@ -306,17 +306,21 @@ class Search:
         Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
         """
         while True:
-            alone, pairs = list[Judged](), list[Judged]()
-            for names in self._list_groups(fit):
-                if len(names) > 1 and any(one.refusal for one in alone):
-                    break
-                one = self._judge(self._drop(fit, names), fit, is_final=True)
-                (alone if len(names) == 1 else pairs).append(one)
-            refused = [(float(np.nan_to_num(one.gain)), one.added) for one in (*alone, *pairs) if one.refusal]
+            groups = self._list_groups(fit)
+            alone = {names[0]: self._judge_last(fit, names) for names in groups if len(names) == 1}
+            refused = [one for one in alone.values() if one.refusal]
             if not refused:
-                return fit, {name: one for one in alone for name in one.added}
+                pairs = (self._judge_last(fit, names) for names in groups if len(names) > 1)
+                refused = [one for one in pairs if one.refusal]
+            if not refused:
+                return fit, alone
             # The least gain goes first.
-            fit = self._drop(fit, min(refused)[1])
+            least = min(refused, key=lambda one: (float(np.nan_to_num(one.gain)), one.added))
+            fit = self._drop(fit, least.added)
+
+    def _judge_last(self, fit: PartFit, names: Collection[str]) -> Judged:
+        """How effects of the last model are judged against the model without them."""
+        return self._judge(self._drop(fit, names), fit, is_final=True)
 
     def _exchange(self, current: PartFit) -> PartFit | None:
         """A better model with others in the place of one effect, or with an effect for its special cases."""
