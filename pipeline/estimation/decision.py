@@ -97,6 +97,11 @@ class Judged:
         """Score with the price of its numbers: smaller is better."""
         return find_cost(self.fit)
 
+    @property
+    def new(self) -> list[Effect]:
+        """Its new effects, fitted."""
+        return [effect for effect in self.fit.state.effects if effect.id in self.added]
+
 
 def find_cost(fit: PartFit) -> float:
     """Minus twice the log-likelihood of a fit, with the price of its numbers and of unusual effects."""
@@ -212,8 +217,7 @@ class Search:
 
     def _is_unnamed(self, judged: Judged) -> bool:
         """Whether a model was refused for the size of its new effects alone."""
-        new = [effect for effect in judged.fit.state.effects if effect.id in judged.added]
-        return bool(new) and all(is_too_small(effect, self.conditions) for effect in new)
+        return bool(judged.new) and all(is_too_small(effect, self.conditions) for effect in judged.new)
 
     def fit(self, state: State, noise: Noise | None = None) -> PartFit:
         """The fit from a state; made once."""
@@ -365,7 +369,7 @@ class Search:
             other: the others in the place of one of its effects.
             margin: by how much they must be better than each of them beside it.
         """
-        new = [effect for effect in other.fit.state.effects if effect.id in other.added]
+        new = other.new
         if find_cost(self.fit(current.state.add(*new))) < other.cost - EQUAL:
             return False
         parts = new if len(new) > 1 else []
