@@ -195,7 +195,7 @@ def cut_track(
     clock = np.concatenate(([False], np.diff(counted) > 0))
     gaps = rigid.find_gaps(t, settings.gap_s)
     apart = _find_apart(t, p, q, gaps | clock, settings)
-    if apart.any() and rigid.find_held(p, q).mean() <= _REPEATED:
+    if apart.any():
         count = int(apart.sum())
         text = (
             f"{count} pose{'s' * (count > 1)} of {topic} lie{'s' * (count == 1)} far from those before and "
@@ -245,11 +245,10 @@ _FAST = 3.0
 def _find_apart(t: Floats, p: Floats, q: Floats, breaks: Flags, settings: VelocitySection) -> Flags:
     """Poses that lie away from those before them, and from those after them, which go on, as flags."""
     apart, last = np.zeros(t.size, dtype=bool), t.size - 1
-    if t.size < FEWEST_MESSAGES:
+    if t.size < FEWEST_MESSAGES or rigid.find_held(p, q).mean() > _REPEATED:
         return apart
     stretch = np.cumsum(breaks)
     least = np.array([settings.jump_m, settings.jump_rad])
-    usual = np.zeros(2)
 
     def measure(first: Ints, second: Ints) -> Floats:
         """Distance and angle from one pose to another, shape (n, 2) [m, rad]."""
@@ -257,15 +256,16 @@ def _find_apart(t: Floats, p: Floats, q: Floats, breaks: Flags, settings: Veloci
         dot = np.abs(np.sum(q[first] * q[second], axis=1))
         return np.column_stack((moved, 2.0 * np.arccos(np.minimum(dot, 1.0))))
 
+    every = np.arange(last)
+    spans = np.diff(t)
+    rates = measure(every, every + 1)[spans > 0.0] / spans[spans > 0.0, None]
+    usual = np.quantile(rates, 0.9, axis=0)
+
     def is_far(first: Ints, second: Ints) -> Flags:
         elapsed = t[second] - t[first]
         limits = least + _FAST * usual * elapsed[:, None]
         return np.asarray((measure(first, second) > limits).any(axis=1) | (stretch[first] != stretch[second]))
 
-    every = np.arange(last)
-    elapsed = np.diff(t)
-    rates = measure(every, every + 1)[elapsed > 0.0] / elapsed[elapsed > 0.0, None]
-    usual = np.quantile(rates, 0.9, axis=0)
     for count in range(1, _APART + 1):
         before = np.arange(last - count)
         after = before + count + 1
