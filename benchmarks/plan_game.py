@@ -23,7 +23,7 @@ from pipeline.core import SlipError
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.plan import parse_area
-from pipeline.plan.next_drive import ALL, Wish, plan_drive, study
+from pipeline.plan.next_drive import Wish, plan_drive, study
 from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import check_plan, read_promises, write_plan
 from pipeline.results import Named
@@ -121,11 +121,9 @@ def play(seed: int, folder: Path) -> Score:
         wish = Wish(
             parse_area(_AREAS.get(name, "20x10m"), vehicle),
             _SECONDS,
-            (ALL,),
             speed_mps=4.0 if name == "car" else None,
-            seed=seed,
         )
-        plan = plan_drive(vehicle, studied, wish, [before]).plan
+        plan = plan_drive(vehicle, studied, wish, [before])
         score.plan_s = round(time.perf_counter() - begun, 1)
         score.duration_s = plan.commands.duration_s
         if plan.manoeuvres:

@@ -16,6 +16,7 @@ from pipeline.analysis.work import Progress, Work, hash_model, key_stages, read_
 from pipeline.core import (
     FIGURES,
     INPUTS,
+    PACKAGE,
     FigureFormat,
     SlipError,
     read_version,
@@ -177,7 +178,9 @@ def _is_done(manifest: Manifest, keys: Mapping[str, str], options: Options) -> b
     if options.through != STAGES[-1]:
         return True
     files = set(manifest.files)
-    has_report = REPORT in files or not options.report
+    # What another version wrote is drawn again.
+    is_drawn = REPORT in files and manifest.part("versions").get(PACKAGE) == read_version()
+    has_report = is_drawn or not options.report
     figures = options.figures
     has_figures = figures is None or any(name.endswith(f".{figures}") for name in files)
     diagnosed = not options.diagnosis or has_diagnosis(manifest, key_diagnosis(keys))

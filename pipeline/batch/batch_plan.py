@@ -13,7 +13,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
-from pipeline.core import SlipError, read_bounded, walk_files
+from pipeline.core import SlipError, read_bounded, read_version, walk_files
 from pipeline.estimation.stored_diagnosis import STAGE, VERSION
 from pipeline.logs import LogError, hash_log, to_location
 from pipeline.sources import list_configuration_files, list_presets, read_tables
@@ -76,6 +76,7 @@ def _fingerprint_program() -> object:
 
     return [
         {**VERSIONS, STAGE: VERSION},
+        read_version(),
         {contract.name: contract.version for contract in list_contracts()},
         [msgspec.to_builtins(vehicle) for vehicle in list_presets()],
         msgspec.to_builtins(read_tables()),

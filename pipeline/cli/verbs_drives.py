@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
@@ -25,14 +24,13 @@ from pipeline.cli.conventions import (
     show_progress,
     spell_choices,
 )
-from pipeline.core import SlipError, align_rows, finite_or_none, format_count
+from pipeline.core import SlipError, align_rows, format_count, format_duration
 
 if TYPE_CHECKING:
     from pipeline.analysis import Options
     from pipeline.datasets import Forecast
     from pipeline.estimation import Recording
-    from pipeline.plan import Needed, Plan
-    from pipeline.results import RunDiagnosis
+    from pipeline.plan import Plan
     from pipeline.simulate import EffectSpec
     from pipeline.simulate.facts import Kind
     from pipeline.sources import Vehicle
@@ -44,9 +42,7 @@ def plan(  # noqa: D417 - the runs document themselves
     /,
     *,
     vehicle: str | None = None,
-    wanted: Annotated[
-        list[str] | None, Parameter(name="--for", help="undecided, all, or ids of effects")
-    ] = None,
+    wanted: Annotated[list[str] | None, Parameter(name="--for")] = None,
     time: str = "60s",
     area: str = "20x10m",
     max_speed: PositiveFloat | None = None,
@@ -56,25 +52,21 @@ def plan(  # noqa: D417 - the runs document themselves
     topic: str | None = None,
     type_name: Annotated[str | None, Parameter(name="--type")] = None,
     terrain: str | None = None,
-    known: Path | None = None,
     check: Path | None = None,
-    compare: str | None = None,
-    seed: int = 0,
     config: Path | None = None,
     results: Results = Path("results"),
     folder: Path = Path("plan"),
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Plan a drive that decides the open questions of a diagnosis.
+    """Plan the drive that tells most of what your logs left open.
 
-    The plan is an MCAP file that a robot can play.
+    The screen lists what is open and what the drive tells of it; an MCAP file plays it.
 
     Args:
         vehicle: vehicle preset; without logs the plan covers all effects of that vehicle.
-        terrain: terrain to drive on; the plan starts from the prediction of the runs of --known.
-        known: results folder with diagnosed runs of the vehicle (default: --results).
-        wanted: what to decide; by default what is undecided, and in the time left all that is open.
+        terrain: terrain to drive on; the plan starts from what the runs in the results predict there.
+        wanted: ids of effects: only what is open about these.
         time: longest duration, for example 60s or 2min.
         area: free area: length along the initial heading, and width; the start is in its middle.
         max_speed: highest speed [m/s] (default of all limits: what the runs reached).
@@ -84,9 +76,6 @@ def plan(  # noqa: D417 - the runs document themselves
         topic: topic of the commands (default: the recorded one).
         type_name: message type of that topic.
         check: plan.toml, or the plan's folder, to compare with the log of the drive.
-        compare: other drives whose times are shown beside the plan's, for example
-            drive,human,straight_and_circle,eights.
-        seed: seed of the random draws.
         config: configuration file of the logs.
         folder: folder of the plan, to write.
         json: print one JSON object.
@@ -99,22 +88,10 @@ def plan(  # noqa: D417 - the runs document themselves
     if check is not None:
         return _check(check, names, options, said, json=json, quiet=quiet)
     from pipeline.models import find_effect  # noqa: PLC0415 - heavy
-    from pipeline.plan import (  # noqa: PLC0415 - heavy
-        ALL,
-        UNDECIDED,
-        Wish,
-        compare_protocols,
-        expect,
-        parse_area,
-        parse_protocols,
-        parse_time,
-        plan_drive,
-        study,
-    )
+    from pipeline.plan import Wish, expect, parse_area, parse_time, plan_drive, study  # noqa: PLC0415 - heavy
     from pipeline.report.drive_pages import write_drive  # noqa: PLC0415 - heavy
 
     seconds = parse_time(time)
-    protocols = () if compare is None else parse_protocols(compare)
     gathered = _gather(names, options, quiet=quiet or json) if names else None
     chosen = _find_vehicle(vehicle) if gathered is None else gathered.vehicle
     recordings = [] if gathered is None else gathered.recordings
@@ -128,33 +105,26 @@ def plan(  # noqa: D417 - the runs document themselves
         max_acceleration,
         topic,
         type_name,
-        seed,
         max_lateral,
     )
-    for name in {*wish.wanted} - {UNDECIDED, ALL}:
+    for name in wish.wanted:
         find_effect(name)
     with show_progress(at_work, quiet=quiet or json) as progress:
         progress("diagnosis")
         if gathered is None:
-            studied = expect(chosen, terrain, known or results)
+            studied = expect(chosen, terrain, results)
         else:
-            studied = study(recordings, chosen, terrain, known or results, progress)
+            studied = study(recordings, chosen, terrain, results, progress)
         command = {} if gathered is None else gathered.command
-        planned = plan_drive(chosen, studied, wish, recordings, command, progress)
-        made, forecast = planned.plan, studied.forecast
-        others = compare_protocols(studied.knowledge, planned.questions, planned.limits, protocols, seed)
-    asked = [question.text for question in planned.questions]
+        made = plan_drive(chosen, studied, wish, recordings, command, progress)
     files = write_drive(made, folder, results)
     shown = _show_in_report(results, gathered.manifests, made) if gathered is not None else []
     if json:
-        content = {
-            one.protocol: dict(zip(asked, map(finite_or_none, one.seconds), strict=True)) for one in others
-        }
-        written = {**_known_as_json(forecast), "files": [str(file) for file in files], "errors": []}
-        print_json({**made.to_json(), **({"compare": content} if others else {}), **written})
+        written = {**_known_as_json(studied.forecast), "files": [str(file) for file in files], "errors": []}
+        print_json({**made.to_json(), **written})
     elif not quiet:
-        lines = [*_format_known(forecast), *format_plan(made, studied.diagnosis, files, said), *shown]
-        print_lines([*lines, *_list_others(made, asked, others)])
+        driven_s = studied.knowledge.driven_s
+        print_lines([*_format_known(studied.forecast), *format_plan(made, driven_s, files, said), *shown])
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
 
@@ -186,19 +156,6 @@ def _format_known(forecast: Forecast | None) -> list[str]:
     here = f"{format_count(len(forecast.here), 'run')} there"
     runs = f"{here}, {len(forecast.elsewhere)} elsewhere"
     return [f"known        of {forecast.vehicle} on {forecast.terrain}: {runs}"]
-
-
-def _list_others(made: Plan, asked: Sequence[str], others: Sequence[Needed]) -> list[str]:
-    """Times of the plan and of other protocols [s], one line per question."""
-    if not others or not asked:
-        return []
-    mine = {one.question: one.decided_after_s for one in made.promises}
-    rows = [f"{'seconds to decide':<44}{'plan':>8}" + "".join(f"{one.protocol:>21}" for one in others)]
-    for number, text in enumerate(asked):
-        seconds = [one.seconds[number] for one in others]
-        columns = "".join(f"{'-' if math.isinf(s) else f'{s:.0f}':>21}" for s in seconds)
-        rows.append(f"{text:<44}{f'{mine[text]:.0f}' if text in mine else '-':>8}{columns}")
-    return rows
 
 
 class _Gathered(NamedTuple):
@@ -290,37 +247,39 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     return LOSSY if lossy else CLEAN
 
 
-def format_plan(
-    made: Plan, diagnosis: RunDiagnosis | None, files: Sequence[Path], said: str = ""
-) -> list[str]:
-    """The plan on one screen; said: flags that the next command needs again."""
-    from pipeline.plan import SAFETY  # noqa: PLC0415 - heavy
+def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
+    """The plan on one screen.
 
-    if not made.manoeuvres and not made.impossible:
-        what = "" if diagnosis is None else ": all effects are decided, and more driving narrows no interval"
-        return [f"no open question{what}"]
-    lines = []
-    for one in made.promises:
-        how = f"t = {one.expected:.1f}" if one.kind == "separation" else f"±{one.expected:.2g}"
-        lines.append(f"after {one.decided_after_s:3.0f} s  {one.question} ({how})")
-    if rest := made.format_rest():
-        lines.append(f"then         {rest}")
-    lines += [f"undecided    {text}" for text in made.list_impossible()]
+    Args:
+        made: the plan.
+        driven_s: length of the logs so far [s]; 0 without logs.
+        files: the files that were written.
+        said: flags that the next command needs again.
+    """
+    from pipeline.plan import SAFETY, list_gains, summarize_gains  # noqa: PLC0415 - heavy
+
+    runs = f" after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
+    if not made.gains:
+        return [f"open         nothing{runs}: no cause is undecided, and each number is known within 5 %"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
+    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in align_rows(list_gains(made)))]
     most = f"limits       {made.format_limits()}"
     if not made.manoeuvres:
-        none = f"no drive on {ground} of level ground answers an open question: no file is written"
-        return [f"drive        {none}", most, *lines]
-    lines += [
+        return [
+            *lines,
+            f"drive        none on {ground} of level ground tells any of this: no file is written",
+            most,
+        ]
+    return [
+        *lines,
         f"drive        {made.commands.duration_s:.0f} s on {ground}",
-        most,
         f"place        start in the middle, heading along the length; end within {made.home_m:.1f} m of it",
+        most,
         f"play         ros2 bag play {files[2]}   ({made.topic}, {made.type_name})",
         f"page         {files[-1]}",
         *(f"safety       {text}" for text in SAFETY),
         f"afterwards   slip plan --check {shlex.quote(str(files[0]))} NEW.mcap{said}",
     ]
-    return lines
 
 
 def simulate(  # noqa: D417 - arguments document themselves

@@ -269,12 +269,12 @@ class _Scan:
 
     @property
     def grain(self) -> float:
-        """Standard error of the size of the step that is determined best."""
+        """Standard error of the step that is determined best, no less than by the stated errors."""
         if not self.places.size or self.freedom < FEWEST_FREE:
             return math.inf
         explained, whole = self._weigh(self.y[None, :])
         scale = (float(whole[0]) - float(explained.max())) / self.freedom
-        return math.sqrt(max(scale, 0.0)) / float(self.norms.max())
+        return math.sqrt(max(scale, 1.0)) / float(self.norms.max())
 
     def ask(self, rng: np.random.Generator, level: float) -> tuple[float, float]:
         """Return p of the largest step, and the F ratio of probability `level`."""

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from pipeline.door import open_door
 
 if TYPE_CHECKING:
+    from pipeline.plan.gain_words import list_gains, summarize_gains
     from pipeline.plan.manoeuvres import (
         LEAD_S,
         RATE_HZ,
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
         wait,
     )
     from pipeline.plan.next_drive import (
-        ALL,
-        UNDECIDED,
         Wish,
         expect,
         forecast_deployment,
@@ -33,10 +32,7 @@ if TYPE_CHECKING:
     from pipeline.plan.plan import SAFETY, Plan
     from pipeline.plan.plan_files import (
         FILES,
-        Needed,
         check_plan,
-        compare_protocols,
-        parse_protocols,
         read_promises,
         require_played,
         write_plan,

@@ -1,15 +1,13 @@
 """Choice of the sequence of manoeuvres that answers the open questions."""
 
-import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 from pipeline.core import Complex, Floats
-from pipeline.models import Excitation, find_effect, suggest_manoeuvre
-from pipeline.plan.manoeuvres import LEAD_S, LONGEST_S, TAIL_S, Area
-from pipeline.plan.questions import Answerable, Impossible, Question
+from pipeline.plan.manoeuvres import Area
+from pipeline.plan.questions import Answerable
 
 _ROUNDS = 2
 
@@ -68,25 +66,15 @@ class Chooser:
             reserve: factor on the goals: gains of manoeuvres do not add up exactly, and stretches of driving
                 do not begin with manoeuvres.
         """
-        chosen = self.extend([], reserve)
+        self.reserve = reserve
+        self._answers.clear()
+        chosen: list[int] = []
+        while (best := self._find_next(chosen)) is not None:
+            chosen.append(best)
         for _ in range(_ROUNDS):
             if not self._exchange(chosen):
                 break
         return chosen
-
-    def extend(self, chosen: Sequence[int], reserve: float) -> list[int]:
-        """Append manoeuvres while they contribute to an answer and time remains.
-
-        Args:
-            chosen: fixed beginning of the sequence.
-            reserve: as of `choose`.
-        """
-        self.reserve = reserve
-        self._answers.clear()
-        longer = list(chosen)
-        while (best := self._find_next(longer)) is not None:
-            longer.append(best)
-        return longer
 
     def add_up(self, trials: Sequence[Sequence[int]]) -> list[float]:
         """For each trial, the sum over all questions of the fraction of the goal that it reaches."""
@@ -149,76 +137,3 @@ class Chooser:
             at, heading = path[:, -1], heading + shape.heading
         home = _HOME_SHARE * min(self.area.length_m, self.area.width_m)
         return bool((np.abs(at) <= home).all())
-
-
-def explain_open(question: Impossible, chooser: Chooser, order: Sequence[int]) -> Impossible:
-    """An open question with the reason.
-
-    The drive is continued for this question alone: for a longer time, in an unlimited area, and both. The
-    first that answers it shows what is in its way; if none does, the limits of the commands are.
-
-    Args:
-        question: the question, as `leave_open` gives it.
-        chooser: the manoeuvres within the limits, and their information on all questions.
-        order: manoeuvres of the plan.
-    """
-    one = next(known for known in chooser.questions if known.question.text == question.question)
-    library = np.ones(chooser.durations.size)
-    best, longest_s = library, min(_MOST_TIMES * chooser.time_s, LONGEST_S - LEAD_S - TAIL_S)
-    for advice, drive in _continue(one, chooser, order, longest_s):
-        weight = np.bincount(np.array(drive, np.int64), minlength=library.size).astype(np.float64)
-        if float(one.answer(weight, _RESERVES[0])) >= 1.0:
-            seconds = math.ceil(LEAD_S + float(chooser.durations[list(drive)].sum()) + TAIL_S)
-            return replace(question, because=advice.format(seconds=seconds))
-        best = weight if _is_better(one, weight, best) else best
-    if float(one.answer(library)) >= 1.0 and float(chooser.durations.sum()) <= LONGEST_S - LEAD_S - TAIL_S:
-        seconds = math.ceil(LEAD_S + float(chooser.durations.sum()) + TAIL_S)
-        return replace(question, because=f"give a larger --area, and up to --time {seconds}s")
-    because, needs_slope = _advise(one.question, longest_s)
-    # What a drive on level ground reaches of a slope says nothing.
-    at_best = "" if needs_slope else f"expected {one.format_reached(best)}"
-    return replace(question, because=because, reached=at_best, needs_limits=not needs_slope)
-
-
-def _continue(
-    one: Answerable, chooser: Chooser, order: Sequence[int], longest_s: float
-) -> Iterator[tuple[str, list[int]]]:
-    """The plan continued for one question without one of its limits after the other, and what that takes."""
-    for area, time_s, advice in (
-        (chooser.area, longest_s, "give --time {seconds}s"),
-        (_EVERYWHERE, chooser.time_s, "give a larger --area"),
-        (_EVERYWHERE, longest_s, "give a larger --area, and --time {seconds}s"),
-    ):
-        alone = Chooser([one], chooser.durations, chooser.shapes, area, time_s)
-        for reserve in _RESERVES:
-            drive = alone.extend(order, reserve)
-            spent = float(chooser.durations[drive].sum())
-            if time_s == chooser.time_s or spent > chooser.time_s:
-                yield advice, drive
-                break
-
-
-def _is_better(one: Answerable, weight: Floats, than: Floats) -> bool:
-    """Whether a drive reaches more than another."""
-    return bool(weight.any()) and one.rate(weight) > one.rate(than)
-
-
-_RESERVES = (1.4, 2.0, 2.8, 4.0)
-"""Factors on the goals of a suggested drive: gains of manoeuvres do not add up exactly. They are raised until
-the drive is longer than the given time, in which the question stays open."""
-
-
-_MOST_TIMES = 10
-"""Longest suggested drive, in multiples of the given time: beyond it, another drive is better."""
-
-
-_EVERYWHERE = Area(math.inf, math.inf)
-
-
-def _advise(question: Question, longest_s: float) -> tuple[str, bool]:
-    """Why no drive answers a question and what shows it, and whether that is a slope."""
-    effects = [find_effect(name)() for name in question.effects]
-    on_slope = any(Excitation.SLOPE in effect.needs for effect in effects)
-    tried = f"no drive of up to {LEAD_S + longest_s + TAIL_S:.0f} s that was tried decides it"
-    why = "no drive on level ground decides it" if on_slope else tried
-    return f"{why}; to observe it: {suggest_manoeuvre(*effects)}", on_slope

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -29,6 +29,8 @@ _TURN_RISE_S = 1.0
 # Added to half of the vehicle's length, towards every edge of the area.
 _MARGIN_M = 0.5
 _SHORTEST_S = 15.0
+_RAISED = 2.0
+"""Factor on the limits to see whether a harder drive would tell more."""
 LONGEST_S = 3600.0
 
 
@@ -62,6 +64,23 @@ class Limits:
         ]
         texts.append(f"{self.turn_rate:.3g} {'rad/s of steering' if steered else 'rad/s^2'}")
         return ", ".join([*texts, f"{self.lateral_mps2:.3g} m/s^2 sideways"])
+
+    def raise_within(self, vehicle: Vehicle) -> tuple["Limits", str]:
+        """Twice the speed, turn and sideways acceleration, within the vehicle's own; the options for them."""
+        raised = replace(
+            self,
+            speed_mps=min(_RAISED * self.speed_mps, vehicle.max_speed_mps or math.inf),
+            lateral_mps2=_RAISED * self.lateral_mps2,
+        )
+        if not is_steered(vehicle):
+            turn = min(_RAISED * self.turn, vehicle.max_yaw_rate_radps or math.inf)
+            raised = replace(raised, turn=turn, turn_rate=turn / _TURN_RISE_S)
+        pairs = {
+            "--max-speed": (raised.speed_mps, self.speed_mps),
+            "--max-yaw-rate": (raised.turn, self.turn),
+            "--max-lateral": (raised.lateral_mps2, self.lateral_mps2),
+        }
+        return raised, " ".join(f"{name} {new:.3g}" for name, (new, old) in pairs.items() if new > old)
 
 
 def is_steered(vehicle: Vehicle) -> bool:
@@ -140,33 +159,6 @@ def choose_limits(
     if vehicle.max_yaw_rate_radps is None and math.isnan(driven.yaw_rate_radps):
         turn = min(turn, fastest)
     return Limits(speed, turn, acceleration, turn / _TURN_RISE_S, lateral)
-
-
-_RAISED = 2.0
-"""Factor on a limit to see whether it keeps a question open."""
-
-
-def list_raised(vehicle: Vehicle, limits: Limits) -> Iterator[tuple[str, Limits, str]]:
-    """Limits raised one by one, within the vehicle's own: option with its value, all limits, the old one."""
-    sideways = _RAISED * limits.lateral_mps2
-    yield (
-        f"--max-lateral {sideways:.3g}",
-        replace(limits, lateral_mps2=sideways),
-        f"{limits.lateral_mps2:.3g} m/s^2 sideways",
-    )
-    faster = _RAISED * limits.acceleration_mps2
-    yield (
-        f"--max-acceleration {faster:.3g}",
-        replace(limits, acceleration_mps2=faster),
-        f"{limits.acceleration_mps2:.3g} m/s^2",
-    )
-    speed = min(_RAISED * limits.speed_mps, vehicle.max_speed_mps or math.inf)
-    if speed > limits.speed_mps:
-        yield f"--max-speed {speed:.3g}", replace(limits, speed_mps=speed), f"{limits.speed_mps:.3g} m/s"
-    turn = min(_RAISED * limits.turn, vehicle.max_yaw_rate_radps or math.inf)
-    if turn > limits.turn and not is_steered(vehicle):
-        raised = replace(limits, turn=turn, turn_rate=turn / _TURN_RISE_S)
-        yield f"--max-yaw-rate {turn:.3g}", raised, f"{limits.turn:.3g} rad/s"
 
 
 @dataclass(frozen=True)

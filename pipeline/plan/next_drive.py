@@ -163,10 +163,6 @@ def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain:
     return values
 
 
-UNDECIDED = "undecided"
-ALL = "all"
-
-
 @dataclass(frozen=True)
 class Studied:
     """Knowledge of one vehicle from its runs.
@@ -189,12 +185,10 @@ class Wish:
     Attributes:
         area: free area.
         time_s: longest duration [s].
-        wanted: `UNDECIDED`, `ALL`, or ids of effects; empty for undecided effects first and, in the remaining
-            time, all open questions.
+        wanted: ids of effects whose open questions are to be answered; empty for all.
         speed_mps, yaw_rate_radps, acceleration_mps2, lateral_mps2: limits; None for what the runs reached, or
             without runs for those of the vehicle.
         topic, type_name: topic and type of the played commands; None for those of the recorded command.
-        seed: seed of the random draws.
     """
 
     area: Area
@@ -205,17 +199,7 @@ class Wish:
     acceleration_mps2: float | None = None
     topic: str | None = None
     type_name: str | None = None
-    seed: int = 0
     lateral_mps2: float | None = None
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A plan with its questions and limits."""
-
-    plan: Plan
-    questions: tuple[Question, ...]
-    limits: Limits
 
 
 def plan_drive(
@@ -225,8 +209,8 @@ def plan_drive(
     recordings: Sequence[Recording] = (),
     command: Mapping[str, object] | None = None,
     notify: Callable[[str], object] = str,
-) -> Planned:
-    """Plan the drive that best answers the open questions.
+) -> Plan:
+    """Plan the drive that tells most of the open questions.
 
     Args:
         vehicle: vehicle to drive.
@@ -253,15 +237,8 @@ def plan_drive(
         acceleration_mps2=wish.acceleration_mps2,
         lateral_mps2=wish.lateral_mps2,
     )
-    is_ambiguous = diagnosis is not None and bool(diagnosis.undecided)
-    wanted = wish.wanted or (UNDECIDED if is_ambiguous else ALL,)
     notify("fitting the alternatives of open questions")
-    questions = tuple(ask(knowledge, wanted, limits, wish.time_s, diagnosis))
-    later: list[Question] = []
-    if is_ambiguous and not wish.wanted:
-        texts = {question.text for question in questions}
-        everything = ask(knowledge, [ALL], limits, wish.time_s, diagnosis)
-        later = [question for question in everything if question.text not in texts]
+    questions = ask(knowledge, wish.wanted, limits, wish.time_s, diagnosis)
     topic, type_name = choose_topic(vehicle, command or {}, recordings[0].path if recordings else "")
     request = Request(
         limits,
@@ -270,10 +247,9 @@ def plan_drive(
         tuple(recording.name for recording in recordings),
         wish.topic or topic,
         wish.type_name or type_name,
-        wish.seed,
         tuple(reached.list_used(limits)),
     )
-    return Planned(make_plan(knowledge, questions, request, later, notify), questions, limits)
+    return make_plan(knowledge, questions, request, notify)
 
 
 def study(
@@ -299,7 +275,7 @@ def study(
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
     from pipeline.models import list_effects  # noqa: PLC0415 - heavy
     from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
-    from pipeline.results import find_refusal  # noqa: PLC0415 - heavy
+    from pipeline.results import find_refusal, read_suggestion  # noqa: PLC0415 - heavy
 
     joint = diagnose_runs(recordings, vehicle, notify=notify)
     diagnosis = joint.runs[0]
@@ -308,9 +284,11 @@ def study(
         what = f"{why}, so that nothing can be planned from it"
         hint = "See the findings of `slip diagnose`, or plan for the vehicle alone with --vehicle."
         raise SlipError("nothing_judged", what, where=recordings[0].name, hint=hint)
-    # Terms outside the catalogue are specific to this run's terrain.
     catalogue = {effect.id for effect in list_effects()}
     named = [effect for effect in joint.proposal.model.effects if effect.id in catalogue]
+    if terrain is None:
+        # A suggested term was seen on the ground of these runs.
+        named += read_suggestion(diagnosis, vehicle)
     runs = [load_recording(recording, vehicle) for recording in recordings]
     if terrain is None or known is None:
         return Studied(diagnosis, learn(runs, vehicle, named))
@@ -347,11 +325,14 @@ def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str
 def ask(
     knowledge: Knowledge, wanted: Sequence[str], limits: Limits, time_s: float, diagnosis: RunDiagnosis | None
 ) -> list[Question]:
-    """List the questions of a plan.
+    """List what the logs so far leave open, or without logs all that acts on the vehicle.
+
+    Undecided alternatives, identified effects that others could replace, wide intervals, and effects that the
+    logs could not show.
 
     Args:
         knowledge: knowledge before the drive.
-        wanted: ``undecided``, ``all``, or ids of effects.
+        wanted: ids of effects; only what concerns one of them is asked. Empty for all.
         limits: limits of the commands, to which the usual sizes of effects are relative.
         time_s: length of the plan [s].
         diagnosis: diagnosis of the existing logs; None without logs.
@@ -362,22 +343,24 @@ def ask(
     from pipeline.plan.plan import find_largest  # noqa: PLC0415
     from pipeline.plan.questions import ask_apart, ask_numbers, ask_presence, ask_undecided, list_names  # noqa: PLC0415
 
-    questions: list[Question] = []
-    names = [name for name in wanted if name not in {UNDECIDED, ALL}]
-    numbers = knowledge.base.names & set(names)
-    if len(names) < len(wanted):
-        groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
-        questions += ask_undecided(knowledge, groups)
-        questions += ask_apart(knowledge, {name for group in groups for name in group})
-        numbers |= knowledge.base.names.difference(*groups)
-    questions += [one for one in ask_numbers(knowledge.base) if numbers & set(one.effects)]
-    if ALL in wanted:
-        names += [*diagnosis.unobservable_why] if diagnosis is not None else list_names(knowledge)
-    elif diagnosis is None and not names:
-        names = list(list_names(knowledge))
-    if names:
-        questions += ask_presence(knowledge, dict.fromkeys(names), find_largest(knowledge, limits, time_s))
-    return questions
+    groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
+    open_ones = {name for group in groups for name in group}
+    stated = {}
+    if diagnosis is not None and not diagnosis.has_suggestion:
+        # Beside a suggested term effects have other numbers.
+        stated = {
+            f"{effect.id}.{name}": value.half
+            for effect in diagnosis.effects
+            for name, value in effect.parameters.items()
+        }
+    numbers = ask_numbers(knowledge.base, stated)
+    questions: list[Question] = [*ask_undecided(knowledge, groups), *ask_apart(knowledge, open_ones)]
+    questions += [one for one in numbers if not open_ones & {*one.effects}]
+    hidden = list_names(knowledge) if diagnosis is None else tuple(diagnosis.unobservable_why)
+    if wanted:
+        questions = [one for one in questions if {*wanted} & {*one.effects}]
+    largest = find_largest(knowledge, limits, time_s)
+    return [*questions, *ask_presence(knowledge, dict.fromkeys(wanted or hidden), largest)]
 
 
 def read_command(manifest: Manifest) -> dict[str, object]:

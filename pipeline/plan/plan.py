@@ -1,5 +1,6 @@
-"""A plan: manoeuvres chosen for questions, and the expected gain of the whole."""
+"""A plan: manoeuvres chosen for questions, and what the whole is expected to tell of each."""
 
+import bisect
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -8,11 +9,12 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_share, pick
-from pipeline.models import Effect, Largest, list_effects
-from pipeline.plan.chooser import Chooser, Shape, explain_open
+from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_digits, pick
+from pipeline.models import Effect, Excitation, Largest, list_effects
+from pipeline.plan.chooser import Chooser, Shape
 from pipeline.plan.manoeuvres import (
     LEAD_S,
+    LONGEST_S,
     RATE_HZ,
     TAIL_S,
     Area,
@@ -23,18 +25,15 @@ from pipeline.plan.manoeuvres import (
     is_steered,
     join,
     list_manoeuvres,
-    list_raised,
     wait,
 )
 from pipeline.plan.questions import (
     DECIDED_T,
     Answerable,
-    Impossible,
     Judge,
     Question,
     Separation,
-    leave_open,
-    list_reasons,
+    list_concerned,
 )
 from pipeline.plan.rehearsal import Knowledge, Rehearsal, drive, start_state
 
@@ -44,13 +43,6 @@ _SIZES = (0.7, 1.0, 1.5, 2.0)
 _STEP_S = 1.0
 # Factors on the goals of single manoeuvres, raised until the whole plan reaches its goals.
 _RESERVES = (1.1, 1.4, 1.8)
-# Multiple of the goals; more driving adds nothing. Spare time is driven if it narrows an interval by a tenth.
-_AMPLE = 2.0
-_LEAST_GAIN = 0.1
-# Factor on what is reached from which a raised limit is named: less is not worth a harder drive.
-_HELPS = 1.25
-# A shorter rest is not reported.
-_LEAST_REST_S = 5.0
 
 SAFETY = (
     "This drives a real robot in open loop: no obstacle and no error stops it.",
@@ -61,25 +53,40 @@ SAFETY = (
 
 @dataclass(frozen=True)
 class ExpectedGain:
-    """Expected gain of a plan for one question.
+    """What a drive is expected to tell of one open question.
 
     Attributes:
         question: as text.
         effects: ids of the effects concerned.
-        kind: `separation` by a block t, or `interval` by the half-width of a 95 % interval.
-        decided_after_s: time since the start of the plan.
-        expected: block t, or half-width in the parameter's unit, at the end of the plan.
-        goal: promised value: at least this t, at most this half-width.
-        unit: of `expected`.
+        kind: `separation` by a block t, `presence` by one in favour of an effect that acts, or `interval` by
+            the half-width of a 95 % interval.
+        goal: the t, or the half-width, that answers the question.
+        now: t, or half-width in the parameter's unit, before the drive.
+        expected: t, or half-width, of the logs and the drive.
+        decided_after_s: time in the drive from which the question is answered; infinite if it is not.
+        drives: how many times the drive answers it together; 0 if that takes more than an hour of driving.
+        unit: of an interval.
+        value: of the parameter of an interval.
+        needs: what would tell it where this drive does not.
     """
 
     question: str
     effects: tuple[str, ...]
-    kind: Literal["separation", "interval"]
-    decided_after_s: float
-    expected: float
+    kind: Literal["separation", "presence", "interval"]
     goal: float
+    now: float
+    expected: float
+    decided_after_s: float
+    drives: int
     unit: str = "1"
+    value: float = math.nan
+    needs: str = ""
+
+    @property
+    def tells(self) -> bool:
+        """Whether the drive tells something: repeated it answers the question, or it narrows the interval."""
+        narrows = self.kind == "interval" and format_digits(self.expected) != format_digits(self.now)
+        return self.drives > 0 or (narrows and self.expected < self.now)
 
 
 @dataclass(frozen=True)
@@ -92,12 +99,10 @@ class Plan:
         manoeuvres: names and start times [s].
         commands: all of them, zero commands first.
         limits, area: limits that it satisfies.
-        promises, impossible: by question.
+        gains: what is expected by question; what is answered first stands first.
         topic, type_name: topic on which the commands are played, and its type.
         steered: whether a turn is a steering angle.
         home_m: largest distance of any model's end from the start.
-        spare_s: available time that is not driven [s].
-        spare_gain: fraction by which driving it would narrow the interval that gains most.
         wheels: commanded speeds of the left and the right wheels [rad/s], shape (n,) each; None if the drive
             has other inputs.
         ways: paths of the models, base first, positions x + iy [m] at 20 Hz, shape (models, n).
@@ -110,43 +115,29 @@ class Plan:
     commands: Commands = field(repr=False)
     limits: Limits
     area: Area
-    promises: tuple[ExpectedGain, ...]
-    impossible: tuple[Impossible, ...]
+    gains: tuple[ExpectedGain, ...]
     topic: str
     type_name: str
     steered: bool
     home_m: float
-    spare_s: float
-    spare_gain: float
     wheels: tuple[Floats, Floats] | None = field(repr=False)
     ways: Complex = field(repr=False)
     as_driven: tuple[str, ...] = ()
+
+    @property
+    def promises(self) -> tuple[ExpectedGain, ...]:
+        """Questions of which the drive tells something."""
+        return tuple(one for one in self.gains if one.tells)
+
+    @property
+    def left(self) -> tuple[ExpectedGain, ...]:
+        """Questions of which it tells nothing."""
+        return tuple(one for one in self.gains if not one.tells)
 
     def format_limits(self) -> str:
         """All limits, and which of them are what the runs reached."""
         text = self.limits.format(steered=self.steered)
         return f"{text} ({enumerate_texts(self.as_driven)} as the runs reached)" if self.as_driven else text
-
-    def format_rest(self) -> str:
-        """Use of the time after the last decision, or why it is not driven; empty without a drive."""
-        duration = self.commands.duration_s
-        last = max((one.decided_after_s for one in self.promises), default=duration)
-        intervals = any(one.kind == "interval" for one in self.promises)
-        sentences = []
-        if self.promises and duration - last >= _LEAST_REST_S:
-            after = f"no further decision after {last:.0f} s"
-            rest = f"; the rest of the {duration:.0f} s narrows intervals"
-            sentences.append(after + (rest if intervals else f" of {duration:.0f} s"))
-        if self.promises and self.spare_s >= _LEAST_REST_S:
-            gain = f"narrow no interval by more than {format_share(max(self.spare_gain, 0.01))}"
-            sentences.append(
-                f"{self.spare_s:.0f} more seconds would {gain if intervals else 'decide nothing else'}"
-            )
-        return "; ".join(sentences)
-
-    def list_impossible(self) -> list[str]:
-        """Open questions, one text per reason."""
-        return list_reasons(self.impossible)
 
     def to_json(self) -> dict[str, object]:
         """The documented keys of `slip plan --json`, and others."""
@@ -154,7 +145,7 @@ class Plan:
             "duration_s": self.commands.duration_s if self.manoeuvres else 0.0,
             "vehicle": self.vehicle,
             "runs": list(self.runs),
-            **pick(self, "home_m", "spare_s", "spare_gain"),
+            "home_m": self.home_m,
             "limits": asdict(self.limits) | {"yaw_rate_radps": finite_or_none(self.limits.yaw_rate_radps)},
             "limits_as_driven": list(self.as_driven),
             "area": asdict(self.area),
@@ -164,16 +155,17 @@ class Plan:
             "manoeuvres": [{"name": name, "start_s": start} for name, start in self.manoeuvres],
             "promises": [
                 {
-                    "question": one.question,
+                    **pick(one, "question", "kind", "goal", "drives", "unit"),
                     "effects": list(one.effects),
-                    "decided_after_s": one.decided_after_s,
-                    ("expected_t" if one.kind == "separation" else "interval_after_s"): one.expected,
+                    "decided_after_s": finite_or_none(one.decided_after_s),
+                    "now": finite_or_none(one.now),
+                    ("interval_after_s" if one.kind == "interval" else "expected_t"): one.expected,
                 }
                 for one in self.promises
             ],
             "impossible": [
-                {**pick(one, "question", "because", "reached"), "effects": list(one.effects)}
-                for one in self.impossible
+                {"question": one.question, "effects": list(one.effects), "because": one.needs}
+                for one in self.left
             ],
         }
 
@@ -187,7 +179,6 @@ class Request:
         time_s: longest duration, including the zero commands at the start.
         runs: names of the logs that the knowledge is based on.
         topic, type_name: topic on which the commands will be played, and its type.
-        seed: seed of the draws of parameters.
         as_driven: limits that are what the runs reached, in words.
     """
 
@@ -197,7 +188,6 @@ class Request:
     runs: tuple[str, ...] = ()
     topic: str = "/cmd_vel"
     type_name: str = "geometry_msgs/msg/Twist"
-    seed: int = 0
     as_driven: tuple[str, ...] = ()
 
 
@@ -205,61 +195,41 @@ def make_plan(
     knowledge: Knowledge,
     questions: Sequence[Question],
     request: Request,
-    later: Sequence[Question] = (),
     notify: Callable[[str], object] = str,
 ) -> Plan:
-    """Choose manoeuvres that answer questions, and compute the expected gain of the whole.
+    """Choose the manoeuvres that tell most of the questions, and compute what the whole tells of each.
 
     Args:
         knowledge: what is known before the drive.
         questions: to answer.
         request: time, area and limits.
-        later: questions for the time that remains after the others are answered.
         notify: called with what is being done.
 
     Raises:
         PlanError: ``no_room``, no manoeuvre fits into the area and the time.
     """
     largest = find_largest(knowledge, request.limits, request.time_s)
-    models = _list_models(knowledge, [*questions, *later], largest, request.seed)
+    models = _list_models(knowledge, questions, largest)
     library = list_manoeuvres(knowledge.vehicle, request.limits)
-    plural = "s" * (len(questions) != 1)
-    notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open question{plural}")
-    chooser = _make_chooser(knowledge, questions, request, library, models) if questions else None
-    best, order, gain = _rehearse(knowledge, questions, request.area, [], models), [], 0.0
-    for attempt, reserve in enumerate(_RESERVES if chooser is not None else (), start=1):
-        notify(f"choosing manoeuvres, attempt {attempt} of at most {len(_RESERVES)}")
-        chosen = chooser.choose(reserve) if chooser is not None else []
-        trial = _rehearse(knowledge, questions, request.area, [library[number] for number in chosen], models)
-        if (len(trial.promises), trial.answered) > (len(best.promises), best.answered):
-            best, order = trial, chosen[: len(trial.manoeuvres)]
-        if not best.impossible:
-            break
-    if chooser is not None and best.promises:
-        asked = [*questions, *(later if not best.impossible else ())]
-        if len(asked) > len(questions):
-            chooser = _make_chooser(knowledge, asked, request, library, models)
-        notify("filling the time that is left")
-        longer = chooser.extend(order, _AMPLE)
-        fuller = _rehearse(knowledge, asked, request.area, [library[number] for number in longer], models)
-        # Questions of second priority may stay open without a report.
-        texts = {one.text for one in questions}
-        missed = tuple(one for one in fuller.impossible if one.question in texts)
-        fuller, gain = replace(fuller, impossible=missed), _find_gain(best, fuller)
-        # Questions of second priority must not reduce the gain for the first.
-        is_covered = {one.question for one in best.promises} <= {one.question for one in fuller.promises}
-        if is_covered and (gain >= _LEAST_GAIN or len(fuller.promises) > len(best.promises)):
-            best, gain, order = fuller, 0.0, longer[: len(fuller.manoeuvres)]
-    if not best.promises:
-        # Without an expected answer nothing is driven.
-        undriven = tuple(replace(one, reached="") for one in best.impossible)
-        best, order = replace(best, manoeuvres=(), starts=(), impossible=undriven), []
-    if chooser is not None:
-        reasons = []
-        for number, one in enumerate(best.impossible, start=1):
-            notify(f"what keeps open questions open: {number} of {len(best.impossible)}")
-            reasons.append(explain_open(one, chooser, order))
-        best = replace(best, impossible=_name_limits(reasons, knowledge, questions, request, notify))
+    best = _rehearse(knowledge, questions, request.area, [], models)
+    if questions:
+        plural = "s" * (len(questions) != 1)
+        notify(f"rehearsing {len(library)} manoeuvres for {len(questions)} open question{plural}")
+        chooser = _make_chooser(knowledge, questions, request, models)
+        undriven = tuple(_expect_gain(one, np.zeros(len(library))) for one in chooser.questions)
+        best = replace(best, gains=undriven)
+        for attempt, reserve in enumerate(_RESERVES, start=1):
+            notify(f"choosing manoeuvres, attempt {attempt} of at most {len(_RESERVES)}")
+            chosen = [library[number] for number in chooser.choose(reserve)]
+            trial = _rehearse(knowledge, questions, request.area, chosen, models)
+            # What tells nothing is not driven.
+            if trial.answered <= best.answered or not any(one.tells for one in trial.gains):
+                break
+            best = trial
+            if all(math.isfinite(one.decided_after_s) for one in best.gains if one.tells):
+                break
+        notify("what other drives would tell")
+        best = replace(best, gains=_advise(best, chooser, knowledge, questions, request.limits))
     commands, ways = best.commands, best.ways
     return Plan(
         as_driven=request.as_driven,
@@ -269,61 +239,65 @@ def make_plan(
         commands=commands,
         limits=request.limits,
         area=request.area,
-        promises=best.promises,
-        impossible=best.impossible,
+        gains=best.gains,
         topic=request.topic,
         type_name=request.type_name,
         steered=is_steered(knowledge.vehicle),
         home_m=float(np.abs(ways[:, -1]).max()),
-        spare_s=round(request.time_s - commands.duration_s, 3),
-        spare_gain=round(gain, 4),
         wheels=_turn_wheels(commands, knowledge),
         ways=ways,
     )
 
 
-def _name_limits(
-    reasons: Sequence[Impossible],
-    knowledge: Knowledge,
-    questions: Sequence[Question],
-    request: Request,
-    notify: Callable[[str], object],
-) -> tuple[Impossible, ...]:
-    """Open questions; where no room and no time answers one, with the limit that holds it back most.
+@dataclass(frozen=True)
+class _Trial:
+    """Manoeuvres rehearsed as a whole; see `Plan`."""
 
-    All manoeuvres are rehearsed with one limit after the other raised.
+    manoeuvres: tuple[Manoeuvre, ...]
+    starts: tuple[float, ...]
+    commands: Commands
+    ways: Complex
+    gains: tuple[ExpectedGain, ...]
+    answered: float
+
+
+def _advise(
+    best: _Trial, chooser: Chooser, knowledge: Knowledge, questions: Sequence[Question], limits: Limits
+) -> tuple[ExpectedGain, ...]:
+    """What is expected, with what would tell the questions of which the drive tells nothing.
+
+    An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at twice the limits.
     """
-    still = {one.question for one in reasons if one.needs_limits}
-    asked = [one for one in questions if one.text in still]
-    if not asked:
-        return tuple(reasons)
+    left = {one.question for one in best.gains if not one.tells}
+    asked = [one for one in questions if one.text in left]
+    harder, options = limits.raise_within(knowledge.vehicle)
+    judged = {one.question.text: one for one in chooser.questions}
+    faster = {one.question.text: one for one in _judge_library(knowledge, asked, harder)[1]} if asked else {}
+    room = np.array([chooser.fits([number]) for number in range(chooser.durations.size)], dtype=np.float64)
+    gains = []
+    for one in best.gains:
+        needs = ""
+        if one.question in left:
+            if any(
+                Excitation.SLOPE in effect.needs for effect in list_concerned(judged[one.question].question)
+            ):
+                needs = "drive by hand on a slope, in several directions"
+            elif _answers(judged[one.question], room):
+                needs = f"plan for it alone, --for {one.effects[0]}"
+            elif _answers(judged[one.question], np.ones(room.size)):
+                needs = "give a larger --area"
+            elif _answers(faster[one.question], np.ones(faster[one.question].groups.seconds.size)):
+                needs = f"give {options}, where the robot and the ground allow it"
+            else:
+                needs = "no drive that was tried tells it: an hour, anywhere, at twice these limits"
+        gains.append(replace(one, needs=needs))
+    return tuple(gains)
 
-    def look(limits: Limits) -> list[tuple[float, bool]]:
-        """By question: how much all manoeuvres reach, larger for more, and whether that answers it."""
-        library = list_manoeuvres(knowledge.vehicle, limits)
-        edges = np.concatenate(([0.0], np.cumsum([one.commands.duration_s for one in library])))
-        commands = join([one.commands for one in library])
-        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, edges[:-1])
-        every = np.ones(edges.size - 1)
-        judged = Judge(rehearsal, knowledge, edges).judge(asked)
-        return [(one.rate(every), float(one.answer(every)) >= 1.0) for one in judged]
 
-    notify("what the limits of the commands keep open")
-    before = [reached for reached, _ in look(request.limits)]
-    best: dict[str, tuple[float, str]] = {}
-    for option, limits, text in list_raised(knowledge.vehicle, request.limits):
-        notify(f"whether the limit of {text} keeps questions open")
-        for one, own, (reached, is_answered) in zip(asked, before, look(limits), strict=True):
-            if reached > max(own * _HELPS, best.get(one.text, (0.0, ""))[0]):
-                allowed = "where the robot and the ground allow it"
-                advice = f"the limit of {text} keeps it open: give {option}, {allowed}"
-                if not is_answered:
-                    times = f"{reached / own:.1f} times as much" if own > 0.0 else "something"
-                    advice = f"the limit of {text} holds it back most: {option}, {allowed}, tells {times}"
-                best[one.text] = reached, advice
-    return tuple(
-        replace(one, because=best[one.question][1]) if one.question in best else one for one in reasons
-    )
+def _answers(one: Answerable, weight: Floats) -> bool:
+    """Whether an hour of these manoeuvres answers a question."""
+    seconds = float(weight @ one.groups.seconds)
+    return seconds > 0.0 and float(one.answer(weight * (LONGEST_S / seconds))) >= 1.0
 
 
 def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floats] | None:
@@ -336,19 +310,6 @@ def _turn_wheels(commands: Commands, knowledge: Knowledge) -> tuple[Floats, Floa
     ahead = 0.5 * (driven.left + driven.right) / senses.command_scale
     apart = 0.5 * (driven.right - driven.left) / senses.command_turn_scale
     return ahead - apart, ahead + apart
-
-
-@dataclass(frozen=True)
-class _Trial:
-    """Manoeuvres rehearsed as a whole; see `Plan`."""
-
-    manoeuvres: tuple[Manoeuvre, ...]
-    starts: tuple[float, ...]
-    commands: Commands
-    ways: Complex
-    promises: tuple[ExpectedGain, ...]
-    impossible: tuple[Impossible, ...]
-    answered: float
 
 
 def _rehearse(
@@ -371,21 +332,9 @@ def _rehearse(
         chosen.pop()
     starts = tuple(np.round(ends[:-1], 3).tolist())
     if not chosen:
-        nothing = tuple(Impossible(one.text, one.effects, "") for one in questions)
-        return _Trial((), starts, commands, ways, (), nothing, 0.0)
-    promised = _expect_answers(knowledge, questions, rehearsal, commands.duration_s)
-    return _Trial(tuple(chosen), starts, commands, ways, *promised)
-
-
-def _find_gain(best: _Trial, fuller: _Trial) -> float:
-    """Fraction by which a longer drive narrows the promised interval that gains most."""
-    after = {one.question: one.expected for one in fuller.promises}
-    gains = [
-        1.0 - after[one.question] / one.expected
-        for one in best.promises
-        if one.kind == "interval" and one.question in after
-    ]
-    return max([0.0, *gains])
+        return _Trial((), (), commands, ways, (), 0.0)
+    gains, answered = _expect_gains(knowledge, questions, rehearsal, commands.duration_s)
+    return _Trial(tuple(chosen), starts, commands, ways, gains, answered)
 
 
 def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest:
@@ -396,7 +345,7 @@ def find_largest(knowledge: Knowledge, limits: Limits, time_s: float) -> Largest
 
 
 def _list_models(
-    knowledge: Knowledge, questions: Sequence[Question], largest: Largest, seed: int
+    knowledge: Knowledge, questions: Sequence[Question], largest: Largest
 ) -> list[tuple[Effect, ...]]:
     """Candidate models: the base, those of the questions, draws, and the base with one more effect.
 
@@ -408,7 +357,7 @@ def _list_models(
         for model in (question.models if isinstance(question, Separation) else (question.model,))
     )
     supposed = list(dict.fromkeys([knowledge.base, *asked]))
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(0)
     drawn = [supposed[turn % len(supposed)].draw(generator) for turn in range(_MODELS)]
     unnoticed = dict.fromkeys(
         _enlarge(one, times)
@@ -443,15 +392,12 @@ def _make_chooser(
     knowledge: Knowledge,
     questions: Sequence[Question],
     request: Request,
-    library: Sequence[Manoeuvre],
     models: Sequence[tuple[Effect, ...]],
 ) -> Chooser:
     """Chooser for the library, with the information of each manoeuvre on each question, and its paths."""
-    durations = np.array([one.commands.duration_s for one in library])
+    rehearsal, answerable = _judge_library(knowledge, questions, request.limits)
+    durations = answerable[0].groups.seconds
     edges = np.concatenate(([0.0], np.cumsum(durations)))
-    rehearsal = Rehearsal(
-        join([one.commands for one in library]), knowledge.vehicle, knowledge.senses, edges[:-1]
-    )
     ways = [rehearsal.trace(effects) for effects in models]
     shapes = []
     for begin, end in zip((edges[:-1] * RATE_HZ).round(), (edges[1:] * RATE_HZ).round(), strict=True):
@@ -460,7 +406,6 @@ def _make_chooser(
         turned = np.array([heading[rows] for _, heading in ways])
         own = np.exp(-1j * turned[:, :1]) * (paths - paths[:, :1])
         shapes.append(Shape(own, turned[:, -1] - turned[:, 0]))
-    answerable = Judge(rehearsal, knowledge, edges).judge(questions)
     time_s = request.time_s - LEAD_S - TAIL_S
     chooser = Chooser(answerable, durations, shapes, request.area, time_s)
     if not any(chooser.fits([one]) for one in np.flatnonzero(durations <= time_s).tolist()):
@@ -473,41 +418,58 @@ def _make_chooser(
     return chooser
 
 
-def _expect_answers(
+def _judge_library(
+    knowledge: Knowledge, questions: Sequence[Question], limits: Limits
+) -> tuple[Rehearsal, list[Answerable]]:
+    """All manoeuvres within limits one after the other, and what each tells of every question."""
+    pieces = [one.commands for one in list_manoeuvres(knowledge.vehicle, limits)]
+    edges = np.concatenate(([0.0], np.cumsum([one.duration_s for one in pieces])))
+    rehearsal = Rehearsal(join(pieces), knowledge.vehicle, knowledge.senses, edges[:-1])
+    return rehearsal, Judge(rehearsal, knowledge, edges).judge(questions)
+
+
+def _expect_gains(
     knowledge: Knowledge, questions: Sequence[Question], rehearsal: Rehearsal, duration_s: float
-) -> tuple[tuple[ExpectedGain, ...], tuple[Impossible, ...], float]:
-    """Expected gain of the whole plan by question, open questions, and the sum of the reached fractions."""
+) -> tuple[tuple[ExpectedGain, ...], float]:
+    """What the whole plan tells by question, and the sum of the fractions of the goals that it reaches."""
     edges = np.arange(0.0, duration_s + _STEP_S, _STEP_S)
-    promises, impossible, answered = [], [], 0.0
-    for one in Judge(rehearsal, knowledge, edges, stretches=True).judge(questions):
-        full = np.ones(edges.size - 1)
-        reached, measured = float(one.answer(full)), float(one.measure(full))
-        answered += reached
-        if reached >= 1.0:
-            promises.append(_expect_answer(one, edges, measured))
-        else:
-            impossible.append(leave_open(one, full))
-    promises.sort(key=lambda answer: answer.decided_after_s)
-    return tuple(promises), tuple(impossible), answered
+    judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
+    whole = np.ones(edges.size - 1)
+    answered = sum(float(one.answer(whole)) for one in judged)
+    gains = []
+    for one in judged:
+        within = _find_first(one, [whole * (edges[1:] <= end) for end in edges])
+        drives = _find_first(one, [whole * count for count in range(int(LONGEST_S / edges[-1]) + 1)])
+        after = math.inf if within is None else float(edges[within])
+        gains.append(replace(_expect_gain(one, whole), decided_after_s=after, drives=drives or 0))
+    return tuple(sorted(gains, key=lambda one: (one.decided_after_s, one.drives))), answered
 
 
-def since_when(one: Answerable, edges: Floats) -> float:
-    """Time after which a question is answered [s], at an edge of the groups; infinite if it is not."""
-    low, high = 0, edges.size
-    while low < high:
-        middle = (low + high) // 2
-        if one.answer((np.arange(edges.size - 1) < middle).astype(np.float64)) >= 1.0:
-            high = middle
-        else:
-            low = middle + 1
-    return float(edges[high]) if high < edges.size else math.inf
-
-
-def _expect_answer(one: Answerable, edges: Floats, measured: float) -> ExpectedGain:
-    question, after = one.question, since_when(one, edges)
-    if isinstance(question, Separation):
-        return ExpectedGain(question.text, question.effects, "separation", after, measured, DECIDED_T)
-    number = question.model.free[question.number]
-    return ExpectedGain(
-        question.text, question.effects, "interval", after, measured, question.goal, number.unit
+def _expect_gain(one: Answerable, weight: Floats) -> ExpectedGain:
+    """What a drive tells of a question, without when; weights of its groups as of `Answerable.answer`."""
+    question = one.question
+    gain = ExpectedGain(
+        question=question.text,
+        effects=question.effects,
+        kind="separation",
+        goal=DECIDED_T,
+        now=question.now,
+        expected=float(one.measure(weight)),
+        decided_after_s=math.inf,
+        drives=0,
     )
+    if isinstance(question, Separation):
+        return replace(gain, kind="presence" if question.is_presence else "separation")
+    return replace(
+        gain,
+        kind="interval",
+        goal=question.goal,
+        unit=question.model.free[question.number].unit,
+        value=float(question.model.values[question.number]),
+    )
+
+
+def _find_first(one: Answerable, weights: Sequence[Floats]) -> int | None:
+    """Number of the first of weights that rise which answers a question; None if none does."""
+    number = bisect.bisect_left(weights, 1.0, key=lambda weight: float(one.answer(weight)))
+    return number if number < len(weights) else None

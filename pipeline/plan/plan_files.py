@@ -3,7 +3,7 @@
 import csv
 import math
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,19 +16,11 @@ from pipeline.core import Floats, TomlError, format_share, parse_toml, read_boun
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
 from pipeline.plan.manoeuvres import (
-    LEAD_S,
+    LONGEST_S,
     RATE_HZ,
-    Commands,
-    Limits,
     PlanError,
-    hold_within,
-    is_steered,
-    join,
-    wait,
 )
-from pipeline.plan.plan import SAFETY, ExpectedGain, Plan, since_when
-from pipeline.plan.questions import Impossible, Judge, Question
-from pipeline.plan.rehearsal import Knowledge, Rehearsal
+from pipeline.plan.plan import SAFETY, ExpectedGain, Plan
 from pipeline.results import RunDiagnosis
 from pipeline.run import DriveSeries, MotionRun, name_inputs
 from pipeline.sources import Vehicle
@@ -64,13 +56,12 @@ class Promised(msgspec.Struct, frozen=True):
     Attributes:
         vehicle: id of the vehicle.
         runs: names of the runs that the plan is based on.
-        promises, impossible: as of the plan.
+        promises: questions that the drive answers alone.
     """
 
     vehicle: str
     runs: list[str] = []
     promises: list[ExpectedGain] = []
-    impossible: list[Impossible] = []
 
 
 def write_plan(plan: Plan, folder: Path, page: str = "") -> tuple[Path, ...]:
@@ -179,7 +170,7 @@ def _format_toml(plan: Plan) -> str:
     turn = "max_steering_rad" if plan.steered else "max_yaw_rate_radps"
     faster = "max_steering_rate_radps" if plan.steered else "max_yaw_acceleration_radps2"
     lines = ["# What to drive next. `slip plan --check` compares the drive with these expectations."]
-    lines += [f"# {line}" for line in (*SAFETY, plan.format_rest()) if line]
+    lines += [f"# {line}" for line in SAFETY]
     lines += _format_table(
         {
             "vehicle": plan.vehicle,
@@ -204,9 +195,9 @@ def _format_toml(plan: Plan) -> str:
     lines += _format_table({**asdict(plan.area), "home_m": plan.home_m})
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
-    for key, items in (("promises", plan.promises), ("impossible", plan.impossible)):
-        for item in items:
-            lines += ["", f"[[{key}]]", *_format_table(msgspec.to_builtins(item))]
+    for one in plan.promises:
+        if math.isfinite(one.decided_after_s):
+            lines += ["", "[[promises]]", *_format_table(msgspec.to_builtins(one))]
     return "\n".join(lines) + "\n"
 
 
@@ -346,116 +337,3 @@ def _sample(series: DriveSeries, vehicle: Vehicle) -> Floats:
     times = np.arange(0.0, played[-1], 1.0 / RATE_HZ)
     held = np.maximum(np.searchsorted(played, times, side="right") - 1, 0)
     return np.column_stack((speed[held], turn[held]))
-
-
-Stages = list[tuple[float, float, float]]
-
-LONGEST_S = 300.0
-"""Longest duration of a protocol [s]: a question without an answer by then stays unanswered."""
-_STEP_S = 6.0
-_HALF = 0.5
-
-
-@dataclass(frozen=True)
-class Needed:
-    """Time until a protocol answers each question [s]; infinite if it does not, shape of questions."""
-
-    protocol: str
-    seconds: tuple[float, ...]
-
-
-def parse_protocols(text: str) -> tuple[str, ...]:
-    """Parse comma-separated names of `PROTOCOLS`.
-
-    Raises:
-        PlanError: ``unknown_protocol``.
-    """
-    names = tuple(text.split(","))
-    for name in names:
-        if name not in PROTOCOLS:
-            what = f"no protocol is called {name!r}"
-            hint = f"Give some of {', '.join(PROTOCOLS)}."
-            raise PlanError("unknown_protocol", what, where="--compare", hint=hint)
-    return names
-
-
-def compare_protocols(
-    knowledge: Knowledge, questions: Sequence[Question], limits: Limits, names: Sequence[str], seed: int = 0
-) -> list[Needed]:
-    """Time that each protocol needs; no protocol is limited to an area.
-
-    Args:
-        knowledge: what is known before the drive.
-        questions: to answer.
-        limits: limits of the vehicle, the same for all.
-        names: as of `parse_protocols`.
-        seed: seed of the random protocols.
-    """
-    needs = []
-    for name in names:
-        commands, begins = drive_protocol(name, knowledge.vehicle, limits, seed)
-        rehearsal = Rehearsal(commands, knowledge.vehicle, knowledge.senses, begins)
-        edges = np.arange(0.0, commands.duration_s + 1.0)
-        judged = Judge(rehearsal, knowledge, edges, stretches=True).judge(questions)
-        needs.append(Needed(name, tuple(since_when(one, edges) for one in judged)))
-    return needs
-
-
-def drive_protocol(name: str, vehicle: Vehicle, limits: Limits, seed: int) -> tuple[Commands, Floats]:
-    """Commands of a protocol up to `LONGEST_S`, and the times [s] at which its stages begin."""
-    stages = PROTOCOLS[name](limits, vehicle, np.random.default_rng(seed))
-    whole = join([wait(LEAD_S), hold_within(stages, vehicle, limits)])
-    count = round(LONGEST_S * RATE_HZ)
-    commands = Commands(whole.speed[:count], whole.turn[:count])
-    begins = LEAD_S + np.cumsum([0.0, *(seconds for _, _, seconds in stages[:-1])])
-    return commands, begins[begins < commands.duration_s]
-
-
-def _drive(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
-    """Random steps of six seconds from the whole command space (DRIVE; Baril et al., 2024)."""
-    count = round(LONGEST_S / _STEP_S)
-    speeds = generator.uniform(-limits.speed_mps, limits.speed_mps, count).tolist()
-    turns = generator.uniform(-limits.turn, limits.turn, count).tolist()
-    return [(speed, turn, _STEP_S) for speed, turn in zip(speeds, turns, strict=True)]
-
-
-def _human(limits: Limits, _: Vehicle, generator: np.random.Generator) -> Stages:
-    """A human driver: mostly ahead at half speed with small turns, a change every two to six seconds."""
-    stages: Stages = []
-    while sum(stage[2] for stage in stages) < LONGEST_S:
-        speed = float(np.clip(generator.normal(0.4, 0.3), -1.0, 1.0)) * limits.speed_mps
-        turn = float(np.clip(generator.normal(0.0, 0.4), -1.0, 1.0)) * limits.turn
-        stages.append((speed, turn, float(generator.uniform(2.0, 6.0))))
-    return stages
-
-
-def _straight_and_circle(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
-    """Ahead, back, one full circle to the left and one to the right, at half speed, repeated."""
-    speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
-    lap = [
-        (speed, 0.0, 10.0),
-        (-speed, 0.0, 10.0),
-        (speed, _HALF * limits.turn, turning_s),
-        (speed, -_HALF * limits.turn, turning_s),
-    ]
-    return lap * math.ceil(LONGEST_S / (20.0 + 2.0 * turning_s))
-
-
-def _eights(limits: Limits, vehicle: Vehicle, _: np.random.Generator) -> Stages:
-    """One full circle to the left and one to the right at half speed."""
-    speed, turning_s = _HALF * limits.speed_mps, _round_s(limits, vehicle)
-    lap = [(speed, _HALF * limits.turn, turning_s), (speed, -_HALF * limits.turn, turning_s)]
-    return lap * math.ceil(LONGEST_S / (2.0 * turning_s))
-
-
-def _round_s(limits: Limits, vehicle: Vehicle) -> float:
-    """Duration of a full circle at half of the largest turn [s]; twenty for a steering angle."""
-    return 20.0 if is_steered(vehicle) else 2.0 * math.pi / (_HALF * limits.turn)
-
-
-PROTOCOLS: Mapping[str, Callable[[Limits, Vehicle, np.random.Generator], Stages]] = {
-    "drive": _drive,
-    "human": _human,
-    "straight_and_circle": _straight_and_circle,
-    "eights": _eights,
-}

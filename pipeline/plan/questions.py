@@ -7,28 +7,28 @@ parameter follows from its information (A-optimality). Both are sums over window
 end at rest add up.
 """
 
-import re
+import functools
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.special import chdtri, stdtrit
 
-from pipeline.core import (
-    FEWEST_OF_SPREAD,
-    NORMAL_95,
-    STRETCH_S,
-    Flags,
-    Floats,
-    Ints,
-    enumerate_texts,
-    suffix_unit,
-)
+from pipeline.core import FEWEST_OF_SPREAD, NORMAL_95, STRETCH_S, Flags, Floats, Ints, suffix_unit
 from pipeline.estimation import Free, Problem
 from pipeline.estimation.driving_need import find_goal
-from pipeline.models import Excitation, Largest, explain_idle, find_effect, list_effects
+from pipeline.models import (
+    Effect,
+    Excitation,
+    FormulaEffect,
+    Largest,
+    explain_idle,
+    find_effect,
+    list_effects,
+)
 from pipeline.plan.manoeuvres import PlanError
 from pipeline.plan.rehearsal import CLOCK_S, Hypothesis, Knowledge, Rehearsal, start_state
+from pipeline.results import INTERVAL_SHARE
 
 # The diagnosis decides between two candidates at t = 1.6. A t has a standard deviation of one, and nearly
 # every drive of a plan must reach a decision.
@@ -46,12 +46,16 @@ class Separation:
         effects: ids of the effects concerned.
         models: the two models; each in turn is assumed true, and the other is refitted.
         both_ways: whether either may be true; otherwise only the first.
+        now: block t of the logs so far in favour of the first.
+        is_presence: whether the question is if an effect acts at all.
     """
 
     text: str
     effects: tuple[str, ...]
     models: tuple[Hypothesis, Hypothesis]
     both_ways: bool = True
+    now: float = 0.0
+    is_presence: bool = False
 
 
 @dataclass(frozen=True)
@@ -64,6 +68,7 @@ class Precision:
         model: model with this parameter.
         number: row of the parameter in the model's information.
         goal: half-width of its 95 % interval to reach.
+        now: half-width before the drive: that of the diagnosis, else by the model's information.
     """
 
     text: str
@@ -71,6 +76,7 @@ class Precision:
     model: Hypothesis
     number: int
     goal: float
+    now: float
 
 
 Question = Separation | Precision
@@ -151,10 +157,32 @@ class Answerable:
         """
         if isinstance(self.question, Separation):
             powers = [np.sum(weight * one.separate(weight), axis=-1) for one in self.evidence]
-            return np.asarray(0.5 * np.sqrt(np.min(powers, axis=0)))
-        # Student's t of the estimate from the jackknife's blocks.
+            return np.asarray(0.5 * np.sqrt(np.min(powers, axis=0) + self._known))
+        return np.asarray(self._inflation * self._find_width(weight, self.question.number))
+
+    def _find_width(self, weight: Floats, number: int) -> Floats:
+        """Half-width by the information on a parameter; Student's t of the estimate from the blocks."""
         wide = stdtrit(self._count_freedom(weight), 0.975)
-        return np.asarray(wide * self.evidence[0].spread(weight, self.question.number))
+        return np.asarray(wide * self.evidence[0].spread(weight, number))
+
+    @functools.cached_property
+    def _inflation(self) -> float:
+        """Half-width that the logs so far left, relative to that of their information.
+
+        At least one: a jackknife of few blocks may state a narrow interval by chance.
+        """
+        if isinstance(self.question, Separation) or not self.groups.before_s:
+            return 1.0
+        nothing = np.zeros(self.groups.seconds.size)
+        return max(self.question.now / float(self._find_width(nothing, self.question.number)), 1.0)
+
+    @functools.cached_property
+    def _known(self) -> float:
+        """What the logs so far say: squared difference of a separation, information on a parameter."""
+        if isinstance(self.question, Separation):
+            return (2.0 * self.question.now) ** 2
+        number = self.question.number
+        return float(self.evidence[0].prior[number, number]) if self.groups.before_s else 0.0
 
     def bound(self, weight: Floats) -> Floats:
         """Half-width that the jackknife does not exceed in 95 of 100 drives: with few blocks it scatters."""
@@ -175,36 +203,15 @@ class Answerable:
         shares = []
         for one in self.evidence:
             remaining = one.separate(weight)
-            decided = 0.25 * np.sum(weight * remaining, axis=-1) / (reserve * DECIDED_T) ** 2
+            power = np.sum(weight * remaining, axis=-1) + self._known
+            decided = 0.25 * power / (reserve * DECIDED_T) ** 2
             shares.append(np.minimum(decided, 1.0) * self._spread_out(weight, remaining, reserve))
         return np.asarray(np.min(shares, axis=0)) * self._cover(weight)
-
-    def rate(self, weight: Floats) -> float:
-        """What a drive reaches, larger for more: a block t, or the inverse of an interval."""
-        measured = float(self.measure(weight))
-        return measured if isinstance(self.question, Separation) else 1.0 / measured
-
-    def format_reached(self, weight: Floats) -> str:
-        """What a drive reaches, as text."""
-        measured = float(self.measure(weight))
-        if isinstance(self.question, Separation):
-            enough, what = measured >= DECIDED_T, f"t = {measured:.1f}, required {DECIDED_T:g}"
-        else:
-            bound = float(self.bound(weight))
-            enough = bound <= self.question.goal
-            what = f"±{measured:.2g}, up to {bound:.2g}"
-        if enough and (lacking := self.list_lacking(weight)):
-            return f"{what}, without {enumerate_texts(lacking)}"
-        return f"{what}, in fewer than {FEWEST_OF_SPREAD:g} stretches" if enough else what
-
-    def list_lacking(self, weight: Floats) -> list[str]:
-        """Excitation that the question's effects declare to need and the drive lacks, in words."""
-        return [need.value for need, parts in self._list_needed() if not ((weight @ parts) > 0.0).all()]
 
     def _list_needed(self) -> list[tuple[Excitation, Floats]]:
         if not self.groups.excited:
             return []
-        needs = {need for name in self.question.effects for need in find_effect(name).needs}
+        needs = {need for one in list_concerned(self.question) for need in one.needs}
         return [(need, parts.astype(float)) for need, parts in self.groups.excited.items() if need in needs]
 
     def _cover(self, weight: Floats) -> Floats:
@@ -220,11 +227,12 @@ class Answerable:
         first, again = np.minimum(weight, 1.0) * shown, np.maximum(weight - 1.0, 0.0)
         starts = np.flatnonzero(np.diff(self.groups.stretch, prepend=-1))
         sums = np.add.reduceat(first, starts, axis=-1)
+        earlier, known = self.groups.before_s / STRETCH_S, self._known
         power = np.sum(sums**2, axis=-1) + np.sum(again * shown**2, axis=-1)
-        whole = np.sum(weight * shown, axis=-1) ** 2
-        stretches = np.minimum(
-            whole / np.where(power > 0.0, power, np.inf), weight @ self.groups.seconds / STRETCH_S
-        )
+        power += known**2 / earlier if earlier else 0.0
+        whole = (np.sum(weight * shown, axis=-1) + known) ** 2
+        driven = weight @ self.groups.seconds / STRETCH_S + (earlier if known else 0.0)
+        stretches = np.minimum(whole / np.where(power > 0.0, power, np.inf), driven)
         return np.asarray(np.minimum(stretches / (reserve * FEWEST_OF_SPREAD), 1.0))
 
     def _count_freedom(self, weight: Floats) -> Floats:
@@ -236,12 +244,19 @@ class Answerable:
         if isinstance(self.question, Precision):
             number = self.question.number
             shown = np.diagonal(self.evidence[0].normal, axis1=1, axis2=2)[:, number]
-            known = float(self.evidence[0].prior[number, number]) if self.groups.before_s else 0.0
+            known = self._known
         earlier = self.groups.before_s / _BLOCK_S
         power = weight @ shown**2 + (known**2 / earlier if earlier else 0.0)
         blocks = (weight @ shown + known) ** 2 / np.where(power > 0.0, power, np.inf)
         driven = weight @ self.groups.seconds / _BLOCK_S + earlier
         return np.asarray(np.maximum(np.minimum(blocks, driven) - 1.0, 1.0))
+
+
+def list_concerned(question: Question) -> list[Effect]:
+    """The effects of a question, as its models have them."""
+    models = question.models if isinstance(question, Separation) else (question.model,)
+    known = {one.id: one for model in models for one in model.effects}
+    return [known[name] for name in question.effects]
 
 
 class Judge:
@@ -370,20 +385,30 @@ def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separa
         rival, apart = knowledge.rival([*rest, other])
         if apart < DECIDED_T:
             text = f"{' and '.join(dropped)} or {name}"
-            questions.append(Separation(text, (*dropped, name), (base, rival), both_ways=False))
+            questions.append(Separation(text, (*dropped, name), (base, rival), both_ways=False, now=apart))
     return questions
 
 
-def ask_numbers(model: Hypothesis) -> list[Precision]:
-    """Precision of each parameter of a model that is not yet known to five percent."""
+def ask_numbers(model: Hypothesis, stated: Mapping[str, float]) -> list[Precision]:
+    """Precision of each parameter of a model that is not yet known to five percent.
+
+    Args:
+        model: the model.
+        stated: half-widths of 95 % intervals by label ``effect.name``, where the diagnosis states one.
+    """
     spread = np.sqrt(np.diag(np.linalg.inv(model.information))) if model.free else np.zeros(0)
+    formulas = {effect.id for effect in model.effects if isinstance(effect, FormulaEffect)}
     questions = []
     for index, number in enumerate(model.free):
-        goal = find_goal(number.effect, number.name, float(model.values[index]))
-        if NORMAL_95 * float(spread[index]) > goal:
-            unit = suffix_unit(number.unit)
-            text = f"{number.label} within {goal:.2g}{unit}"
-            questions.append(Precision(text, (number.effect,), model, index, goal))
+        value = float(model.values[index])
+        # A formula has no usual size.
+        goal = INTERVAL_SHARE * abs(value)
+        if number.effect not in formulas:
+            goal = find_goal(number.effect, number.name, value)
+        now = stated.get(number.label, NORMAL_95 * float(spread[index]))
+        if now > goal:
+            text = f"{number.label} within {goal:.2g}{suffix_unit(number.unit)}"
+            questions.append(Precision(text, (number.effect,), model, index, goal, now))
     return questions
 
 
@@ -408,8 +433,9 @@ def ask_presence(knowledge: Knowledge, names: Iterable[str], largest: Largest) -
             hint = "Choose another effect, or record logs that identify that one first."
             raise PlanError("acts_beside", what, where=knowledge.vehicle.id, hint=hint)
         with_it = knowledge.base.extend(effect().make_usual(largest))
+        models = with_it, knowledge.base
         questions.append(
-            Separation(f"whether {name} acts", (name,), (with_it, knowledge.base), both_ways=False)
+            Separation(f"whether {name} acts", (name,), models, both_ways=False, is_presence=True)
         )
     return questions
 
@@ -418,54 +444,3 @@ def list_names(knowledge: Knowledge) -> tuple[str, ...]:
     """Every effect of the catalogue that exists on the vehicle, and acts in its model."""
     here = [effect for effect in list_effects() if knowledge.vehicle.kind in effect.kinds]
     return tuple(effect.id for effect in here if effect.acts_in(knowledge.base.names))
-
-
-# Open questions of a plan: what keeps a drive from answering them, found by driving without it.
-
-
-@dataclass(frozen=True)
-class Impossible:
-    """A question that the plan leaves open.
-
-    Attributes:
-        question: as text.
-        effects: ids of the effects concerned.
-        because: the reason.
-        reached: block t or interval that the plan reaches; where no drive decides it, that of the best one.
-        needs_limits: whether no drive within the limits of the commands that was tried decides it.
-    """
-
-    question: str
-    effects: tuple[str, ...]
-    because: str
-    reached: str = ""
-    needs_limits: bool = False
-
-
-def list_reasons(questions: Sequence[Impossible]) -> list[str]:
-    """Open questions, one text per reason."""
-    asked: dict[frozenset[str], tuple[str, list[str]]] = {}
-    for one in questions:
-        _, same = asked.setdefault(frozenset(one.because.split("; ")), (one.because, []))
-        same.append(f"{one.question} ({one.reached})" if one.reached else one.question)
-    return [f"{'; '.join(_join_presence(same))}: {reason}" for reason, same in asked.values()]
-
-
-def _join_presence(texts: Sequence[str]) -> list[str]:
-    """Questions with `whether a acts` and `whether b acts` as one: `whether a and b act`."""
-    named = [match[1] for text in texts if (match := re.fullmatch(r"whether (\S+) acts", text))]
-    if len(named) <= 1:
-        return list(texts)
-    rest = [text for text in texts if not re.fullmatch(r"whether \S+ acts", text)]
-    return [*rest, f"whether {enumerate_texts(named)} act"]
-
-
-def leave_open(one: Answerable, weight: Floats) -> Impossible:
-    """An open question with what a drive reaches; `explain_open` gives the reason.
-
-    Args:
-        one: the question.
-        weight: how often each of its groups is driven, shape (k,); all zero: nothing is driven.
-    """
-    reached = one.format_reached(weight) if weight.any() else ""
-    return Impossible(one.question.text, one.question.effects, "", reached)

@@ -10,7 +10,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import PathError, read_bounded, read_bounded_text, resolve_inside
-from pipeline.plan import SAFETY, Plan
+from pipeline.plan import SAFETY, Plan, list_gains
 from pipeline.report import PLANS, Picture, lead_to, lead_up, list_ways, render_template, set_squares, theme
 from pipeline.report.page import render_figures
 from pipeline.report.theme import (
@@ -46,7 +46,8 @@ def preview_plan(plan: Plan) -> dict[str, object]:
         "drives": bool(plan.manoeuvres),
         "area": f"{plan.area.length_m:g} x {plan.area.width_m:g} m",
         "duration_s": plan.commands.duration_s,
-        **_plan_as_view(plan),
+        "play": _format_play(plan),
+        "gains": list_gains(plan),
     }
 
 
@@ -81,23 +82,14 @@ def render_plan(plan: Plan, catalogue: str = "") -> str:
             f"at most {set_squares(plan.limits.format(steered=plan.steered))}",
         ],
         safety=SAFETY,
-        **_plan_as_view(plan),
+        play=_format_play(plan),
+        rows=list_gains(plan),
         manoeuvres=[f"{start:.0f} s: {name}" for name, start in plan.manoeuvres],
     )
 
 
-def _plan_as_view(plan: Plan) -> dict[str, object]:
-    """Playback, expected results, and open questions of a plan."""
-    return {
-        "play": f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})",
-        "promises": [
-            f"after {one.decided_after_s:.0f} s: {one.question} "
-            + (f"(t = {one.expected:.1f})" if one.kind == "separation" else f"(±{one.expected:.2g})")
-            for one in plan.promises
-        ],
-        "rest": plan.format_rest(),
-        "impossible": plan.list_impossible(),
-    }
+def _format_play(plan: Plan) -> str:
+    return f"ros2 bag play plan.mcap ({plan.topic}, {plan.type_name})"
 
 
 def _draw_ways(plan: Plan, most: int = _MOST_WAYS, every: int = _EVERY) -> Picture:
@@ -188,7 +180,7 @@ class _Preview(msgspec.Struct):
     drives: bool
     area: str
     duration_s: float
-    promises: list[str]
+    gains: list[tuple[str, str, str]]
 
 
 def read_preview(results: Path, run: str, key: str) -> dict[str, object]:

@@ -39,18 +39,20 @@ const fill = async (planned, run) => {
   const link = (file) => `/plan?${new URLSearchParams({ run, file })}`;
   const plan = await get(link("plan.json"));
   const list = (texts) => h("ul", {}, texts.map((text) => h("li", {}, text)));
-  const left = plan.impossible.length > 0 && h("details", { class: "left-open" }, h("summary", {}, "Not answered"), list(plan.impossible));
+  const gains = h("table", {},
+    h("thead", {}, h("tr", {}, ["open", "so far", "with this drive"].map((text) => h("th", { scope: "col" }, text)))),
+    h("tbody", {}, plan.gains.map(([what, now, after]) => h("tr", {}, h("th", { scope: "row" }, what), h("td", {}, now), h("td", {}, after)))));
   if (!plan.drives) {
-    node.replaceChildren(...[h("p", { class: "quiet" }, plan.impossible.length ? "No drive on level ground answers the open questions." : "No open questions."), left].filter(Boolean));
+    node.replaceChildren(h("p", { class: "quiet" }, plan.gains.length ? "No drive there tells anything of these." : "No open questions."), plan.gains.length ? gains : "");
     return;
   }
   const place = h("div", { class: "plot", role: "img", "aria-label": plan.words, data: { figure: "ways" } });
   node.replaceChildren(...[
     place,
     h("p", { class: "quiet" }, `${Math.round(plan.duration_s)} s on ${plan.area}: `, h("a", { href: link("plan.html"), target: "_blank", rel: "noopener" }, "the whole plan")),
-    list(plan.promises), plan.rest && h("p", { class: "quiet" }, plan.rest), left,
+    gains,
     h("p", {}, h("a", { class: "download button", href: link("plan.mcap") }, "Download plan.mcap"), " ", h("code", {}, plan.play)),
-    h("div", { class: "doubts" }, list(plan.safety))].filter(Boolean));
+    h("div", { class: "doubts" }, list(plan.safety))]);
   const plots = slipPlots(plan, { strict: true });
   planned.paint = () => plots.draw(place);
   await planned.paint();

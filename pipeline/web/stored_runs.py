@@ -152,8 +152,8 @@ def write_run_plan(store: Store, manifest: Manifest, area: str, notify: Callable
     vehicle, recording = read_recording(manifest)
     wish = Wish(parse_area(area, vehicle), parse_time(_TIME))
     studied = study([recording], vehicle, notify=notify)
-    planned = plan_drive(vehicle, studied, wish, [recording], read_command(manifest), notify)
-    leave_plan(store, manifest, planned.plan)
+    made = plan_drive(vehicle, studied, wish, [recording], read_command(manifest), notify)
+    leave_plan(store, manifest, made)
 
 
 def find_plan(results: Path, manifest: Manifest) -> str | None:

@@ -71,6 +71,20 @@ def test_a_report_asked_for_later_reuses_every_table(log: Path, out: Path) -> No
     assert analyze(log, out).manifest.folder == later.manifest.folder, "a report once made is not given up"
 
 
+def test_a_report_of_another_version_is_drawn_again_from_the_same_tables(
+    log: Path, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = analyze(log, out, report=True)
+    monkeypatch.setattr("pipeline.analysis.analyze.read_version", lambda: "99.0")
+    monkeypatch.setattr("pipeline.analysis.summary.read_version", lambda: "99.0")
+    second = analyze(log, out, report=True)
+
+    assert second.computed == ()
+    assert second.manifest.folder != first.manifest.folder
+    assert second.summary["provenance"]["version"] == "99.0"
+    assert analyze(log, out, report=True).manifest.folder == second.manifest.folder
+
+
 @pytest.mark.parametrize(
     ("change", "computed"),
     [

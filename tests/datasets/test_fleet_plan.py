@@ -13,7 +13,7 @@ from pipeline.cli import main
 from pipeline.estimation import load_recording
 from pipeline.models import find_effect
 from pipeline.plan import choose_limits
-from pipeline.plan.next_drive import UNDECIDED, ask, expect
+from pipeline.plan.next_drive import ask, expect
 from pipeline.plan.rehearsal import learn
 from pipeline.simulate import Program, make_scenario
 from pipeline.sources import Vehicle, find_preset, list_configuration_files
@@ -56,7 +56,7 @@ def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
         assert [one.effects for one in questions] == [("effective_track",)]
     assert max(spread["ice"], spread["gravel"]) < spread["mud"]
     # Whether an effect acts that the fleet names is no question any more.
-    questions = ask(knowledge, [UNDECIDED], choose_limits(vehicle), 60.0, None)
+    questions = ask(knowledge, [], choose_limits(vehicle), 60.0, None)
     assert "whether effective_track acts" not in {one.text for one in questions}
     assert expect(vehicle, None, results).knowledge.base.names == set()
 
@@ -64,7 +64,7 @@ def test_what_is_known_is_the_forecast_with_its_spread(results: Path) -> None:
 def test_a_plan_for_a_terrain_needs_no_run(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = ["plan", "--vehicle", "warthog", "--terrain", "gravel", "--known", str(results), "--json"]
+    told = ["plan", "--vehicle", "warthog", "--terrain", "gravel", "--results", str(results), "--json"]
     with pytest.raises(SystemExit, match="0"):
         main([*told, "--for", "effective_track", "--out", str(tmp_path / "plan")])
     made = json.loads(capsys.readouterr().out)

@@ -95,6 +95,12 @@ def test_runs_say_what_change_they_would_tell() -> None:
     assert sum(told) >= 15
 
 
+def test_runs_that_agree_exactly_tell_no_change_below_their_own_errors() -> None:
+    estimates, days = make_season(np.random.default_rng(7), ["asphalt"] * 8)
+    equal = follow_one((estimates.with_columns(value=pl.lit(1.5)), days))
+    assert equal.least > estimates["standard_error"].min()
+
+
 def test_a_run_that_does_not_determine_a_number_sets_no_scale() -> None:
     estimates, days = make_season(np.random.default_rng(8), ["asphalt"] * 12)
     is_last = pl.col("run") == "r11"

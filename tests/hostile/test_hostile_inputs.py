@@ -94,7 +94,6 @@ WORDS: list[tuple[str, str]] = [
     ("plan --vehicle husky_a200 --time soon", "--time"),
     ("plan --vehicle husky_a200 --time 2h", "--time"),
     *((f"plan --vehicle husky_a200 --area {area}", "--area") for area in ("20", "0x5m", "ax3", "20x10km")),
-    ("plan --vehicle husky_a200 --compare drive,dance", "straight_and_circle"),
     ("simulate husky_til --out x.mcap", "husky_tile"),
     ("simulate ideal_husky --effect effective_trak=1 --out x.mcap", "effective_track"),
     ("simulate ideal_husky --effect effective_track=kk:1.8 --out x.mcap", "kk"),

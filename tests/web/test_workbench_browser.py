@@ -275,7 +275,7 @@ def test_a_drive_is_planned_on_request_and_its_files_are_there(
         chrome.run("document.querySelector('.plan input').value = '20x10m'")
         chrome.click(".plan .ask button")
         chrome.wait("document.querySelector('.planned .plot.drawn')", patience_s=60.0)
-        assert "icr_offset" in str(chrome.run("document.querySelector('.planned ul').textContent"))
+        assert "centre of rotation" in str(chrome.run("document.querySelector('.planned table').textContent"))
         run = workbench.get("/api/runs")["runs"][0]["run"]  # type: ignore[index]
         for name, start in (("plan.mcap", b"\x89MCAP"), ("plan.html", b"<!doctype html>")):
             status, _, body = workbench.request("GET", f"/plan?run={run}&file={name}")
