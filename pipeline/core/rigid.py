@@ -294,8 +294,8 @@ def _measure_rest(along: Floats, shape: Floats, ways: Floats) -> Floats:
     return rest
 
 
-def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Floats]:
-    """Body-frame increments between consecutive poses, as constant twists over each interval.
+def measure_increments(position: Floats, quaternion: Floats, places: int = 1) -> tuple[Floats, Floats]:
+    """Body-frame increments between poses, as constant twists over each interval.
 
     The logarithm on SE(3): moving with the returned twist for one interval leads exactly from one pose to
     the next, so a circle gives no false lateral motion (start-frame differencing would add dt v w / 2).
@@ -303,13 +303,14 @@ def measure_increments(position: Floats, quaternion: Floats) -> tuple[Floats, Fl
     Args:
         position: shape (n, 3) [m].
         quaternion: shape (n, 4), unit length.
+        places: from each pose to the other one: one if they follow each other.
 
     Returns:
-        Translations [m] and rotations [rad] in the body frame, each of shape (n - 1, 3).
+        Translations [m] and rotations [rad] in the body frame, each of shape (n - places, 3).
     """
-    inverse = invert_quaternions(quaternion[:-1])
-    turn = rotation_vectors(multiply_quaternions(inverse, quaternion[1:]))
-    moved = rotate(inverse, np.diff(position, axis=0))
+    inverse = invert_quaternions(quaternion[:-places])
+    turn = rotation_vectors(multiply_quaternions(inverse, quaternion[places:]))
+    moved = rotate(inverse, position[places:] - position[:-places])
     angle = np.linalg.norm(turn, axis=1, keepdims=True)
     # Inverse left Jacobian of SO(3) (Sola et al., arXiv:1812.01537, eq. 146), with its series near zero.
     safe = np.maximum(angle, 1e-4)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Literal
 
 import msgspec
 import numpy as np
@@ -161,20 +160,7 @@ def examine(
     except SlipError:
         # The stage `extract` raises it again.
         return Recording(sources, configuration)
-    made = examination.run()
-    unit = made.configuration.imu.unit
-    if unit is None or unit == configuration.imu.unit:
-        return made
-    # Headings of positions alone are made of the gyro.
-    unit_finding = next(one for one in made.findings if one.where == "imu")
-    again = examine(data, sources, made_of_imu(configuration, unit), vehicle, is_known=is_known, where=where)
-    return replace(again, findings=(unit_finding, *again.findings))
-
-
-def made_of_imu(configuration: Configuration, unit: Literal["rad/s", "deg/s"]) -> Configuration:
-    """A configuration with the unit of the gyro."""
-    imu = msgspec.structs.replace(configuration.imu, unit=unit)
-    return msgspec.structs.replace(configuration, imu=imu)
+    return examination.run()
 
 
 @dataclass
@@ -266,6 +252,10 @@ class Examination:
             motion = None
         if motion is None:
             return Recording(self.sources, self.configuration)
+        if gyro is not None and self._is_in_degrees(gyro, motion):
+            # Headings of positions alone are made of the gyro.
+            self.extraction.take_degrees()
+            motion, gyro = measure_motion(self.extraction.poses()) or motion, self._read_gyro()
         drives = self._read_drives(motion)
         gyros = [] if gyro is None else [gyro]
         readings = [*(drive.reading for drive in drives), *gyros]
@@ -280,7 +270,6 @@ class Examination:
         self._settle_stamps(command)
         self._report_turn(command)
         motion = self._settle_lengths(motion, readings, command, wheels)
-        self._report_gyro(gyro)
         is_judged = self._settle_wheels(command, wheels, motion)
         kind = self._find_kind(wheels, motion)
         if wheels is not None and not kind and self._leave_out_steered(wheels):
@@ -656,16 +645,17 @@ class Examination:
                     self.sources = replace(self.sources, **{role: left})  # type: ignore[arg-type]
         return signed
 
-    def _report_gyro(self, gyro: Reading | None) -> None:
-        """A gyro in degrees per second."""
-        made = None if gyro is None else gyro.explained
-        is_given = self.configuration.imu.unit is not None
-        if gyro is None or made is None or not made.sign("turned") or is_given:
-            return
+    def _is_in_degrees(self, gyro: Reading, motion: Motion) -> bool:
+        """Whether a gyro turns out to be in degrees per second, and is corrected."""
+        made = gyro.explain(motion)
+        if made is None or not made.sign("turned") or self.configuration.imu.unit is not None:
+            return False
         apart = np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])
-        if abs(apart) < 4.0 * _NEAR:
-            what = f"the gyro of {gyro.name} is in degrees per second"
-            self._correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
+        if abs(apart) > 4.0 * _NEAR:
+            return False
+        what = f"the gyro of {gyro.name} is in degrees per second"
+        self._correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
+        return True
 
     # Sides and signs.
 

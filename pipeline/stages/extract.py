@@ -137,12 +137,8 @@ class Extraction:
                 recorded.setdefault(columns.topic, []).append(columns)
         joined = (self._join_channels(topic, channels) for topic, channels in recorded.items())
         self.columns = {columns.topic: columns for columns in joined if columns is not None}
-        if sources.imu is not None and configuration.imu.unit == "deg/s":
-            self.columns |= {
-                topic: reading.turn_to_radians(one)
-                for topic, one in self.columns.items()
-                if topic == sources.imu.topic
-            }
+        if configuration.imu.unit == "deg/s":
+            self.take_degrees()
         used = {one.topic for one in reading.list_wanted(sources, data.index.types)} if data.unfit else ()
         self.findings += [self._report_left_out(one) for one in data.unfit if one.topic in used]
         pose = sources.pose
@@ -155,6 +151,12 @@ class Extraction:
         self.paused_s = 0.0
         self.clocks = self._align()
         self.start_ns = self._find_start()
+
+    def take_degrees(self) -> None:
+        """Take the rates of the gyro for degrees a second, as `[imu] unit` does."""
+        topic = "" if self.sources.imu is None else self.sources.imu.topic
+        if topic in self.columns:
+            self.columns[topic] = reading.turn_to_radians(self.columns[topic])
 
     def run(self) -> Extracted:
         """All tables."""

@@ -136,6 +136,10 @@ class Track:
     findings: tuple[Finding, ...] = field(default=())
 
 
+TOLD_POSES: Final = frozenset({"bad_quaternion", "bad_pose", "poses_apart"})
+"""Ids of the findings that count the poses that go to quarantine."""
+
+
 def normalize_quaternions(quaternion: Floats, topic: str) -> tuple[Floats, Flags, list[Finding]]:
     """Scale quaternions (n, 4) to unit length; flag unusable ones and report large deviations from one."""
     # A number whose square overflows is infinite, and is not an orientation.
@@ -247,31 +251,26 @@ def _find_apart(t: Floats, p: Floats, q: Floats, breaks: Flags, settings: Veloci
     apart, last = np.zeros(t.size, dtype=bool), t.size - 1
     if t.size < FEWEST_MESSAGES or rigid.find_held(p, q).mean() > _REPEATED:
         return apart
-    stretch = np.cumsum(breaks)
+    stretch, spans = np.cumsum(breaks), np.diff(t)
     least = np.array([settings.jump_m, settings.jump_rad])
 
-    def measure(first: Ints, second: Ints) -> Floats:
-        """Distance and angle from one pose to another, shape (n, 2) [m, rad]."""
-        moved = np.linalg.norm(p[second] - p[first], axis=1)
-        dot = np.abs(np.sum(q[first] * q[second], axis=1))
-        return np.column_stack((moved, 2.0 * np.arccos(np.minimum(dot, 1.0))))
+    def measure(places: int) -> Floats:
+        """Distance and angle from each pose to one so many places later, shape (n - places, 2) [m, rad]."""
+        increments = rigid.measure_increments(p, q, places)
+        return np.column_stack([np.linalg.norm(one, axis=1) for one in increments])
 
-    every = np.arange(last)
-    spans = np.diff(t)
-    rates = measure(every, every + 1)[spans > 0.0] / spans[spans > 0.0, None]
-    usual = np.quantile(rates, 0.9, axis=0)
+    moves = spans > 0.0
+    usual = np.quantile(measure(1)[moves] / spans[moves, None], 0.9, axis=0)
 
-    def is_far(first: Ints, second: Ints) -> Flags:
-        elapsed = t[second] - t[first]
-        limits = least + _FAST * usual * elapsed[:, None]
-        return np.asarray((measure(first, second) > limits).any(axis=1) | (stretch[first] != stretch[second]))
+    def is_far(places: int) -> Flags:
+        limits = least + _FAST * usual * (t[places:] - t[:-places])[:, None]
+        return np.asarray((measure(places) > limits).any(axis=1) | (stretch[places:] != stretch[:-places]))
 
+    steps = is_far(1)
     for count in range(1, _APART + 1):
-        before = np.arange(last - count)
-        after = before + count + 1
-        away = is_far(before, before + 1) & is_far(after - 1, after) & ~is_far(before, after)
+        away = steps[: last - count] & steps[count:] & ~is_far(count + 1)
         for number in range(count):
-            apart[before[away] + 1 + number] = True
+            apart[np.flatnonzero(away) + 1 + number] = True
     return apart
 
 

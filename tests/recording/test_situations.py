@@ -114,9 +114,21 @@ def stamped_in_the_future(path: Path, drive: Drive) -> Path:
     return write_log(path, drive, command_ahead_s=0.5)
 
 
+def with_a_gyro_in_degrees(path: Path, drive: Drive) -> Path:
+    """A gyro in degrees a second beside poses."""
+    return write_log(path, drive, gyro=np.degrees(drive.rate))
+
+
+def with_positions_and_a_gyro_in_degrees(path: Path, drive: Drive) -> Path:
+    """The same beside positions alone, whose headings are made of the gyro."""
+    return write_log(path, drive, gyro=np.degrees(drive.rate), headed=False)
+
+
 @pytest.mark.parametrize(
     ("make", "said", "keys"),
     [
+        (with_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
+        (with_positions_and_a_gyro_in_degrees, ["the gyro of /imu is in degrees"], {"imu.unit": "deg/s"}),
         (stamped_in_the_future, ["its clock runs ahead"], {"command.time": "log"}),
         (exchanged_and_one_counting_double, ["exchanged", "2 times"], {"wheels.exchanged": True}),
         (turns_before_a_gear, ["turns before a gear"], {}),
