@@ -325,7 +325,7 @@ class Examination:
         imu = self.extraction.imu()
         if not imu.height:
             return None
-        return Reading("gyro", str(self.sources.imu), None, Held(*_column(imu, "rate_z")))
+        return Reading("gyro", str(self.sources.imu), None, _hold(imu, "rate_z"))
 
     def _read_drives(self, motion: Motion) -> list[Candidate]:
         commands, wheels = (self.sources.rank_drives(role) for role in ("command", "wheels"))
@@ -358,20 +358,17 @@ class Examination:
             return None
         if source.form is DriveForm.BODY:
             names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
-            stands = not is_measured
-            signals = (Held(*_column(table, name), may_stand=stands) for name in names)
+            signals = (_hold(table, name, may_stand=not is_measured) for name in names)
             return Reading("body", str(source), *signals)
         if unit.kind == "ackermann":
-            speed = Held(*_column(table, "speed"))
+            speed = _hold(table, "speed")
             bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
             return Reading("steering", str(source), speed, bent)
         names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
-        reading = Reading("sides", str(source), *(Held(*_column(table, name)) for name in names))
+        reading = Reading("sides", str(source), *(_hold(table, name) for name in names))
         if self.moves_sideways and section.reversed is None:
             backward = msgspec.structs.replace(section, reversed="right")
-            reading.third_crossed = Held(
-                *_column(self.extraction.read_drive(source, backward, held=True), "sideways")
-            )
+            reading.third_crossed = _hold(self.extraction.read_drive(source, backward, held=True), "sideways")
         return reading
 
     def _make_unit(self, source: DriveSource, kind: str) -> Vehicle:
@@ -1303,8 +1300,13 @@ def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:
 
 
 def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
-    """Times and values of a column, those of inactive spans left out."""
+    """Times and values of a column."""
     return table["t"].to_numpy(), table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _hold(table: pl.DataFrame, name: str, *, may_stand: bool = False) -> Held:
+    """A column as a signal, which counts in the intervals in which commands are live."""
+    return Held(*_column(table, name), may_stand=may_stand, counts=table["active"].to_numpy())
 
 
 def is_crossed(drive: Candidate) -> bool:

@@ -38,17 +38,22 @@ class Held:
         times: increasing [s], shape (n,).
         values: NaN where unknown, shape (n,).
         may_stand: whether one value throughout says something, as that of a command does.
+        counts: whether the vehicle is driven by its commands, shape (n,); throughout if it is not given.
     """
 
-    def __init__(self, times: Floats, values: Floats, *, may_stand: bool = False) -> None:
+    def __init__(
+        self, times: Floats, values: Floats, *, may_stand: bool = False, counts: Flags | None = None
+    ) -> None:
         known = np.isfinite(values)
         if known.any():
             known &= np.abs(times - np.median(times[known])) < _LONGEST_S
         self.times, self.values = times[known], values[known]
+        live = np.ones(self.values.size, dtype=bool) if counts is None else counts[known]
+        read = self.values[live]
         # A command that is sent on changes only has few messages, and says something all the time.
-        enough = self.values.size >= (_FEWEST_CHANGES if may_stand else FEWEST_STEPS)
-        self.is_constant = not (enough and bool(np.ptp(self.values) > 0.0))
-        self.moves = not self.is_constant or (enough and may_stand and bool(self.values.any()))
+        enough = read.size >= (_FEWEST_CHANGES if may_stand else FEWEST_STEPS)
+        self.is_constant = not (enough and bool(np.ptp(read) > 0.0))
+        self.moves = not self.is_constant or (enough and may_stand and bool(read.any()))
         self._sums: dict[float, Floats] = {}
         if not enough:
             return
@@ -58,9 +63,10 @@ class Held:
         period = float(np.median(np.diff(self.times)))
         is_steady = period < _SLOW_S and self.times.size > 2 * FEWEST_STEPS
         longest = max(0.6, 6.0 * period) if is_steady else np.inf
-        missing = (before < 0) | (grid - self.times[np.maximum(before, 0)] > longest)
+        last = np.maximum(before, 0)
+        missing = (before < 0) | (grid - self.times[last] > longest) | ~live[last]
         self._missing = np.append(0.0, np.cumsum(missing))
-        self.grid = np.where(before < 0, 0.0, self.values[np.maximum(before, 0)])
+        self.grid = np.where(before < 0, 0.0, self.values[last])
 
     @property
     def held_share(self) -> float:
@@ -211,11 +217,15 @@ class Explained:
 
     def sign(self, channel: str) -> int:
         """Sign of the gain of ``ahead``, ``turned`` or ``aside`` where it is clear, else zero."""
-        fits = {"ahead": (self.ahead, self.none[0]), "turned": (self.turned, self.none[1])}
-        if channel == "aside" and self.aside is None:
-            return 0
-        one, none = self.aside if channel == "aside" and self.aside is not None else fits[channel]
-        if not self.is_sure or abs(one.t[0]) < CLEAR or compare(one.blocks, none) < CLEAR:
+        aside = None if self.aside is None else self.aside[0]
+        one = {"ahead": self.ahead, "turned": self.turned, "aside": aside}[channel]
+        # The other sign is what is to be refused: where a vehicle stands, both are as far off.
+        if (
+            one is None
+            or not self.is_sure
+            or abs(one.t[0]) < CLEAR
+            or compare(one.blocks, one.turned) < CLEAR
+        ):
             return 0
         return int(np.sign(one.gains[0]))
 

@@ -69,11 +69,13 @@ class Fit:
         gains: coefficients, shape (k,).
         t: their ratios to standard errors that are robust to correlation within blocks, shape (k,).
         blocks: log-likelihood of every block, shape (m,).
+        turned: the same with the first coefficient of the other sign.
     """
 
     gains: Floats
     t: Floats
     blocks: Floats
+    turned: Floats
 
 
 @compiled("void(float64[:, ::1], float64, float64, boolean[::1])")
@@ -133,11 +135,12 @@ def fit(values: Floats, columns: Floats, steps: Steps) -> Fit:
     gains, rest, weight = _solve(white[:, 0], design)
     blocks: Floats = np.bincount(steps.block, list_likelihoods(rest)).astype(np.float64)
     if not gains.size:
-        return Fit(gains, gains, blocks)
+        return Fit(gains, gains, blocks, blocks)
     inverse = np.linalg.pinv((design * weight[:, None]).T @ (design * weight[:, None]))
     pulls = np.column_stack([np.bincount(steps.block, column * weight**2 * rest) for column in design.T])
     error = np.sqrt(np.maximum(np.diag(inverse @ (pulls.T @ pulls) @ inverse), 1e-30))
-    return Fit(gains, gains / error, blocks)
+    other = list_likelihoods(rest + 2.0 * gains[0] * design[:, 0])
+    return Fit(gains, gains / error, blocks, np.bincount(steps.block, other).astype(np.float64))
 
 
 def measure_share(values: Floats, model: Floats) -> float:

@@ -19,8 +19,6 @@ _AGREE = 1.5
 of each other."""
 _EDGES = (2.0, 4.0)
 """Counts of a pulse by decoders that look at two or four of its edges, over those of one."""
-_NEAR = 0.05
-"""Deviation of the logarithm of a scale from such a ratio that is the ground's."""
 _IDLE = 0.1
 """Turning over that of the others below which a wheel's encoder is not turned by the drive."""
 
@@ -113,6 +111,6 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
 
 
 def snap(scale: float) -> float:
-    """A scale above zero, or the ratio of decoders that it is near to."""
+    """A scale above zero, or the ratio of decoders that it is near to: what remains may be the ground's."""
     ratios = [ratio for edge in _EDGES for ratio in (edge, 1.0 / edge)]
-    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < _NEAR), scale)
+    return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)

@@ -37,6 +37,36 @@ def test_gain_and_delay_of_a_command_are_recovered() -> None:
     assert made.lag + made.delay == pytest.approx(LAG, abs=0.06)
 
 
+@pytest.mark.parametrize("turn", [1.0, -1.0])
+def test_the_sign_of_a_command_is_clear_though_the_vehicle_stands_at_times(turn: float) -> None:
+    """An emergency stop under a live command is as far off with either sign."""
+    drive = draw(3, 30.0)
+    asked = np.concatenate((np.tile([0.0, 1.0], (500, 1)), drive.asked))
+    time = np.arange(asked.shape[0]) * STEP
+    rows = np.arange(0, time.size, 10)
+    still = np.zeros(50)
+    stopped = replace(
+        drive, time=time, asked=asked, rows=rows, yaw=np.concatenate((still, drive.yaw)),
+        place=np.concatenate((still + 0j, drive.place)),
+    )  # fmt: skip
+    made = command(stopped, turn=turn).explain(measured(tabulate(stopped)))
+    assert made is not None
+    assert (made.sign("ahead"), made.sign("turned")) == (1, turn)
+
+
+def test_what_a_signal_says_while_nobody_commands_does_not_count() -> None:
+    """An encoder that dies before the driving that counts is dead, though it turned in what went before."""
+    drive = draw(4)
+    times, counts = drive.time[::5], drive.time[::5] > 50.0
+    one, two = (side[::5] for side in drive.wheels())
+    left, right = (Held(times, each, counts=counts) for each in (np.where(counts, 0.0, one), two))
+    read = Reading("sides", "/wheels", left, right)
+    assert read.dead_side == "left"
+    steps = measured(tabulate(drive)).steps
+    assert not right.is_there(steps)[steps.start < 50.0].any()
+    assert right.is_there(steps)[steps.start > 51.0].all()
+
+
 def test_laps_of_one_radius_reverse_no_side_of_the_drive() -> None:
     """Speed and yaw rate are proportional there, so that either explains what the other does."""
     drive, radius = draw(), 8.0
