@@ -662,10 +662,11 @@ class Examination:
             return self._report_sides(motion, command, wheels)
         if not wheels.is_measured and self.configuration.wheels != DriveSection():
             self._read_again(wheels, motion)
-        if self._settle_joints(wheels, motion):
-            self._read_again(wheels, motion)
+        # An encoder that dies is on no other scale before.
         if self.leave_out(wheels, command, motion):
             wheels.reading.explained = None
+            self._read_again(wheels, motion)
+        if self._settle_joints(wheels, motion):
             self._read_again(wheels, motion)
         is_judged = self._report_sides(motion, command, wheels)
         if "reversed" in self.changes.get("wheels", {}):
@@ -732,7 +733,8 @@ class Examination:
         sides = {joint: side for side, joints in chosen.items() for joint in joints}
         late = (0.0, 0.0) if reading.explained is None else (reading.explained.lag, reading.explained.delay)
         turning = {
-            joint: measure_wheel(Held(times, rates[joint]), motion, late, ()) for joint in sorted(sides)
+            joint: measure_wheel(Held(times, rates[joint]), motion, late, reading.inputs)
+            for joint in sorted(sides)
         }
         factors, idle = find_odd_joints(turning, sides)
         factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}

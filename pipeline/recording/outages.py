@@ -33,7 +33,7 @@ _SMALLEST_PART = 20
 _PARTS = 8
 """Number of parts of the finest division in which a living encoder is looked for."""
 _EXACT = 0.95
-"""Share of the readings that repeat the one before, from which on they do so exactly."""
+"""Share of the readings that are one value, from which on an encoder holds it."""
 
 
 @dataclass(frozen=True)
@@ -264,9 +264,12 @@ def _list_dead(
     for which, part in follow_likeliest(gains, price):
         start, end = float(ends[part.start]) - delay, float(ends[part.stop]) - delay
         span = _describe(name, side, start, end, float(gains[part, which].sum()))
-        columns = [each[part] for each in sources]
-        if goes_on[part].sum() > price and not _follows_otherwise(
-            one.values[part], columns, one.fits, span, 2.0 * price
+        # A wheel may have turned at one speed before its encoder holds a value.
+        inside = (ends[:-1][part] >= span.start + delay) & (ends[:-1][part] < span.end + delay)
+        rows = np.arange(part.start, part.stop)[inside]
+        columns = [each[rows] for each in sources]
+        if goes_on[rows].sum() > price and not _follows_otherwise(
+            one.values[rows], columns, one.fits, span, 2.0 * price
         ):
             made.append(span)
     return made + _list_silent(name, side, blocks, one.fits[0].expected, one.top)
@@ -300,12 +303,14 @@ def _follows_otherwise(
 def _describe(name: str, side: Held, start: float, end: float, nats: float) -> Outage:
     """The span with the readings that repeat, from the first one on."""
     first, last = np.searchsorted(side.times, (start, end)).tolist()
-    read = side.values[first:last]
-    is_exact = read.size > 1 and float(np.mean(np.diff(read) == 0.0)) > _EXACT
-    if not is_exact:
-        return Outage(name, start, end, "noise", nats)
-    value = float(np.median(read))
+    kinds, counts = np.unique(side.values[first:last], return_counts=True)
+    value = float(kinds[np.argmax(counts)]) if kinds.size else np.nan
     same = side.values == value
+    repeats = first + np.flatnonzero(same[first:last])
+    # Most readings are the same, and all between the first and the last of them, but for a few.
+    if repeats.size < max(2.0, 0.5 * (last - first)) or same[repeats[0] : repeats[-1]].mean() < _EXACT:
+        return Outage(name, start, end, "noise", nats)
+    first, last = int(repeats[0]), int(repeats[-1]) + 1
     while first > 0 and same[first - 1]:
         first -= 1
     while last < same.size and same[last]:

@@ -1,6 +1,6 @@
 """Encoders of single wheels and of sides against the motion: which count backward, or on another scale."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,9 +38,7 @@ class Turning:
     follows: bool
 
 
-def measure_wheel(
-    wheel: Held, motion: Motion, late: tuple[float, float], beside: tuple[Held, ...]
-) -> Turning:
+def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside: Sequence[Held]) -> Turning:
     """How a wheel turns with the motion.
 
     Args:

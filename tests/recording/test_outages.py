@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from drawn_motion import Drive, command, draw, measured, sides, tabulate
-from front import find_roles
+from front import SAMPLES, find_roles
 from rewritten_logs import list_changes, read, write
 from written_logs import write_log
 
@@ -130,11 +130,26 @@ def test_what_is_left_out_is_told_with_its_line(kind: str, tmp_path: Path) -> No
         assert "encoder_dead" not in {one.id for one in settled.choice.findings}
 
 
-def test_an_encoder_of_mecanum_wheels_dies_beside_a_body_that_is_commanded(tmp_path: Path) -> None:
-    log = simulate_case(None, {}, out=tmp_path / "log.mcap", seed=5, duration_s=60.0, platform="dingo_o")
+@pytest.mark.parametrize("name", ["left encoder dies", "right encoder holds"])
+def test_an_encoder_of_mecanum_wheels_dies_beside_a_body_that_is_commanded(name: str, tmp_path: Path) -> None:
+    log = simulate_case(None, {}, out=tmp_path / "log.mcap", seed=5, duration_s=100.0, platform="dingo_o")
     roles = find_roles(log)
-    (change,) = [one for one in list_changes() if one.name == "right encoder holds"]
+    (change,) = [one for one in list_changes() if one.name == name]
     made = change.make(read(log), roles)
     assert made is not None
     setup = set_up_log(write(made, tmp_path / "changed.mcap"), Options(out=tmp_path))
     assert "encoder_dead" in {one.id for one in setup.choice.findings}
+    # Before it dies it is on no other scale.
+    assert setup.configuration.wheels.factors is None
+
+
+def test_an_encoder_that_dies_in_driving_at_one_speed_is_dead_from_then_on(tmp_path: Path) -> None:
+    """Wheels that turned at one speed before it do not hide the value that it holds."""
+    log = SAMPLES / "warthog_ice.mcap"
+    (change,) = [one for one in list_changes() if one.name == "right encoder holds"]
+    made = change.make(read(log), find_roles(log))
+    assert made is not None
+    setup = set_up_log(write(made, tmp_path / "changed.mcap"), Options(out=tmp_path))
+    (span,) = setup.configuration.wheels.ignore
+    assert (span.side, span.end_s) == ("right", None)
+    assert span.start_s == pytest.approx(144.0, abs=1.0)
