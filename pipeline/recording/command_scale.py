@@ -8,16 +8,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, fit_robustly, robust_spread
+from pipeline.core import Flags, Floats, SlipError, fit_robustly, robust_spread
+from pipeline.recording.case import Candidate, Case
 from pipeline.recording.geometry import roll_wheels
+from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS
 from pipeline.run import STILL_MPS, Alignment
 from pipeline.sources import Vehicle, list_presets
-from pipeline.stages import ONE_SCALE, Finding
+from pipeline.stages import ONE_SCALE, Finding, find_timeout, report_timeout
 
 _LEAST_RATIO = 0.02
 """Ratio of measured to commanded speed below which wheels did not respond: they show no scale."""
@@ -217,3 +220,50 @@ def _find_median(asked: Floats, got: Floats) -> float | None:
     """Median ratio of measured to commanded speed in the slower half of the driving, however it varies."""
     slow = _find_slow(asked)
     return float(np.median(got[slow] / asked[slow])) if slow.sum() >= FEWEST_STEPS else None
+
+
+def measure_command(
+    case: Case, command: Candidate | None, wheels: Candidate | None, kind: str, motion: Motion | None
+) -> Alignment | None:
+    """Corrections of the command as it is read with all others; its time-out goes into the configuration.
+
+    Args:
+        case: the log; its wheels may have explained the command.
+        command: the candidate for it.
+        wheels: the candidate for them.
+        kind: of the vehicle, if its signals show it.
+        motion: of the poses; None where wheels stand in for them.
+    """
+    if command is None:
+        return None
+    vehicle, made = case.vehicle, case.complete()
+    if kind and not case.is_known:
+        vehicle = msgspec.structs.replace(vehicle, kind=kind)
+    case.extraction.vehicle = vehicle
+    try:
+        asked = case.extraction.read_drive(command.source, made.command, held=True)
+        got = pl.DataFrame()
+        if wheels is not None:
+            got = case.extraction.read_drive(wheels.source, made.wheels, held=False)
+    except SlipError:
+        return None
+    is_body = command.reading.form == "body"
+    alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
+    if case.is_known or not is_body:
+        gain, made_of = None, command.reading.explained
+        if is_body and made_of is not None and command.sign("ahead") > 0:
+            gain = float(made_of.ahead.gains[0]) / case.command_factors()[0]
+        late = None if case.driven is None else (case.driven.lag, case.driven.delay)
+        alignment, findings = measure_command_scale(
+            asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
+        )
+        case.findings += findings
+    rates = motion.rates if got.is_empty() and motion is not None else None
+    if rates is None and not got.is_empty():
+        rates = roll(got, vehicle)
+    timeout = None if rates is None else find_timeout(*rates, asked, vehicle)
+    if timeout is not None:
+        hold_s = made.command.hold_s or timeout.seconds
+        case.changes.setdefault("command", {})["hold_s"] = hold_s
+        case.findings.append(report_timeout(timeout, hold_s))
+    return alignment

@@ -11,10 +11,15 @@ import numpy as np
 
 from pipeline.core import enumerate_texts
 from pipeline.logs import LogData
-from pipeline.recording.examination import Candidate, Examination, Recording, describe, is_crossed
+from pipeline.recording.case import Candidate, Case, is_crossed
+from pipeline.recording.command_scale import measure_command
+from pipeline.recording.examination import Recording, describe
 from pipeline.recording.geometry import Geometry, Length, roll_wheels
 from pipeline.recording.motion import Motion
+from pipeline.recording.outages import leave_out
+from pipeline.recording.roles import choose_roles
 from pipeline.recording.score import CLEAR
+from pipeline.recording.units import correct_wheel_unit
 from pipeline.run import GROUND_UNOBSERVABLE
 from pipeline.sources import (
     Configuration,
@@ -57,7 +62,7 @@ def examine_drive(
     ):
         # Of its motion to the side only the wheels of a known vehicle show anything.
         return _take_by_name(sources, configuration) if is_known else None
-    return _DriveExamination(data, sources, configuration, vehicle, is_known=is_known, where=where).stand_in()
+    return _stand_in(Case(data, sources, configuration, vehicle, is_known=is_known, where=where))
 
 
 def _take_by_name(sources: Sources, configuration: Configuration) -> Recording | None:
@@ -84,146 +89,141 @@ def _report_ground(wheels: DriveSource) -> Finding:
     return Finding(GROUND_UNOBSERVABLE, "warning", text, where="pose")
 
 
-class _DriveExamination(Examination):
-    """One log without poses."""
+def _stand_in(case: Case) -> Recording | None:
+    """See `examine_drive`."""
+    wheels, motion = _find_wheels(case)
+    if wheels is None or motion is None:
+        return None
+    commands = _read_commands(case, motion, wheels)
+    case.sources = replace(case.sources, wheels=wheels.source)
+    command, _ = choose_roles(case, commands)
+    if command is None:
+        return None
+    steered = wheels.reading.form == "steering"
+    if leave_out(case, wheels, command, None):
+        kind = "ackermann" if steered else "differential"
+        reading = case.read(wheels.source, is_measured=True, kind=kind, section=case.complete().wheels)
+        rolled = None if reading is None else roll_wheels(reading)
+        if reading is not None and rolled is not None:
+            wheels.reading = reading
+            for one in commands:
+                one.reading.explain(rolled)
+    if wheels.reading.form == "sides":
+        _report_dead_side(case, wheels)
+        _find_unit(case, wheels, command)
+    if not case.findings or case.findings[-1].severity != "error":
+        _report_opposite(case, command, wheels)
+    sources = replace(case.sources, command=command.source)
+    alignment = measure_command(case, command, wheels, "ackermann" if steered else "", None)
+    return Recording(
+        _replace_pose(sources, wheels.source),
+        case.complete(),
+        (*case.findings, _report_ground(wheels.source)),
+        "ackermann" if steered else "",
+        _measure_lengths(case, command, wheels),
+        tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
+        alignment,
+    )
 
-    def stand_in(self) -> Recording | None:
-        """See `examine_drive`."""
-        wheels, motion = self._find_wheels()
-        if wheels is None or motion is None:
-            return None
-        commands = self._read_commands(motion, wheels)
-        self.sources = replace(self.sources, wheels=wheels.source)
-        command, _ = self._choose_roles(commands)
-        if command is None:
-            return None
-        steered = wheels.reading.form == "steering"
-        if self.leave_out(wheels, command, None):
-            kind = "ackermann" if steered else "differential"
-            reading = self._read(wheels.source, is_measured=True, kind=kind, section=self._complete().wheels)
-            rolled = None if reading is None else roll_wheels(reading)
-            if reading is not None and rolled is not None:
-                wheels.reading = reading
-                for one in commands:
-                    one.reading.explain(rolled)
-        if wheels.reading.form == "sides":
-            self._report_dead_side(wheels)
-            self._find_unit(wheels, command)
-        if not self.findings or self.findings[-1].severity != "error":
-            self._report_opposite(command, wheels)
-        sources = replace(self.sources, command=command.source)
-        alignment = self._measure_command(command, wheels, "ackermann" if steered else "", None)
-        return Recording(
-            _replace_pose(sources, wheels.source),
-            self._complete(),
-            (*self.findings, _report_ground(wheels.source)),
-            "ackermann" if steered else "",
-            self._measure_lengths(command, wheels),
-            tuple(describe(one.reading, {id(command.reading): "command"}) for one in commands),
-            alignment,
-        )
 
-    # Signals.
-
-    def _find_wheels(self) -> tuple[Candidate | None, Motion | None]:
-        """The first candidate for wheels that turn, and their motion in its own units."""
-        for number, source in enumerate(self.sources.rank_drives("wheels")):
-            for kind in ("ackermann", "differential"):
-                if kind == "ackermann" and source.form is not DriveForm.JOINTS:
-                    continue
-                reading = self._read(source, is_measured=True, kind=kind)
-                if reading is None or not reading.inputs:
-                    continue
-                if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
-                    continue
-                motion = roll_wheels(reading)
-                if motion is not None:
-                    return Candidate(source, reading, number, is_measured=True), motion
-        return None, None
-
-    def _read_commands(self, motion: Motion, wheels: Candidate) -> list[Candidate]:
-        """Candidates for the command, fitted to the motion of the wheels."""
-        taken = {signal.topic for signal in wheels.source.signals}
-        drives = []
-        for number, source in enumerate(self.sources.rank_drives("command")):
-            if taken & {signal.topic for signal in source.signals}:
+def _find_wheels(case: Case) -> tuple[Candidate | None, Motion | None]:
+    """The first candidate for wheels that turn, and their motion in its own units."""
+    for number, source in enumerate(case.sources.rank_drives("wheels")):
+        for kind in ("ackermann", "differential"):
+            if kind == "ackermann" and source.form is not DriveForm.JOINTS:
                 continue
-            reading = self._read(source, is_measured=False)
-            if reading is not None:
-                reading.explain(motion)
-                drives.append(Candidate(source, reading, number, is_measured=False))
-        return drives
+            reading = case.read(source, is_measured=True, kind=kind)
+            if reading is None or not reading.inputs:
+                continue
+            if kind == "ackermann" and len(reading.inputs) < 2:  # noqa: PLR2004 - no joint steers
+                continue
+            motion = roll_wheels(reading)
+            if motion is not None:
+                return Candidate(source, reading, number, is_measured=True), motion
+    return None, None
 
-    # Faults.
 
-    def _report_dead_side(self, wheels: Candidate) -> None:
-        dead = wheels.reading.dead_side
-        if dead:
-            text = (
-                f"the {dead} wheels' encoder reads the same throughout while the other wheels turn: it is "
-                "dead, and the log holds no pose in its rank"
-            )
-            self.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
+def _read_commands(case: Case, motion: Motion, wheels: Candidate) -> list[Candidate]:
+    """Candidates for the command, fitted to the motion of the wheels."""
+    taken = {signal.topic for signal in wheels.source.signals}
+    drives = []
+    for number, source in enumerate(case.sources.rank_drives("command")):
+        if taken & {signal.topic for signal in source.signals}:
+            continue
+        reading = case.read(source, is_measured=False)
+        if reading is not None:
+            reading.explain(motion)
+            drives.append(Candidate(source, reading, number, is_measured=False))
+    return drives
 
-    def _report_opposite(self, command: Candidate, wheels: Candidate) -> None:
-        """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
-        explained = command.reading.explained
-        if explained is None or not command.is_sure:
-            return
-        if is_crossed(command):
-            what = "one side of the wheels runs backward against its command"
-            mend = 'reversed = "left" or "right" under [wheels] in run.toml'
-            margin: float | None = explained.sign_margin
-        else:
-            against = [
-                verb
-                for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
-                if sign < 0
-            ]
-            if not against:
-                return
-            what = f"the wheels {enumerate_texts(against)} the other way than {command.source} commands"
-            changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
-            change = changes[against[0]] if len(against) == 1 else "sign = -1"
-            if wheels.reading.form != "sides":
-                change = "sign = -1"
-            mend, margin = f"{change} under [wheels] in run.toml", explained.moves
+
+def _report_dead_side(case: Case, wheels: Candidate) -> None:
+    dead = wheels.reading.dead_side
+    if dead:
         text = (
-            f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
-            "command or the polarity of the motors, which are to be corrected on the robot"
+            f"the {dead} wheels' encoder reads the same throughout while the other wheels turn: it is "
+            "dead, and the log holds no pose in its rank"
         )
-        self.findings.append(
-            Finding("signs_contradict", "error", text, where="command, wheels", value=margin)
-        )
+        case.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
 
-    # Units and geometry.
 
-    def _find_unit(self, wheels: Candidate, command: Candidate) -> None:
-        """Unit of the wheel speeds by the radius that each would mean."""
-        explained = command.reading.explained
-        if self.is_known or explained is None or not command.sign("ahead") or command.reading.form == "sides":
+def _report_opposite(case: Case, command: Candidate, wheels: Candidate) -> None:
+    """Signs of the command against those of the wheels: no third signal tells which of them is wrong."""
+    explained = command.reading.explained
+    if explained is None or not command.is_sure:
+        return
+    if is_crossed(command):
+        what = "one side of the wheels runs backward against its command"
+        mend = 'reversed = "left" or "right" under [wheels] in run.toml'
+        margin: float | None = explained.sign_margin
+    else:
+        against = [
+            verb
+            for verb, sign in (("drive", command.sign("ahead")), ("turn", command.sign("turned")))
+            if sign < 0
+        ]
+        if not against:
             return
-        self._correct_wheel_unit(wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
+        what = f"the wheels {enumerate_texts(against)} the other way than {command.source} commands"
+        changes = {"drive": "sign = -1 and exchanged = true", "turn": "exchanged = true"}
+        change = changes[against[0]] if len(against) == 1 else "sign = -1"
+        if wheels.reading.form != "sides":
+            change = "sign = -1"
+        mend, margin = f"{change} under [wheels] in run.toml", explained.moves
+    text = (
+        f"{what}, and no third signal shows which of them is wrong: either the encoders ({mend}), or the "
+        "command or the polarity of the motors, which are to be corrected on the robot"
+    )
+    case.findings.append(Finding("signs_contradict", "error", text, where="command, wheels", value=margin))
 
-    def _measure_lengths(self, command: Candidate, wheels: Candidate) -> Geometry:
-        """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
-        explained, form = command.reading.explained, wheels.reading.form
-        if explained is None or not command.is_sure or form == "body" or command.reading.form == "sides":
-            return Geometry()
-        fits = {"ahead": explained.ahead, "turned": explained.turned}
-        gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
-        errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
-        if is_crossed(command):
-            # With one side reversed, the mean of the sides is half their difference, and the other way round.
-            gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
-            errors = {"ahead": errors["turned"], "turned": errors["ahead"]}
-        elif not command.sign("ahead"):
-            return Geometry()
-        value = self._wheel_factor() / gains["ahead"]
-        radius, width = Length(value, errors["ahead"] * value), None
-        if command.reading.form == "body" and errors["turned"] < 1.0 / CLEAR:
-            value = gains["turned"] / gains["ahead"]
-            width = Length(value, value * float(np.hypot(errors["ahead"], errors["turned"])))
-        if form == "steering":
-            return Geometry(rolled=radius, wheelbase=width)
-        return Geometry(radius=radius, track=width)
+
+def _find_unit(case: Case, wheels: Candidate, command: Candidate) -> None:
+    """Unit of the wheel speeds by the radius that each would mean."""
+    explained = command.reading.explained
+    if case.is_known or explained is None or not command.sign("ahead") or command.reading.form == "sides":
+        return
+    correct_wheel_unit(case, wheels, 1.0 / abs(float(explained.ahead.gains[0])), explained.shares[0])
+
+
+def _measure_lengths(case: Case, command: Candidate, wheels: Candidate) -> Geometry:
+    """Lengths by which the controller turns commands into motion of the wheels, whatever their signs."""
+    explained, form = command.reading.explained, wheels.reading.form
+    if explained is None or not command.is_sure or form == "body" or command.reading.form == "sides":
+        return Geometry()
+    fits = {"ahead": explained.ahead, "turned": explained.turned}
+    gains = {name: abs(float(one.gains[0])) for name, one in fits.items()}
+    errors = {name: 1.0 / max(abs(float(one.t[0])), 1e-9) for name, one in fits.items()}
+    if is_crossed(command):
+        # With one side reversed, the mean of the sides is half their difference, and the other way round.
+        gains = {"ahead": 0.5 * gains["turned"], "turned": 2.0 * gains["ahead"]}
+        errors = {"ahead": errors["turned"], "turned": errors["ahead"]}
+    elif not command.sign("ahead"):
+        return Geometry()
+    value = case.wheel_factor() / gains["ahead"]
+    radius, width = Length(value, errors["ahead"] * value), None
+    if command.reading.form == "body" and errors["turned"] < 1.0 / CLEAR:
+        value = gains["turned"] / gains["ahead"]
+        width = Length(value, value * float(np.hypot(errors["ahead"], errors["turned"])))
+    if form == "steering":
+        return Geometry(rolled=radius, wheelbase=width)
+    return Geometry(radius=radius, track=width)

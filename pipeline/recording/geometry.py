@@ -6,11 +6,12 @@ They come last: no decision on roles, signs and frames needs them, and what is n
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pipeline.core import format_share, join_parts
+from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
@@ -247,3 +248,36 @@ def _guess_platform(radius: float, track: float | None, *, is_shown: bool) -> tu
     names = " or ".join(called for called, _ in alike.values())
     turns = f"turns at {format_share(share)} of the ideal rate"
     return name, f"a {names} has such wheels, and then {turns}: confirm with --vehicle {' or '.join(alike)}"
+
+
+def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | None) -> Geometry:
+    """Lengths of the vehicle by its controller and by the motion."""
+    made = Geometry()
+    car = next((one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None)
+    if car is not None and car.reading.explained is not None and car.sign("turned"):
+        return measure_car(car.reading.explained, is_measured=car is wheels)
+    if wheels is None or wheels.reading.form != "sides":
+        sides = command if command is not None and command.reading.form == "sides" else None
+    else:
+        sides = wheels
+    if sides is not None and sides.is_sure and not is_crossed(sides) and sides.reading.explained is not None:
+        rolled, effective = measure_geometry(sides.reading.explained)
+        factor = case.wheel_factor()
+        made = replace(made, rolled=_scale(rolled, factor), effective=effective)
+    if (
+        command is not None
+        and wheels is not None
+        and wheels.reading.form == "sides"
+        and command.reading.form == "body"
+    ):
+        lengths = measure_controller(command.reading, wheels.reading)
+        if lengths is not None:
+            speed, rate = case.command_factors()
+            radius = _scale(lengths[0], speed * case.wheel_factor())
+            made = replace(made, radius=radius, track=_scale(lengths[1], speed / rate))
+    changes = case.changes.get("wheels", {})
+    return replace(made, is_taken="scale" in changes or changes.get("unit") == "m/s")
+
+
+def _scale(length: Length | None, factor: float) -> Length | None:
+    return None if length is None else Length(length.value * factor, length.error * factor)

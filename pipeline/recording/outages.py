@@ -12,13 +12,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, find_scale, fit_robustly, list_likelihoods
+from pipeline.core import Flags, Floats, Ints, enumerate_texts, find_scale, fit_robustly, list_likelihoods
+from pipeline.recording.case import Candidate, Case
 from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import Held, Reading
+from pipeline.recording.readings import SIDES, Held, Reading
 from pipeline.recording.score import Steps
 from pipeline.run import LIVE_SHARE
-from pipeline.stages import BLOCK_S, follow_likeliest, price_change
+from pipeline.sources import OutageSection
+from pipeline.stages import BLOCK_S, Finding, follow_likeliest, price_change
 
 _LEAST = 0.03
 """Fraction of the usual largest speed of a side below which a difference is no contradiction."""
@@ -380,3 +383,79 @@ def _list_silent(name: str, side: Held, blocks: _Blocks, expected: Floats, top: 
                 )
             )
     return made
+
+
+_READS = {
+    "nothing": "no reading is recorded",
+    "zero": "zero is recorded",
+    "one value": "one value is repeated",
+    "noise": "noise is recorded",
+}
+
+
+def leave_out(case: Case, wheels: Candidate, command: Candidate | None, motion: Motion | None) -> bool:
+    """Leave out where an encoder reads nothing while all else goes on; whether any is left out."""
+    reading, section = wheels.reading, case.complete().wheels
+    if section.ignore is not None or reading.dead_side or not reading.inputs:
+        return False
+    names = SIDES if reading.form == "sides" else ("both",)
+    sides = {name: one for name, one in zip(names, (reading.first, reading.second), strict=False) if one}
+    made = reading.explained
+    late = (0.0, 0.0) if made is None else (made.lag, made.delay)
+    asked = command.reading if command is not None and command.is_sure else None
+    outages = find_outages(sides, late, asked, motion)
+    if not outages:
+        return False
+    kind = "ackermann" if reading.form == "steering" else "differential"
+    case.extraction.vehicle = case.make_unit(wheels.source, kind)
+    table = case.extraction.read_drive(wheels.source, section, held=False)
+    stamps = table["t"].to_numpy()
+    clock = (table["log_time"].to_numpy() - case.extraction.data.index.start_ns) / 1e9
+    words = {
+        "the commands": asked,
+        "the poses": motion,
+        "the other wheels": asked is None or motion is None,
+    }
+    witnesses = [word for word, is_there in words.items() if is_there]
+    texts, spans = [], []
+    for one in outages:
+        inside = (stamps >= one.start) & (stamps < one.end)
+        columns = [name for name in (*SIDES, "speed") if one.side in {name, "both"}]
+        is_read = table.filter(pl.Series(inside)).filter(pl.any_horizontal(pl.col(columns).is_finite()))
+        ends = [max(one.start, stamps[0]), *is_read["t"].to_list(), min(one.end, stamps[-1])]
+        is_silent = is_read.height < 2 or max(np.diff(ends)) > 0.5 * (ends[-1] - ends[0])  # noqa: PLR2004
+        reads = "nothing" if is_silent else one.reads
+        start, end = (
+            at if np.isinf(at) else float(np.interp(at, stamps, clock)) for at in (one.start, one.end)
+        )
+        when = f"from {start:.0f} to {end:.0f} s"
+        if end == np.inf:
+            when = f"from {start:.0f} s on"
+        elif start == -np.inf:
+            when = f"until {end:.0f} s"
+        who = "both wheels' encoders read" if one.side == "both" else f"the {one.side} wheels' encoder reads"
+        texts.append(f"{who} nothing {when} ({_READS[reads]} while {enumerate_texts(witnesses)} go on)")
+        # In hundredths, which the line of the text has as well.
+        first = None if np.isinf(start) else float(np.floor(1e2 * start) / 1e2)
+        last = None if np.isinf(end) else float(np.ceil(1e2 * end) / 1e2)
+        spans.append(OutageSection(side=one.side, start_s=first, end_s=last))  # type: ignore[arg-type]
+    case.changes.setdefault("wheels", {})["ignore"] = spans
+    text = (
+        f"{'; '.join(texts)}: left out, as ignore = {_write_spans(spans)} under [wheels] in run.toml "
+        "does; ignore = [] takes it as recorded"
+    )
+    begin = None if np.isinf(outages[0].start) else outages[0].start
+    case.findings.append(
+        Finding("encoder_dead", "warning", text, where="wheels", t_start=begin, count=len(outages))
+    )
+    return True
+
+
+def _write_spans(spans: Sequence[OutageSection]) -> str:
+    """As a line of TOML."""
+    parts = []
+    for one in spans:
+        ends = {"start_s": one.start_s, "end_s": one.end_s}
+        keys = [f'side = "{one.side}"', *(f"{key} = {at:g}" for key, at in ends.items() if at is not None)]
+        parts.append(f"{{{', '.join(keys)}}}")
+    return f"[{', '.join(parts)}]"

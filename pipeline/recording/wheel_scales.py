@@ -5,10 +5,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.core import Floats
+from pipeline.core import Floats, enumerate_texts
+from pipeline.recording.case import Candidate, Case
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Held
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit, measure_share
+from pipeline.sources import DriveForm
+from pipeline.stages import choose_sides
 
 _FOLLOWS = 0.5
 """Least share of a wheel's turning that the motion explains: outliers of a localization are no more."""
@@ -112,3 +115,67 @@ def snap(scale: float) -> float:
     """A scale above zero, or the ratio of decoders that it is near to: what remains may be the ground's."""
     ratios = [ratio for edge in _EDGES for ratio in (edge, 1.0 / edge)]
     return next((ratio for ratio in ratios if abs(np.log(scale / ratio)) < 0.5 * np.log(_SAME)), scale)
+
+
+def settle_joints(case: Case, wheels: Candidate, motion: Motion) -> bool:
+    """Correct single wheels that contradict all others of a topic of joints; whether there are any."""
+    section, reading = case.complete().wheels, wheels.reading
+    is_free = section.factors is None and section.left is None and section.right is None
+    if wheels.source.form is not DriveForm.JOINTS or reading.form != "sides" or not is_free:
+        return False
+    times, rates = case.extraction.read_rates(wheels.source)
+    chosen = choose_sides(sorted(rates), section)
+    sides = {joint: side for side, joints in chosen.items() for joint in joints}
+    late = (0.0, 0.0) if reading.explained is None else (reading.explained.lag, reading.explained.delay)
+    turning = {
+        joint: measure_wheel(Held(times, rates[joint]), motion, late, reading.inputs)
+        for joint in sorted(sides)
+    }
+    factors, idle = find_odd_joints(turning, sides)
+    factors = {joint: float(f"{factor:.4g}") for joint, factor in factors.items()}
+    for joint, factor in factors.items():
+        how = "counts backward" if factor < 0.0 else "counts"
+        if abs(factor) != 1.0:
+            how += f" {1.0 / abs(factor):.3g} times as fast as"
+        else:
+            how += " against"
+        what = f"{joint} of {wheels.source} {how} the other wheels"
+        line = ", ".join(f'"{name}" = {value:g}' for name, value in factors.items())
+        case.correct("wheels", what, f"factors = {{{line}}}", {"factors": factors})
+    for side, joints in chosen.items():
+        left = [joint for joint in joints if joint not in idle]
+        if left == joints or case.moves_sideways:
+            continue
+        lost = enumerate_texts([joint for joint in joints if joint in idle])
+        named = ", ".join(f'"{joint}"' for joint in left)
+        line = f"{side} = [{named}]"
+        what = f"the drive does not turn {lost} of {wheels.source}, as it does the other wheels of its side"
+        case.correct("wheels", what, line, {side: left})
+    return bool(factors or idle)
+
+
+def settle_scales(case: Case, wheels: Candidate, motion: Motion) -> bool:
+    """Correct a side whose encoder counts on another scale than the other; whether one does."""
+    reading, made = wheels.reading, wheels.reading.explained
+    first, second = reading.first, reading.second
+    is_free = case.complete().wheels.factors is None
+    if reading.form != "sides" or first is None or second is None or made is None or not is_free:
+        return False
+    late = (made.lag, made.delay)
+    left, right = (measure_wheel(one, motion, late, (first, second)) for one in (first, second))
+    scale = compare_sides(left, right)
+    if scale is None:
+        return False
+    counts = {"left": abs(float(left.gains[0])), "right": abs(float(right.gains[0]))}
+    side, other = ("left", "right") if scale > 1.0 else ("right", "left")
+    if case.is_known:
+        # What does not explain all of a wheel's turning makes both seem low.
+        high, low = (abs(np.log(counts[one] * case.vehicle.wheel_radius_m)) for one in (side, other))
+        side, other = (other, side) if low - high > 0.5 * abs(np.log(scale)) else (side, other)
+    factor = float(f"{1.0 / snap(counts[side] / counts[other]):.4g}")
+    what = (
+        f"the {side} wheels' encoder counts {1.0 / factor:.3g} times as much as the {other} one for "
+        "the same motion (another gear or resolution?)"
+    )
+    case.correct("wheels", what, f"factors = {{{side} = {factor:g}}}", {"factors": {side: factor}})
+    return True

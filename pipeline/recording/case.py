@@ -1,0 +1,270 @@
+"""One log while it is examined: how its signals are read, and what was corrected so far."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import msgspec
+import numpy as np
+import polars as pl
+
+from pipeline.core import Floats, SlipError
+from pipeline.logs import LogData
+from pipeline.recording.evidence import RATES, SPEEDS, WHEELS, Axis, Units
+from pipeline.recording.motion import Motion
+from pipeline.recording.readings import Bent, Explained, Held, Reading
+from pipeline.recording.score import CLEAR
+from pipeline.sources import CONFIGURED, Configuration, DriveForm, DriveSection, DriveSource, Sources, Vehicle
+from pipeline.stages import Extraction, Finding, find_sideways_share
+
+TAKEN_M = 0.1
+"""Radius of wheels [m] whose speeds tell none, as of metres a second: any other gives the same slip."""
+_AHEAD_S = 0.02
+"""Time by which a command is stamped after its recording [s] that is another clock's, and no rounding's."""
+_AS_RECORDED: Mapping[str, Mapping[str, str]] = {
+    "imu": {"unit": 'unit = "rad/s"'},
+    "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0", "unit": 'unit = "m"'},
+    "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
+    "command": {
+        "unit": 'unit = "m/s"',
+        "yaw_unit": 'yaw_unit = "rad/s"',
+        "steering_unit": 'steering_unit = "rad"',
+    },
+}
+"""Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
+
+
+@dataclass
+class Candidate:
+    """A candidate for a command or for wheels.
+
+    Attributes:
+        source: its topics.
+        reading: its signals.
+        rank: its place by type and name among those of its role.
+        is_measured: whether type and name say that it is measured.
+        steering: unit of its steering angle.
+        is_angle: whether a type of body commands holds speed and steering angle.
+    """
+
+    source: DriveSource
+    reading: Reading
+    rank: int
+    is_measured: bool
+    steering: Units = field(default_factory=lambda: Units(("", "rad")))
+    is_angle: bool = False
+
+    @property
+    def is_sure(self) -> bool:
+        """Whether the motion follows it."""
+        return self.reading.explained is not None and self.reading.explained.is_sure
+
+    def sign(self, axis: Axis) -> int:
+        """Sign against the pose; zero where it is not clear."""
+        return self.reading.explained.sign(axis) if self.reading.explained is not None else 0
+
+    def sign_as_motion(self, axis: Axis) -> int:
+        """The same of a signal that states a motion.
+
+        A body that turns far more than it states turns by something else, as wheels that slip: a wrong sign
+        changes no size.
+        """
+        explained = self.reading.explained
+        is_far = (
+            explained is not None
+            and self.reading.form == "body"
+            and abs(float(explained.turned.gains[0])) > _MOST_GAIN
+        )
+        return 0 if axis == "turned" and is_far else self.sign(axis)
+
+
+_MOST_GAIN = 2.0
+"""Largest turn of a body over that which a signal states as its motion."""
+
+
+def is_crossed(drive: Candidate) -> bool:
+    """Whether one side counts backward: by the motion ahead, of a body command by turning, too."""
+    explained = drive.reading.explained
+    if explained is None or not explained.crossed:
+        return False
+    sizes = [abs(float(explained.ahead.t[0])), abs(float(explained.turned.t[0]))]
+    return sizes[0] > CLEAR and (drive.reading.form == "sides" or sizes[1] > CLEAR)
+
+
+class Case:
+    """One log: its candidates, and what was decided so far."""
+
+    def __init__(
+        self,
+        data: LogData,
+        sources: Sources,
+        configuration: Configuration,
+        vehicle: Vehicle,
+        *,
+        is_known: bool,
+        where: str,
+    ) -> None:
+        self.is_known = is_known
+        self.sources, self.configuration, self.vehicle = sources, configuration, vehicle
+        # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
+        equal = replace(sources, others={**sources.others, "command": ()}, power=None)
+        self.findings: list[Finding] = []
+        self.changes: dict[str, dict[str, object]] = {}
+        self.extraction = Extraction(data, equal, configuration, vehicle, where)
+        self.ahead = _find_ahead(self)
+        if self.ahead is not None:
+            equal = replace(equal, command=self.ahead[0])
+            section = msgspec.structs.replace(configuration.command, time="log")
+            by_log = msgspec.structs.replace(configuration, command=section)
+            self.extraction = Extraction(data, equal, by_log, vehicle, where)
+        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
+        self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
+            find_sideways_share(data.topics, one) for one in drives
+        )
+        self.driven: Explained | None = None
+
+    # Signals.
+
+    def read_gyro(self) -> Reading | None:
+        """The yaw rate of the gyro; None without one."""
+        imu = self.extraction.imu()
+        if not imu.height:
+            return None
+        return Reading("gyro", str(self.sources.imu), None, _hold(imu, "rate_z"))
+
+    def read(
+        self,
+        source: DriveSource,
+        *,
+        is_measured: bool,
+        kind: str = "differential",
+        section: DriveSection | None = None,
+    ) -> Reading | None:
+        """The signals of a source, with unit lengths; None if they cannot be read as the user says."""
+        section = section or self.find_section(source, is_measured=is_measured)
+        self.extraction.vehicle = unit = self.make_unit(source, kind)
+        try:
+            table = self.extraction.read_drive(source, section, held=True)
+        except SlipError:
+            return None
+        if source.form is DriveForm.BODY:
+            names = ("body_x", "body_w", *(["body_y"] if self.moves_sideways else []))
+            signals = (_hold(table, name, may_stand=not is_measured) for name in names)
+            return Reading("body", str(source), *signals)
+        if unit.kind == "ackermann":
+            speed = _hold(table, "speed")
+            bent = Bent(speed, *_column(table, "steering")) if speed.moves else None
+            return Reading("steering", str(source), speed, bent)
+        names = ("left", "right", *(["sideways"] if self.moves_sideways else []))
+        reading = Reading("sides", str(source), *(_hold(table, name) for name in names))
+        if self.moves_sideways and section.reversed is None:
+            backward = msgspec.structs.replace(section, reversed="right")
+            reading.third_crossed = _hold(self.extraction.read_drive(source, backward, held=True), "sideways")
+        return reading
+
+    def make_unit(self, source: DriveSource, kind: str) -> Vehicle:
+        """A vehicle of unit lengths whose inputs are those of a source."""
+        if source.form is DriveForm.STEERING:
+            kind = "ackermann"
+        elif self.moves_sideways:
+            kind = "omni" if source.form is DriveForm.BODY else "mecanum"
+        return Vehicle(
+            id="unit",
+            name="unit",
+            kind=kind,
+            units=self.vehicle.units,
+            wheel_radius_m=1.0,
+            track_width_m=1.0,
+            wheelbase_m=1.0,
+        )
+
+    def find_section(self, source: DriveSource, *, is_measured: bool) -> DriveSection:
+        """What the user says of a source: of the topic that is named, or of any if none is."""
+        of_role = self.configuration.wheels if is_measured else self.configuration.command
+        chosen = self.sources.wheels if is_measured else self.sources.command
+        is_another = chosen is not None and chosen.reason == CONFIGURED and chosen.signals != source.signals
+        return DriveSection() if is_another else of_role
+
+    def read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
+        """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""
+        section = self.complete().wheels
+        reading = self.read(wheels.source, is_measured=True, kind=kind, section=section)
+        made = None if reading is None else reading.explain(motion)
+        if reading is None or made is None or (kind == "ackermann" and not made.sign("turned")):
+            return False
+        wheels.reading = reading
+        return True
+
+    # What the user reads, and what the stages read.
+
+    def correct(
+        self, section: str, what: str, line: str, change: dict[str, object], margin: float | None = None
+    ) -> None:
+        """Apply a correction, or tell it where the user's configuration decides otherwise."""
+        default = type(getattr(self.configuration, section))()
+        given = [
+            key
+            for key in change
+            if getattr(getattr(self.configuration, section), key) != getattr(default, key)
+        ]
+        name = "pose_turned" if section == "pose" else f"{section}_corrected"
+        if "up" in change and not given and self.configuration.pose.axes != default.axes:
+            given = ["axes"]
+        if given and section == "pose":
+            text = f"{what}, but [pose] in run.toml gives {', '.join(given)}, which is taken as it is given"
+            self.findings.append(Finding("pose_contradicted", "warning", text, where=section, value=margin))
+            return
+        if given:
+            text = f"{what}, but [{section}] in run.toml gives {', '.join(given)}: correct it"
+            self.findings.append(Finding("signs_contradict", "error", text, where=section))
+            return
+        self.changes.setdefault(section, {}).update(change)
+        settled = [text for key, text in _AS_RECORDED[section].items() if key in change]
+        otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
+        text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
+        self.findings.append(Finding(name, "warning", text, where=section, value=margin))
+
+    def complete(self) -> Configuration:
+        """The user's configuration with the corrections."""
+        sections = {
+            name: msgspec.structs.replace(getattr(self.configuration, name), **change)
+            for name, change in self.changes.items()
+        }
+        return msgspec.structs.replace(self.configuration, **sections)
+
+    def command_factors(self) -> tuple[float, float]:
+        """Factors from a body command as it was read to m/s and rad/s."""
+        changes = self.changes.get("command", {})
+        return SPEEDS[str(changes.get("unit", "m/s"))], RATES[str(changes.get("yaw_unit", "rad/s"))]
+
+    def wheel_factor(self) -> float:
+        """Factor from the radius of raw wheel speeds to that of rad/s."""
+        changes = self.changes.get("wheels", {})
+        if changes.get("unit") == "m/s":
+            return TAKEN_M
+        return 1.0 / WHEELS[str(changes.get("unit", "rad/s"))] / float(str(changes.get("scale", 1.0)))
+
+
+def _find_ahead(case: Case) -> tuple[DriveSource, float] | None:
+    """A candidate for the command that is stamped after it was recorded, and by how much [s]."""
+    late = {key: one.latency_s for key, one in case.extraction.clocks.items() if one.clock == "header"}
+    if case.configuration.command.time is not None:
+        return None
+    for source in case.sources.rank_drives("command"):
+        own = {signal.topic for signal in source.signals}
+        rest = [latency for topic, latency in late.items() if topic not in own]
+        ahead = -min((late.get(topic, 0.0) for topic in own), default=0.0)
+        if ahead > _AHEAD_S and rest and min(rest) > -_AHEAD_S:
+            return source, ahead
+    return None
+
+
+def _column(table: pl.DataFrame, name: str) -> tuple[Floats, Floats]:
+    """Times and values of a column."""
+    return table["t"].to_numpy(), table[name].cast(pl.Float64).fill_null(np.nan).to_numpy()
+
+
+def _hold(table: pl.DataFrame, name: str, *, may_stand: bool = False) -> Held:
+    """A column as a signal, which counts in the intervals in which commands are live."""
+    return Held(*_column(table, name), may_stand=may_stand, counts=table["active"].to_numpy())

@@ -1,0 +1,216 @@
+"""Roles of signals: which of the candidates are the command and the wheels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.core import Floats, format_duration
+from pipeline.recording.case import Candidate, Case
+from pipeline.recording.evidence import is_named_measured, rate_command
+from pipeline.recording.kinds import settle_turn
+from pipeline.recording.motion import Motion
+from pipeline.recording.readings import Held, Reading
+from pipeline.recording.score import CLEAR, FEWEST_STEPS, fit
+from pipeline.recording.units import settle_steering
+from pipeline.run import LIVE_SHARE
+from pipeline.sources import CONFIGURED, DriveForm, DriveSource, Sources
+from pipeline.stages import Finding
+
+_STILL = 0.1
+"""Gain of the motion on the drive below which a body stands: on ice it is .13 to .26 of the wheels."""
+_EXPLAINED = 0.9
+"""Share of the motion that a signal in a strange unit explains, and vibration does not."""
+_SMALLEST_M = 0.1
+"""Radius of a wheel [m] that counts as small."""
+_MOST = 20
+"""Candidates of a role that are compared, the likeliest by type and name: each costs a fit."""
+_BOTH_WAYS = 0.02
+"""Share of a drive in one direction from which on it goes that way."""
+_MARGIN = 4.0
+"""Gain of another command over the one by type and name that decides [nats]."""
+
+
+def read_drives(case: Case, motion: Motion) -> list[Candidate]:
+    """The candidates for the command and for wheels that can be read, fitted to the motion.
+
+    The likeliest of each by type and name come first.
+    """
+    commands, wheels = (case.sources.rank_drives(role) for role in ("command", "wheels"))
+    drives, taken = [], set()
+    for is_measured, sources in ((False, commands), (True, wheels)):
+        for rank, source in enumerate(sources[:_MOST]):
+            key = (source.form, source.signals)
+            reading = None if key in taken else case.read(source, is_measured=is_measured)
+            if reading is None and key not in taken and is_measured and source == case.sources.wheels:
+                reading = _read_by_motion(case, source, motion)
+            taken.add(key)
+            if reading is not None:
+                drives.append(Candidate(source, reading, rank, is_measured))
+    for drive in drives:
+        drive.reading.explain(motion)
+        settle_steering(case, drive, motion)
+        settle_turn(case, drive, motion)
+    return _leave_out_sizes(case, drives)
+
+
+def _read_by_motion(case: Case, source: DriveSource, motion: Motion) -> Reading | None:
+    """Joints whose names show no side, each put on the side on which it turns; None without."""
+    columns = case.extraction.columns.get(source.signals[0].topic)
+    if source.form is not DriveForm.JOINTS or columns is None or case.configuration.wheels.left is not None:
+        return None
+    times, joints = case.extraction.read_rates(source)
+    body = np.column_stack([motion.body.real, motion.yaw])
+    sides: dict[str, list[str]] = {"left": [], "right": []}
+    for name, rate in joints.items():
+        signal = Held(times, rate)
+        if not signal.moves:
+            continue
+        keep = signal.is_there(motion.steps)
+        if keep.sum() < FEWEST_STEPS:
+            continue
+        steps = motion.steps.take(keep)
+        made = fit(signal.integrate(steps, 0.0, 0.0), body[keep], steps)
+        if min(abs(made.t)) > CLEAR:
+            sides["left" if made.gains[0] * made.gains[1] < 0.0 else "right"].append(name)
+    if not (sides["left"] and sides["right"]):
+        return None
+    names = {side: ", ".join(joined) for side, joined in sides.items()}
+    what = (
+        f"the joints of {source} do not name their side; by the motion {names['left']} are left and "
+        f"{names['right']} right"
+    )
+    line = "; ".join(f"{side} = [{', '.join(repr(one) for one in listed)}]" for side, listed in sides.items())
+    case.correct("wheels", what, line.replace("'", '"'), dict(sides))
+    section = case.complete().wheels
+    return case.read(source, is_measured=True, section=section)
+
+
+def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates without wheel speeds that are sizes alone, as of sensors that know no direction."""
+    asked = [
+        one.reading.first.values
+        for one in drives
+        if one.reading.form == "body" and one.is_sure and one.reading.first is not None
+    ]
+    back = max((min(_share_back(one), _share_back(-one)) for one in asked), default=0.0)
+    signed = []
+    for one in drives:
+        sides = [] if one.reading.form != "sides" else one.reading.inputs
+        if back < _BOTH_WAYS or not sides or any(side.values.min() < 0.0 for side in sides):
+            signed.append(one)
+            continue
+        text = (
+            f"not used: {one.source}: its speeds have no sign: they are never below zero, though the "
+            "body is driven forward and backward"
+        )
+        case.findings.append(Finding("wheels_unsigned", "warning", text, where="wheels"))
+        for role in ("command", "wheels"):
+            if getattr(case.sources, role) == one.source:
+                others = case.sources.rank_drives(role)
+                left = next((other for other in others if other.signals != one.source.signals), None)
+                case.sources = replace(case.sources, **{role: left})  # type: ignore[arg-type]
+    return signed
+
+
+def choose_roles(case: Case, drives: Sequence[Candidate]) -> tuple[Candidate | None, Candidate | None]:
+    """Command and wheels: those by type and name, unless the motion says otherwise."""
+    if _is_still(case, drives):
+        for one in drives:
+            one.reading.explained = None
+    sure = [one for one in drives if one.is_sure and not one.reading.is_constant]
+    earliest = min(
+        (one.reading.explained.lag + one.reading.explained.delay for one in sure if one.reading.explained),
+        default=0.0,
+    )
+    named = command = _find(drives, case.sources.command)
+    # Plain numbers have their roles by name alone: the motion may follow both, and tell them apart. Where
+    # it does not follow the command, the vehicle is driven by other means.
+    is_followed = any(one is command for one in sure)
+    rivals = [
+        one for one in sure if not one.is_measured or (is_followed and one.source.form is DriveForm.SIDES)
+    ]
+    if rivals and (command is None or command.source.reason != CONFIGURED):
+        rates = {id(one): rate_command(one.reading, one.rank, earliest) for one in rivals}
+        best = max(rivals, key=lambda one: rates[id(one)])
+        if command is None or rates[id(best)] > rates.get(id(command), -np.inf) + _MARGIN:
+            if command is not None:
+                _report_command(case, best, command)
+            command = best
+    wheels = _find(drives, case.sources.wheels)
+    if wheels is not None and command is not None and wheels.source.signals == command.source.signals:
+        # What is named as a command measures what the other asks for.
+        is_sides = named is not None and named is not command and named.reading.form == "sides"
+        return command, named if is_sides else None
+    if wheels is None and case.sources.wheels is None:
+        # A pair of sides that is no command measures the wheels.
+        is_free = command is None
+        spare = [one for one in rivals if one is not command and one.reading.form == "sides"]
+        spare = [
+            one
+            for one in spare
+            if is_free or one.source.form is DriveForm.SIDES or is_named_measured(one.reading.name)
+        ]
+        wheels = max(spare, key=lambda one: -one.rank, default=None)
+        if wheels is not None and command is not None and command.reading.form == "sides":
+            wheels = wheels if is_named_measured(wheels.reading.name) else None
+    return command, wheels
+
+
+def _is_still(case: Case, drives: Sequence[Candidate]) -> bool:
+    """Whether the body hardly moves where the drive does: it is stuck, lifted, or another body."""
+    first = _find(drives, case.sources.command) or _find(drives, case.sources.wheels)
+    made = None if first is None else first.reading.explained
+    if first is None or made is None or first.reading.form == "steering":
+        return False
+    scale = case.vehicle.wheel_radius_m if case.is_known and first.reading.form == "sides" else 1.0
+    least = _STILL * scale if case.is_known or first.reading.form == "body" else _STILL * _SMALLEST_M
+    fits = [made.ahead, made.turned, *([made.aside[0]] if made.aside is not None else [])]
+    gains = max(abs(float(one.gains[0])) for one in fits)
+    return gains < least and max(made.shares) < _EXPLAINED
+
+
+def _find(drives: Sequence[Candidate], source: DriveSource | None) -> Candidate | None:
+    return next((one for one in drives if source is not None and one.source.signals == source.signals), None)
+
+
+def _report_command(case: Case, chosen: Candidate, other: Candidate) -> None:
+    text = (
+        f"{chosen.source} is taken for the command, and not {other.source}: the motion follows the first "
+        "later, and the second measures it or is not followed; [command] in run.toml names another"
+    )
+    case.findings.append(Finding("role_by_motion", "info", text, where="command"))
+
+
+def settle_stamps(case: Case, command: Candidate | None) -> None:
+    """Take the times of recording of a command that is stamped after it was recorded."""
+    if case.ahead is None or command is None or command.source.signals != case.ahead[0].signals:
+        return
+    what = (
+        f"the stamps of {command.source} lie {format_duration(case.ahead[1])} after they were recorded, "
+        "and those of the other topics do not: its clock runs ahead"
+    )
+    case.correct("command", what, 'time = "log"', {"time": "log"})
+
+
+def name_sources(case: Case, command: Candidate | None, wheels: Candidate | None) -> Sources:
+    """The sources with these roles, without notes on a choice by name that no longer holds."""
+    made = case.sources
+    for role, drive in (("command", command), ("wheels", wheels)):
+        before, source = getattr(made, role), None if drive is None else drive.source
+        if source is None or source == before:
+            continue
+        rest = [one for one in (before, *made.others.get(role, ())) if one is not None and one != source]
+        notes = tuple(note for note in made.notes if not note.startswith(f"{role}:"))
+        made = replace(made, others={**made.others, role: tuple(rest)}, notes=notes)
+        made = replace(made, command=source) if role == "command" else replace(made, wheels=source)
+    return made
+
+
+def _share_back(speeds: Floats) -> float:
+    """Share of the moving samples in which something goes backward."""
+    top = float(np.quantile(np.abs(speeds), 0.95)) if speeds.size else 0.0
+    moving = np.abs(speeds) > LIVE_SHARE * top
+    return float(np.mean(speeds[moving] < 0.0)) if moving.any() else 0.0

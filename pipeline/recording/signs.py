@@ -1,0 +1,179 @@
+"""Frame of the poses and signs of the other signals: what turns, and what goes the other way."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+from pipeline.core import enumerate_texts
+from pipeline.recording.case import Candidate, Case
+from pipeline.recording.evidence import Axis, Reversal, find_frame, find_reversed
+from pipeline.recording.motion import Motion
+from pipeline.recording.readings import Reading
+from pipeline.sources import PoseContent
+from pipeline.stages import Finding
+
+_HALF_TURN = 180.0
+_AGREE = {"command": "commands", "wheels": "wheels", "gyro": "the gyro"}
+_AGAINST = {"command": "the commands", "wheels": "the measured wheels", "gyro": "the gyro"}
+_FAULTS = {
+    "pose_backward": "the frame of the poses points to the rear, as that of a sensor that is mounted "
+    "backward",
+    "pose_mirrored": "the poses' frame is of the other hand, as north, east, down",
+    "command_ahead": "the sign of linear.x is wrong where it is sent, or both motors are reversed",
+    "command_turned": "the sign of angular.z or of the steering is inverted, or left and right are exchanged",
+    "command_aside": "the sign of linear.y is wrong where it is sent",
+    "command_mirrored": "left and right are exchanged where it is sent",
+    "command_both": "its sign is wrong where it is sent, or both motors are wired backward",
+    "wheels_both": "both encoders count backward",
+    "wheels_exchanged": "left and right encoders are exchanged",
+    "wheels_exchanged_both": "both encoders count backward, and are exchanged",
+    "gyro": "the gyro is mounted upside down",
+}
+_CHANGES: Mapping[str, Mapping[str, object]] = {
+    "wheels_both": {"sign": -1},
+    "wheels_exchanged": {"exchanged": True},
+    "wheels_exchanged_both": {"sign": -1, "exchanged": True},
+}
+_REMEDIES = {
+    "pose_backward": " (heading_deg = 180 under [pose] in run.toml)",
+    "pose_mirrored": ' (up = "-z" under [pose] in run.toml)',
+    "wheels_both": " (sign = -1 under [wheels] in run.toml)",
+    "wheels_exchanged": " (exchanged = true under [wheels] in run.toml)",
+    "wheels_exchanged_both": " (sign = -1 and exchanged = true under [wheels] in run.toml)",
+}
+
+
+def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Motion:
+    """The motion in the frame in which the readings explain it, and the readings fitted to it."""
+    source, section = case.sources.pose, case.configuration.pose
+    if source is None or source.content is not PoseContent.POSE:
+        return motion
+    turned, margin = find_frame(motion, readings)
+    if not margin:
+        return motion
+    if section.heading_deg is not None:
+        text = (
+            f"by the motion the heading of {source} is {turned.offset_deg:.0f} degrees off (or as much "
+            "less half a turn), but [pose] in run.toml gives heading_deg, which is taken as it is given"
+        )
+        case.findings.append(Finding("pose_contradicted", "warning", text, where="pose", value=margin))
+        return motion
+    if turned.flip:
+        text = (
+            f"the headings of {source} turn against its own path: its frame is of the other hand; "
+            "correct what publishes it"
+        )
+        case.findings.append(Finding("pose_flipped", "error", text, where="pose", value=margin))
+    for one in readings:
+        one.explain(turned)
+    return turned
+
+
+def report_signs(
+    case: Case, motion: Motion, command: Candidate | None, wheels: Candidate | None, gyro: Reading | None
+) -> None:
+    """Correct what goes the other way than all other signals, or tell it."""
+    signs: dict[tuple[str, Axis], int] = {}
+    for name, drive in (("command", command), ("wheels", wheels)):
+        if drive is not None:
+            axes: tuple[Axis, ...] = ("ahead", "turned", "aside")
+            sign = drive.sign if drive is command else drive.sign_as_motion
+            signs |= {(name, axis): sign(axis) for axis in axes}
+    if gyro is not None and gyro.explained is not None:
+        signs["gyro", "turned"] = gyro.explained.sign("turned")
+    up, offset = motion.up, motion.offset_deg
+    if up != "z" and -1 in {sign for (_, axis), sign in signs.items() if axis == "turned"}:
+        # Neither way along another axis is usual.
+        up, offset = f"-{up}", -offset
+        signs = {key: sign if key[1] == "ahead" else -sign for key, sign in signs.items()}
+    if offset and -1 in {sign for (_, axis), sign in signs.items() if axis == "ahead"}:
+        offset += 180.0
+        signs = {key: sign if key[1] == "turned" else -sign for key, sign in signs.items()}
+    made = find_reversed(signs)
+    if made.rivals:
+        _report_either(case, made, signs, command, wheels)
+    else:
+        for fault in made.faults:
+            if fault == "pose_backward":
+                offset += 180.0
+            elif fault == "pose_mirrored":
+                up, offset = up.removeprefix("-") if up.startswith("-") else f"-{up}", -offset
+            else:
+                _report_fault(case, fault, command, wheels)
+    _report_frame(case, up, 180.0 - (180.0 - offset) % 360.0, signs)
+
+
+def _report_frame(case: Case, up: str, offset: float, signs: dict[tuple[str, Axis], int]) -> None:
+    source = case.sources.pose
+    who, drivers = _name_witnesses(signs, "turned"), _name_witnesses(signs, "ahead")
+    if up != "z":
+        direction, axis = ("down" if up.startswith("-") else "up"), up.removeprefix("-")
+        what = f"the {axis} axis of the poses of {source} points {direction}"
+        if axis == "z":
+            what += " (north, east, down)"
+        else:
+            what += ", as of motion capture or of a camera's optical frame: the body turns about it"
+        case.correct("pose", f"{what}, as {who} show", f'up = "{up}"', {"up": up})
+    if offset:
+        side = "right" if offset > 0.0 else "left"
+        off = f"{abs(offset):.0f} degrees to the {side}"
+        what = f"the heading of {source} is {off} of the course of {drivers}"
+        if abs(offset) == _HALF_TURN:
+            what = (
+                f"the poses of {source} look to the rear where {drivers} drive ahead (a sensor that is "
+                "mounted backward, or base_link points to the rear)"
+            )
+        case.correct("pose", what, f"heading_deg = {offset:g}", {"heading_deg": float(f"{offset:g}")})
+
+
+def _report_fault(
+    case: Case, fault: str, command: Candidate | None, wheels: Candidate | None, others: Sequence[str] = ()
+) -> None:
+    """Correct or report a fault; the sign of a gyro is fitted by `stages.align`."""
+    drive = wheels if fault.startswith("wheels") else command
+    if fault == "gyro" or drive is None:
+        return
+    change: dict[str, object] = dict(_CHANGES.get(fault, {}))
+    is_car = drive.reading.form == "steering"
+    if change and (drive.reading.form == "sides" or (is_car and fault == "wheels_both")):
+        what = f"the speed of {drive.source} counts backward" if is_car else _FAULTS[fault]
+        line = ", ".join(f"{key} = {str(value).lower()}" for key, value in change.items())
+        case.correct("wheels", what, line, change)
+        return
+    role = "wheels" if drive is wheels else "command"
+    faults = "; or ".join(_FAULTS[one] for one in (fault, *others))
+    text = f"{drive.source} contradicts all other signals: {faults}"
+    case.findings.append(Finding(f"{role}_reversed", "error", text, where=role))
+
+
+def _report_either(
+    case: Case,
+    made: Reversal,
+    signs: dict[tuple[str, Axis], int],
+    command: Candidate | None,
+    wheels: Candidate | None,
+) -> None:
+    """Two signals that contradict each other, with what mends the one and the other."""
+    ways = (made.faults, *made.rivals)
+    if all(len(names) == 1 and names[0].startswith("command") for names in ways):
+        _report_fault(case, made.faults[0], command, wheels, [names[0] for names in made.rivals])
+        return
+    against = sorted({name for (name, _), sign in signs.items() if sign < 0})
+    verbs = {"ahead": "drive", "turned": "turn", "aside": "move sideways"}
+    axes = sorted({axis for (_, axis), sign in signs.items() if sign < 0})
+    remedies = {fault: f"{text}{_REMEDIES.get(fault, '')}" for fault, text in _FAULTS.items()}
+    options = "; or ".join(
+        " and ".join(remedies[name] for name in names) for names in (made.faults, *made.rivals)
+    )
+    text = (
+        f"{' and '.join(_AGAINST[name] for name in against)} and the poses "
+        f"{' and '.join(verbs[axis] for axis in axes)} opposite ways, and no third signal tells which of "
+        f"them is wrong: either {options}"
+    )
+    case.findings.append(Finding("signs_contradict", "error", text, where=f"{against[0]}, pose"))
+
+
+def _name_witnesses(signs: Mapping[tuple[str, Axis], int], axis: Axis) -> str:
+    """The signals that show in which way a body turns, or drives."""
+    there = {name for (name, of), sign in signs.items() if sign and of == axis}
+    return enumerate_texts([word for name, word in _AGREE.items() if name in there]) or "the other signals"

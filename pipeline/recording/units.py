@@ -1,0 +1,191 @@
+"""Units of the signals by the motion, corrected or told."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pipeline.recording.case import TAKEN_M, Candidate, Case, is_crossed
+from pipeline.recording.evidence import (
+    RATES,
+    USUAL,
+    Units,
+    find_body_units,
+    find_pose_unit,
+    find_steering_unit,
+    find_wheel_unit,
+    is_unit_exact,
+)
+from pipeline.recording.geometry import explain_wheels
+from pipeline.recording.motion import Motion, measure_motion
+from pipeline.recording.readings import Bent, Reading
+from pipeline.sources import DriveForm, PoseContent
+from pipeline.stages import Finding
+
+_NEAR = 0.03
+"""Spread of the logarithm of a gyro's scale."""
+
+
+def settle_gyro(case: Case, gyro: Reading, motion: Motion) -> bool:
+    """Whether a gyro turns out to be in degrees per second, and is corrected."""
+    made = gyro.explain(motion)
+    if made is None or not made.sign("turned") or case.configuration.imu.unit is not None:
+        return False
+    apart = np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])
+    if abs(apart) > 4.0 * _NEAR:
+        return False
+    what = f"the gyro of {gyro.name} is in degrees per second"
+    case.correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
+    return True
+
+
+def settle_lengths(
+    case: Case,
+    motion: Motion,
+    readings: Sequence[Reading],
+    command: Candidate | None,
+    wheels: Candidate | None,
+) -> Motion:
+    """The motion in metres, and the readings fitted to it."""
+    source = case.sources.pose
+    if source is None or source.content is not PoseContent.POSE or case.configuration.pose.unit:
+        return motion
+    gains: dict[str, float | None] = {"body": None, "sides": None, "steering": None}
+    for drive in (command, wheels):
+        made = None if drive is None else drive.reading.explained
+        if drive is not None and made is not None and drive.sign("ahead") and not is_crossed(drive):
+            gains[drive.reading.form] = abs(float(made.ahead.gains[0]))
+    radius = case.vehicle.wheel_radius_m if case.is_known else None
+    unit = find_pose_unit(gains["body"] or gains["steering"], gains["sides"], radius)
+    if unit == "m":
+        return motion
+    case.correct("pose", f"the positions of {source} are in {unit}", f'unit = "{unit}"', {"unit": unit})
+    case.extraction.configuration = case.complete()
+    scaled = measure_motion(case.extraction.poses())
+    if scaled is None:
+        return motion
+    scaled = scaled.turn(flip=motion.flip, offset_deg=motion.offset_deg)
+    for one in readings:
+        one.explain(scaled)
+    return scaled
+
+
+def settle_steering(case: Case, drive: Candidate, motion: Motion) -> None:
+    """Read a steering angle in the unit in which the body turns by it; which one it is is told later."""
+    reading = drive.reading
+    section = case.find_section(drive.source, is_measured=drive.is_measured)
+    is_free = drive.source.form is DriveForm.STEERING and section.steering_unit is None
+    if not is_free or drive.source.signals[1].unit or not isinstance(reading.second, Bent):
+        return
+    tried = {"rad": reading, "deg": replace(reading, second=reading.second.rescale(np.pi / 180.0))}
+    nats, lengths = {}, dict[str, float | None]()
+    for unit, one in tried.items():
+        made = one.explain(motion) if unit != "rad" else one.explained
+        nats[unit] = 0.0 if made is None else float((made.turned.blocks - made.none[1]).sum())
+        turns = made is not None and made.sign("turned") and made.sign("ahead")
+        lengths[unit] = (
+            abs(float(made.ahead.gains[0] / made.turned.gains[0])) if made is not None and turns else None
+        )
+    known = case.vehicle.wheelbase_m if case.is_known else None
+    drive.steering = find_steering_unit(nats, lengths, known, str(drive.source))
+    if drive.steering.likeliest[1] == "deg":
+        reading.second, reading.explained = tried["deg"].second, tried["deg"].explained
+
+
+def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) -> None:
+    """Correct the units of the command and of the wheels, or tell two that are as likely."""
+    for role, one in (("command", command), ("wheels", wheels)):
+        if one is not None and one.reading.form == "steering":
+            _report_units(case, role, one, one.steering)
+    if command is not None and command.reading.form != "sides" and _is_usable(command):
+        explained = command.reading.explained
+        if explained is None:
+            return
+        # A car turns by its wheelbase, and not by a unit.
+        turns = command.reading.form == "body" and command.sign("turned")
+        gains = [
+            abs(float(one.gains[0])) if is_seen else None
+            for is_seen, one in ((command.sign("ahead"), explained.ahead), (turns, explained.turned))
+        ]
+        beside = None if wheels is None or not wheels.is_sure else wheels.reading.explained
+        if wheels is not None and beside is not None and wheels.reading.form == "body":
+            # What wheels do of a command is its unit on any ground.
+            fits = (("ahead", beside.ahead), ("turned", beside.turned))
+            gains = [
+                gain / abs(float(one.gains[0])) if gain and wheels.sign(axis) else gain  # type: ignore[arg-type]
+                for gain, (axis, one) in zip(gains, fits, strict=True)
+            ]
+        units = find_body_units(gains, explained.shares, str(command.source))
+        _report_units(case, "command", command, units, gains)
+    if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
+        _find_wheel_unit(case, command, wheels)
+
+
+def _report_units(
+    case: Case, role: str, drive: Candidate, units: Units, gains: Sequence[float | None] = (None, None)
+) -> None:
+    """Correct units of a drive, or tell two readings that are as likely."""
+    section = getattr(case.configuration, role)
+    turn_key, turn = (
+        ("steering_unit", "steering angle") if drive.steering is units else ("yaw_unit", "yaw rate")
+    )
+    for index, (key, what) in enumerate((("unit", "speed"), (turn_key, turn))):
+        unit, of = units.likeliest[index], f"the {what} of {drive.source}"
+        if getattr(section, key) is not None or not unit:
+            continue
+        if unit not in USUAL:
+            speed, gain = units.likeliest[0], gains[0]
+            is_sure = speed in USUAL or gain is None or is_unit_exact(gain, speed)
+            unsure = ", or has no unit, as percent of a throttle, whose gains say nothing of the robot"
+            text = f"{of} is in {unit}{'' if is_sure else unsure}"
+            case.correct(role, text, f'{key} = "{unit}"', {key: unit})
+        elif units.rival is not None and units.rival[index] != unit:
+            other, gain = units.rival[index], gains[index]
+            seen = "" if gain is None else f": the body moves {gain:.3g} times as far as it says"
+            text = (
+                f"{of} may be in {other}{seen}; it is taken as {unit}, and no other signal tells which "
+                f'({key} = "{other}" under [{role}] in run.toml takes it so, {key} = "{unit}" settles it)'
+            )
+            case.findings.append(Finding("unit_undecided", "warning", text, where=role, value=gain))
+
+
+def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -> None:
+    """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
+    explained, share = wheels.reading.explained, 1.0
+    radius = case.vehicle.wheel_radius_m if case.is_known else None
+    driven = None
+    if radius is not None and command is not None:
+        driven = case.driven = explain_wheels(command.reading, wheels.reading)
+    if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
+        # Wheels follow a command closely on any ground.
+        of_command = radius if command.reading.form == "sides" else case.command_factors()[0]
+        gain = of_command / float(driven.ahead.gains[0])
+    elif explained is not None and wheels.is_sure and wheels.sign("ahead"):
+        gain, share = float(explained.ahead.gains[0]), explained.shares[0]
+    else:
+        return
+    correct_wheel_unit(case, wheels, gain, share, radius)
+
+
+def correct_wheel_unit(
+    case: Case, wheels: Candidate, gain: float, share: float, radius: float | None = None
+) -> None:
+    """Correct the unit of wheel speeds, unless the type or the user gives it; see `find_wheel_unit`."""
+    if wheels.source.signals[0].unit or case.configuration.wheels.unit is not None:
+        return
+    unit = find_wheel_unit(gain, share, str(wheels.source), radius)
+    what = f"the wheel speeds of {wheels.source} are in "
+    taken = "" if radius is not None else f": taken as those of wheels of {TAKEN_M} m, which alters no slip"
+    if not unit:
+        what += f"no usual unit (ticks, or turns before a gear?){taken}"
+        scale = float(f"{gain / TAKEN_M:.4g}")
+        case.correct("wheels", what, f"scale = {scale:g}", {"scale": scale})
+    elif unit != "rad/s":
+        what += f"{unit}{taken if unit == 'm/s' else ''}"
+        case.correct("wheels", what, f'unit = "{unit}"', {"unit": unit})
+
+
+def _is_usable(drive: Candidate) -> bool:
+    return drive.is_sure and not is_crossed(drive)
