@@ -62,7 +62,7 @@ STAGES = {
     "learned term": ("pipeline.estimation.learned_step.learn_beyond",),
     "regions of the error": ("pipeline.estimation.error_regions.map_errors",),
     "other conclusions": ("pipeline.estimation.conclude.summarize",),
-    "other search": ("pipeline.estimation.diagnose_runs",),
+    "other search": ("pipeline.estimation.diagnose.diagnose_runs",),
 }
 HERE = Path(__file__).parents[1]
 REST = "everything else"

@@ -5,164 +5,27 @@
 what is not observable, and what no effect of the catalogue explains.
 """
 
-from __future__ import annotations
-
-import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-import msgspec
-from threadpoolctl import threadpool_limits
-
-from pipeline.core import Budget, usual_budget
-from pipeline.estimation import conclude
-from pipeline.estimation.ambiguity import Clocks, find_undecided, find_unobservable, read_clocks
-from pipeline.estimation.comparison import Comparison, Input, InputChoice, choose_input
-from pipeline.estimation.conclude import Explored
-from pipeline.estimation.context import Context, DiagnosisError, prepare
-from pipeline.estimation.decision import Search
-from pipeline.estimation.diagnosis import Diagnosis
-from pipeline.estimation.encoder_scale import find_encoder_scale
-from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
-from pipeline.estimation.intervals import Estimates, estimate_intervals
-from pipeline.estimation.ladder import climb
-from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import (
-    Prediction,
-    Problem,
-    carry_over,
-    predict_at,
-    predict_at_from,
-    predict_from,
-)
-from pipeline.estimation.recordings import Recording, load_recording
-from pipeline.estimation.state import Free, State
-from pipeline.estimation.together import Member, judge_together
-from pipeline.estimation.unexplained import search_formula
-from pipeline.models import Effect, Model, Place
-from pipeline.results import Finding, Named, RunDiagnosis, Value, read_findings
-from pipeline.run import MotionRun, load_run
-from pipeline.sources import Vehicle
+from pipeline.door import open_door
 
 if TYPE_CHECKING:
-    import polars as pl
-
-
-_UNITS = {"": 1.0, "s": 1.0, "min": 60.0, "m": 60.0, "h": 3600.0}
-"""Seconds in a unit of `--budget`."""
-_DURATION = re.compile(r"(\d+(?:\.\d+)?)\s*(s|min|m|h|)")
-
-
-def parse_budget(text: str) -> float:
-    """CPU time [s] of ``60s``, ``2min`` or a number of seconds.
-
-    Raises:
-        DiagnosisError: ``bad_budget``.
-    """
-    match = _DURATION.fullmatch(text.strip())
-    if match is None or float(match[1]) == 0.0:
-        what, hint = f"{text!r} is not a duration above zero", "Write it like 60s or 5min."
-        raise DiagnosisError("bad_budget", what, where="--budget", hint=hint)
-    return float(match[1]) * _UNITS[match[2]]
-
-
-def diagnose_runs(
-    recordings: Sequence[Recording],
-    vehicle: Vehicle,
-    *,
-    inputs: Sequence[str] = ("command", "measured"),
-    model: Model | None = None,
-    budget_s: float | None = None,
-    notify: Callable[[str], None] | None = None,
-) -> Diagnosis:
-    """Identify the physical effects missing from the model of one run, or of several runs of one vehicle.
-
-    Args:
-        recordings: the runs' tables.
-        vehicle: their vehicle.
-        inputs: `command`, `measured` or both; with both, the command leads and the wheels separate the
-            drivetrain from the ground.
-        model: the known model, to which effects are added; the ideal model when None.
-        budget_s: CPU time limit of the search [s]; by default a minute for ten minutes of driving.
-        notify: called with a progress message.
-
-    Returns:
-        One diagnosis per run, those that were judged together first: they share their effects. A run that
-        cannot be judged has none, and its reason as a finding.
-
-    Raises:
-        DiagnosisError: ``too_short`` or ``no_input``, where no run can be judged.
-    """
-    known = () if model is None else model.effects
-    leading = "command" if "command" in inputs else "measured"
-
-    def judge(members: Sequence[Member]) -> Diagnosis:
-        judged = search(members, [one.run for one in members])
-        misread = find_encoder_scale(judged.runs[0])
-        if misread is None:
-            return judged
-        again = search(members, misread.correct([one.run for one in members]))
-        finding = misread.report()
-        runs = (msgspec.structs.replace(run, findings=(finding, *run.findings)) for run in again.runs)
-        return replace(again, runs=tuple(runs))
-
-    def search(members: Sequence[Member], runs: Sequence[MotionRun]) -> Diagnosis:
-        chosen = choose_input(runs, inputs[0] if len(inputs) == 1 else None, known)
-        context = prepare(runs, vehicle, chosen.source)
-        driven = sum(run.duration_s for run in runs)
-        budget = Budget(usual_budget(driven) if budget_s is None else budget_s, notify)
-        # With more threads, the order of summation would depend on the number of cores.
-        with threadpool_limits(limits=1, user_api="blas"):
-            paths, clocks = _explore(context, chosen.source, known, budget)
-            return _conclude([one.recording for one in members], context, chosen, paths, clocks)
-
-    return judge_together(recordings, vehicle, leading, judge)
-
-
-def _explore(
-    context: Context, source: Input, known: Sequence[Effect], budget: Budget
-) -> tuple[list[Explored], Clocks]:
-    """Explore all available paths: ground and drivetrain separately, or both together without encoders."""
-    problem, path = context.problem, source
-    if not context.is_drive_alone and source is Input.COMMAND and context.has_encoders:
-        problem, path = context.problem.behind_wheels, Input.MEASURED
-    usable = [e for e in known if path is Input.COMMAND or e.place > Place.DRIVE]
-    candidates = context.list_candidates(path)
-    search = Search(problem.parts[0], candidates, context.conditions, frozenset(e.id for e in usable), budget)
-    body = _explore_part(context, search, path.value, problem.start_state(usable))
-    paths, state = [body], body.outcome.final.state
-    if path is not source:
-        driven = [e for e in known if e.place <= Place.DRIVE]
-        candidates, given = context.list_drivetrain(), frozenset(e.id for e in driven)
-        search = Search(context.problem.parts[1], candidates, context.conditions, given, budget)
-        paths.append(_explore_part(context, search, "wheels", State((), state.timing).add(*driven)))
-    return paths, read_clocks(context, state, path)
-
-
-def _explore_part(context: Context, search: Search, path: str, start: State) -> Explored:
-    outcome = search.run(start)
-    formula = None
-    if path != "wheels" and not context.is_drive_alone:
-        sideways = context.vehicle.kinematics.has_inputs("sideways")
-        outcome, formula = search_formula(search, outcome, sideways=sideways)
-    unobservable, detectable = find_unobservable(search, outcome)
-    undecided = tuple(find_undecided(search, outcome))
-    return Explored(path, search, outcome, formula, undecided, unobservable, tuple(detectable))
-
-
-def _conclude(
-    recordings: Sequence[Recording],
-    context: Context,
-    chosen: InputChoice,
-    paths: Sequence[Explored],
-    clocks: Clocks,
-) -> Diagnosis:
-    whole, delays = conclude.summarize(context, chosen.source, paths, clocks, recordings[0].length_scale_m)
-    (common,) = whole.runs
-    common = msgspec.structs.replace(common, input_reason=chosen.reason)
-    runs = tuple(
-        conclude.of_run(common, recording, number, delays[number], context)
-        for number, recording in enumerate(recordings)
+    from pipeline.estimation.comparison import Comparison, Input, choose_input
+    from pipeline.estimation.diagnose import diagnose_runs, parse_budget
+    from pipeline.estimation.diagnosis import Diagnosis
+    from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
+    from pipeline.estimation.intervals import Estimates, estimate_intervals
+    from pipeline.estimation.ladder import climb
+    from pipeline.estimation.model_fit import Fitted, fit_model
+    from pipeline.estimation.problem import (
+        Prediction,
+        Problem,
+        carry_over,
+        predict_at,
+        predict_at_from,
+        predict_from,
     )
-    return replace(whole, runs=runs)
+    from pipeline.estimation.recordings import Recording, load_recording
+    from pipeline.estimation.state import Free, State
+else:
+    __getattr__ = open_door(__name__, __file__)
