@@ -1,12 +1,14 @@
 """One log through all stages: its results, preview and plan; and stored runs, opened by log or name."""
 
+from __future__ import annotations
+
 import json
 import tempfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import msgspec
 
@@ -26,9 +28,6 @@ from pipeline.core import (
 from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
-from pipeline.report import lead_up
-from pipeline.report.drive_pages import read_preview
-from pipeline.report.scene import RunReport
 from pipeline.results import RunDiagnosis
 from pipeline.store import (
     DIAGNOSIS,
@@ -46,6 +45,9 @@ from pipeline.store import (
     stored_contexts,
     stored_keys,
 )
+
+if TYPE_CHECKING:
+    from pipeline.report.scene import RunReport
 
 SUMMARY = "summary.json"
 
@@ -226,6 +228,8 @@ def _write_outputs(
     generation = work.generation
     if options.report or options.figures:
         # Importing the plotting code is most of the start-up time: only if needed.
+        from pipeline.report import lead_up  # noqa: PLC0415
+        from pipeline.report.drive_pages import read_preview  # noqa: PLC0415
         from pipeline.report.motion_view import view_diagnosis  # noqa: PLC0415
         from pipeline.report.page import render_report  # noqa: PLC0415
         from pipeline.report.scene import NOT_DIAGNOSED, RunReport  # noqa: PLC0415

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import kendalltau, mannwhitneyu
 
 from pipeline.core import CONFIDENCE, Flags, Floats, SlipError
 
@@ -83,6 +82,8 @@ def cliffs_delta(a: ArrayLike, b: ArrayLike) -> float:
         StatisticsError: a side is empty or contains a value that is not finite.
     """
     first, second = check_values(a, what="values"), check_values(b, what="values")
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 - heavy
+
     above = float(mannwhitneyu(second, first, method="asymptotic").statistic)
     pairs = first.size * second.size
     return (above - (pairs - above)) / pairs
@@ -113,6 +114,8 @@ def mann_whitney(a: ArrayLike, b: ArrayLike) -> float:
     first, second = check_values(a, what="samples"), check_values(b, what="samples")
     if np.ptp(np.concatenate((first, second))) == 0.0:
         return 1.0
+    from scipy.stats import mannwhitneyu  # noqa: PLC0415 - heavy
+
     return float(mannwhitneyu(first, second, method="asymptotic").pvalue)
 
 
@@ -129,6 +132,8 @@ def kendall_tau(a: ArrayLike, b: ArrayLike) -> float:
         StatisticsError: fewer than two things, or a value that is not finite.
     """
     first, second = check_values(a, what="values", fewest=2), check_values(b, what="values", fewest=2)
+    from scipy.stats import kendalltau  # noqa: PLC0415 - heavy
+
     tau = float(kendalltau(first, second).statistic)
     return 0.0 if math.isnan(tau) else tau
 

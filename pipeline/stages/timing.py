@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import solveh_banded
-from scipy.optimize import isotonic_regression
 
 from pipeline.core import (
     LONGEST_WAIT_S,
@@ -479,6 +478,8 @@ def _list_terms(track: Track) -> Floats:
 
 def _take_off(track: Track, ages: Floats) -> Floats:
     """Stamps minus the ages, changed as little as their order and the way between poses require."""
+    from scipy.optimize import isotonic_regression  # noqa: PLC0415 - heavy
+
     least = np.append(0.0, np.cumsum(_find_least_waits(track)))
     ordered: Floats = isotonic_regression(track.times - ages - least).x + least
     return ordered
