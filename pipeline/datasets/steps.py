@@ -269,12 +269,16 @@ class _Scan:
 
     @property
     def grain(self) -> float:
-        """Standard error of the step that is determined best, no less than by the stated errors."""
+        """Standard error of the size of the step that is determined best; of equal values by their errors."""
         if not self.places.size or self.freedom < FEWEST_FREE:
             return math.inf
         explained, whole = self._weigh(self.y[None, :])
         scale = (float(whole[0]) - float(explained.max())) / self.freedom
-        return math.sqrt(max(scale, 1.0)) / float(self.norms.max())
+        return math.sqrt(1.0 if self._is_level(whole) else max(scale, 0.0)) / float(self.norms.max())
+
+    def _is_level(self, whole: Floats) -> bool:
+        """Whether the design leaves no more than rounding of the values."""
+        return float(whole[0]) <= 1e-18 * float(self.y @ self.y)
 
     def ask(self, rng: np.random.Generator, level: float) -> tuple[float, float]:
         """Return p of the largest step, and the F ratio of probability `level`."""
@@ -283,7 +287,7 @@ class _Scan:
         drawn = self._rate(rng.standard_normal((_SHIFT_DRAWS, self.y.size)) * self.draw_deviations(rng))
         limit = float(np.quantile(drawn, 1.0 - level))
         whole = self._weigh(self.y[None, :])[1]
-        if float(whole[0]) <= 1e-18 * float(self.y @ self.y):
+        if self._is_level(whole):
             return 1.0, limit
         seen = self._rate(self.y[None, :])[0]
         return (1 + int(np.count_nonzero(drawn >= seen))) / (_SHIFT_DRAWS + 1), limit
