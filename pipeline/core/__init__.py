@@ -114,6 +114,7 @@ if TYPE_CHECKING:
         guess_names,
         make_plain,
         mark_finding,
+        name_first,
         naming_os_errors,
         shorten,
         split_interval,

@@ -138,6 +138,11 @@ def enumerate_texts(texts: Sequence[str]) -> str:
     return " and ".join(filter(None, [", ".join(texts[:-1]), *texts[-1:]]))
 
 
+def name_first(names: Sequence[str], most: int = 4) -> list[str]:
+    """Names; of more than so many the first ones, and how many others."""
+    return [*names] if len(names) <= most else [*names[: most - 1], f"{len(names) - most + 1} others"]
+
+
 def format_digits(value: float, digits: int = 2) -> str:
     """A number of so many significant digits, at least those before the point; a whole number for 0."""
     leading = math.floor(math.log10(abs(value))) if value and math.isfinite(value) else 0

@@ -8,7 +8,16 @@ from itertools import compress
 
 import polars as pl
 
-from pipeline.core import INPUT_WORDS, NORMAL_95, finite_or_none, format_count, guess_names, pick, suffix_unit
+from pipeline.core import (
+    INPUT_WORDS,
+    NORMAL_95,
+    finite_or_none,
+    format_count,
+    guess_names,
+    name_first,
+    pick,
+    suffix_unit,
+)
 from pipeline.datasets.compared_runs import ComparedRuns, find_material
 from pipeline.datasets.forecast import leave_out_odd, list_numbers
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError, gather_runs
@@ -580,10 +589,11 @@ def _note_what_lacks(series: Sequence[Series], parameters: Sequence[ParameterTre
         if number.odd:
             notes.append(f"{number.label} of {number.vehicle} stands apart in {', '.join(number.odd)}")
     notes += [
-        f"{', '.join(labels)} of {vehicle}, left out where a run does not determine it: {', '.join(runs)}"
+        f"{', '.join(name_first(labels))} of {vehicle}, left out where a run does not determine it: "
+        f"{', '.join(runs)}"
         for (vehicle, runs), labels in lost.items()
     ]
-    return [*notes, *(f"{', '.join(labels)} of {need}" for need, labels in needs.items())]
+    return [*notes, *(f"{', '.join(name_first(labels))} of {need}" for need, labels in needs.items())]
 
 
 def summarize_trend(trend: Trend) -> dict[str, object]:

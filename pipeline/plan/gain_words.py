@@ -3,15 +3,19 @@
 import math
 from collections.abc import Iterator, Sequence
 
-from pipeline.core import enumerate_texts, format_count, format_digits, format_duration, suffix_unit
+from pipeline.core import (
+    enumerate_texts,
+    format_count,
+    format_digits,
+    format_duration,
+    name_first,
+    suffix_unit,
+)
 from pipeline.models import name_term
 from pipeline.plan.plan import ExpectedGain, Plan
 
 Row = tuple[str, str, str]
 """A question, what the logs so far say of it, and what the drive adds."""
-
-_MOST_NAMES = 4
-"""Names of a row: more make it too long for a screen. The JSON object has all."""
 
 
 def list_gains(plan: Plan) -> list[Row]:
@@ -74,8 +78,4 @@ def _name(gain: ExpectedGain) -> str:
 
 
 def _join(gains: Sequence[ExpectedGain]) -> str:
-    """Names of questions; of many the first, and how many more."""
-    names = [_name(one) for one in gains]
-    if len(names) > _MOST_NAMES:
-        names[_MOST_NAMES - 1 :] = [f"{len(names) - _MOST_NAMES + 1} others"]
-    return enumerate_texts(names)
+    return enumerate_texts(name_first([_name(one) for one in gains]))
