@@ -96,20 +96,15 @@ def examine(
         return Recording(sources, configuration)
     try:
         case = Case(data, sources, configuration, vehicle, is_known=is_known, where=where)
-        motion, gyro = measure_motion(case.extraction.poses()), case.read_gyro()
+        motion = measure_motion(case.extraction.poses())
+        if motion is None:
+            return Recording(sources, configuration)
+        motion, gyro = settle_gyro(case, motion)
     except SlipError:
         # The stage `extract` raises it again.
         return Recording(sources, configuration)
-    if motion is None:
-        return Recording(sources, configuration)
-    if gyro is not None and settle_gyro(case, gyro, motion):
-        # Headings of positions alone are made of the gyro.
-        case.extraction.take_degrees()
-        motion, gyro = measure_motion(case.extraction.poses()) or motion, case.read_gyro()
     drives = read_drives(case, motion)
     gyros = [] if gyro is None else [gyro]
-    for one in gyros:
-        one.explain(motion)
     readings = [*(drive.reading for drive in drives), *gyros]
     motion = turn_motion(case, motion, readings)
     command, wheels = choose_roles(case, drives)

@@ -28,17 +28,22 @@ _NEAR = 0.03
 """Spread of the logarithm of a gyro's scale."""
 
 
-def settle_gyro(case: Case, gyro: Reading, motion: Motion) -> bool:
-    """Whether a gyro turns out to be in degrees per second, and is corrected."""
-    made = gyro.explain(motion)
-    if made is None or not made.sign("turned") or case.configuration.imu.unit is not None:
-        return False
-    apart = np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])
-    if abs(apart) > 4.0 * _NEAR:
-        return False
+def settle_gyro(case: Case, motion: Motion) -> tuple[Motion, Reading | None]:
+    """The motion and the gyro, if there is one, fitted to it; one in degrees per second is corrected."""
+    gyro = case.read_gyro()
+    made = None if gyro is None else gyro.explain(motion)
+    if gyro is None or made is None or not made.sign("turned") or case.configuration.imu.unit is not None:
+        return motion, gyro
+    if abs(np.log(abs(float(made.turned.gains[0])) / RATES["deg/s"])) > 4.0 * _NEAR:
+        return motion, gyro
     what = f"the gyro of {gyro.name} is in degrees per second"
     case.correct("imu", what, 'unit = "deg/s"', {"unit": "deg/s"})
-    return True
+    # Headings of positions alone are made of the gyro.
+    case.extraction.take_degrees()
+    motion, gyro = measure_motion(case.extraction.poses()) or motion, case.read_gyro()
+    if gyro is not None:
+        gyro.explain(motion)
+    return motion, gyro
 
 
 def settle_lengths(
