@@ -56,6 +56,34 @@ def test_a_decision_needs_several_stretches_however_large_one_is() -> None:
     assert Answerable(question, (even,), groups).answer(np.array([1.0, 1.0, 0.0, 0.0])) < 1.0
 
 
+def test_the_evidence_of_the_logs_so_far_counts() -> None:
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    # Four stretches of a drive that alone reach t = 3.
+    evidence = Evidence(np.zeros((4, 0, 0)), np.zeros((4, 0)), np.full(4, 9.0), np.zeros((0, 0)))
+    groups, drive = Groups(np.full(4, 10.0), np.arange(4), before_s=60.0), np.ones(4)
+    for now, reached in ((0.0, 3.0), (4.0, 5.0)):
+        question = Separation("a or b", ("a", "b"), (model, model), both_ways=False, now=now)
+        one = Answerable(question, (evidence,), groups)
+        assert float(one.measure(drive)) == pytest.approx(reached)
+        assert (float(one.answer(drive)) >= 1.0) == (reached >= DECIDED_T)
+        # Three times the drive decides also what the logs say nothing of.
+        assert float(one.answer(3.0 * drive)) == 1.0
+
+
+def test_an_interval_starts_from_what_the_diagnosis_states() -> None:
+    model = Hypothesis((), (), np.zeros((0, 0)))
+    evidence = Evidence(np.full((8, 1, 1), 100.0), np.zeros((8, 1)), np.zeros(8), np.array([[800.0]]))
+    groups, drive = Groups(np.full(8, 7.0), np.arange(8), before_s=56.0), np.ones(8)
+    plain, wide = (
+        Answerable(Precision("k", ("k",), model, 0, 0.01, now), (evidence,), groups) for now in (0.0, 1.0)
+    )
+    assert float(wide.measure(0.0 * drive)) == pytest.approx(1.0)
+    # As much driving again narrows both by the same factor.
+    narrowed = [float(one.measure(drive) / one.measure(0.0 * drive)) for one in (plain, wide)]
+    assert narrowed[0] == pytest.approx(narrowed[1])
+    assert 0.6 < narrowed[0] < 0.75
+
+
 def test_what_is_named_is_kept_apart_from_what_looks_like_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
