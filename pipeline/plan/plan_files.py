@@ -247,7 +247,10 @@ def check_plan(promised: Promised, diagnosis: RunDiagnosis) -> Check:
     still = [
         f"{' or '.join(group.candidates)}: {describe_separation(group)}" for group in diagnosis.undecided
     ]
-    still += [f"{name}: {suggest_drive(name)}" for name in diagnosis.unobservable_why]
+    hidden: dict[str, list[str]] = {}
+    for name in diagnosis.unobservable_why:
+        hidden.setdefault(suggest_drive(name), []).append(name)
+    still += [f"{', '.join(names)}: {advice}" for advice, names in hidden.items()]
     return Check(answers, tuple(still))
 
 

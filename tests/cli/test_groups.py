@@ -60,7 +60,7 @@ def test_the_folder_of_results_is_one_option_and_nothing_else_has_its_name() -> 
         "model literature", "model show", "model trust", "model untrust", "model trusted", "simulate",
     }  # fmt: skip
     for names in options.values():
-        assert not names & {"--out", "--known"} - ({"--known"} if "--for" in names else set())
+        assert not names & {"--out", "--known"}
 
 
 def test_no_option_has_a_negative_that_means_nothing() -> None:
