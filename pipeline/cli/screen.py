@@ -324,6 +324,8 @@ def _format_end(summary: Summary, said: str, *, unchanged: bool) -> list[str]:
     elif RunReport(summary).is_refused:
         log = _relative(str(mapping_in(summary, "log").get("path") or "LOG"))
         lines.append(_row("next", f"slip inspect {shlex.quote(log)}"))
+    if stored.get("undecided"):
+        lines.append(_row("next", f"slip plan {name}{said}    the drive that tells what is undecided"))
     report = summary.get("report")
     if isinstance(report, str):
         lines.append(_row("report", _relative(report)))
