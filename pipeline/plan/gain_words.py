@@ -38,8 +38,8 @@ def summarize_gains(plan: Plan) -> str:
     parts = [f"answers {answered} of them"] if answered else []
     if told := len(plan.promises) - answered:
         parts.append(f"adds to {told}")
-    told_text = f"this drive {' and '.join(parts) or 'tells nothing of them'}"
-    return f"{format_count(len(plan.gains), 'question')}; {told_text}"
+    count = format_count(len(plan.gains), "question")
+    return f"{count}; this drive {' and '.join(parts)}" if parts else count
 
 
 def _describe(gain: ExpectedGain, duration_s: float) -> Row:
