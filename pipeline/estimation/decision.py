@@ -8,7 +8,7 @@ by anything after it. Models are compared by their likelihood less `PRICE` for e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -303,6 +303,10 @@ class Search:
             if not weak:
                 return fit
             fit = self._drop(fit, [min(weak)[1]])
+
+    def refuse(self, fit: PartFit, given: Collection[str]) -> PartFit:
+        """The model without effects that are not accepted beside its others, those given among them."""
+        return replace(self, given=self.given.union(given))._refuse(fit)[0]
 
     def _refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
         """The model without effects that are not accepted beside its others, and how each was judged.

@@ -63,7 +63,7 @@ def search_formula(
         beside = wide.run(final.state)
         for fit in (beside.final, *(rival.judged.fit for rival in beside.rivals)):
             # An effect that only imitated what a formula describes goes.
-            offer = search.prune(fit)
+            offer = search.refuse(fit, [one.id for one in _list_terms(fit)])
             gone = set(final.ids) - set(offer.ids)
             offers.append(
                 (offer, search.fit(final.state.drop(gone)), 2.0 * PRICE) if gone else (offer, final, EQUAL)
