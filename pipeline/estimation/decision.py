@@ -170,7 +170,44 @@ class Search:
 
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
-        first = current = self.fit(start)
+        first = other = self.fit(start)
+        result, least = None, math.inf
+        while other is not None:
+            # Models are compared with all that improves them, what is not accepted in the end included.
+            extended, refused = self._extend_all(other)
+            if result is not None and not find_cost(extended) < least:
+                break
+            least = find_cost(extended)
+            result, other = self._conclude(first, extended, refused)
+        return result
+
+    def _conclude(
+        self, first: PartFit, extended: PartFit, refused: Sequence[Judged]
+    ) -> tuple[SearchResult, PartFit | None]:
+        """The result with a model's accepted effects, and a better model with others in the place of one."""
+        current, judged = self._refuse(extended)
+        rivals, better = list[Rival](), list[Judged]()
+        for name, one in judged.items():
+            if self.budget.is_spent():
+                break
+            for other in self.list_rivals(current, one.base, [name]):
+                behind = other.cost - find_cost(current)
+                is_new = behind < EQUAL and not set(other.added) & set(current.ids)
+                # An error of the data sheet, too small for a name, may be as good an explanation as a name.
+                is_possible = not other.refusal or self._is_unnamed(other)
+                if is_new and is_possible and self.replaces(current, other):
+                    rivals.append(Rival(name, other, behind))
+                if not other.refusal and behind < -EQUAL:
+                    better.append(other)
+        result = SearchResult(
+            first, current, tuple(judged), judged, tuple(rivals), tuple(refused), self.screen(current)
+        )
+        chosen = _choose(better)
+        other = self._try_wholes(current) if chosen is None else chosen.fit
+        return result, None if other is None else self.prune(other)
+
+    def _extend_all(self, current: PartFit) -> tuple[PartFit, list[Judged]]:
+        """The model extended until nothing is accepted, and the extensions of it that were not."""
         refused = list[Judged]()
         while not self.budget.is_spent():
             self.budget.report(self.part.title, current.ids)
@@ -185,28 +222,11 @@ class Search:
                 self.given |= set(small.added)
                 continue
             better = None if chosen is None else self.prune(chosen.fit)
-            if better is None or not find_cost(better) < find_cost(current):
-                # What an extension makes superfluous may have been worth more than it.
-                better = self._exchange(current)
+            # What an extension makes superfluous may have been worth more than it.
             if better is None or not find_cost(better) < find_cost(current):
                 break
             current = better
-        return self._conclude(first, *self._refuse(current), refused)
-
-    def _conclude(
-        self, first: PartFit, current: PartFit, judged: dict[str, Judged], refused: Iterable[Judged]
-    ) -> SearchResult:
-        rivals = list[Rival]()
-        for name, one in judged.items():
-            for other in self.list_rivals(current, one.base, [name]):
-                behind = other.cost - find_cost(current)
-                is_new = behind < EQUAL and not set(other.added) & set(current.ids)
-                # An error of the data sheet, too small for a name, may be as good an explanation as a name.
-                is_possible = not other.refusal or self._is_unnamed(other)
-                if is_new and is_possible and self.replaces(current, other):
-                    rivals.append(Rival(name, other, behind))
-        new = tuple(judged)
-        return SearchResult(first, current, new, judged, tuple(rivals), tuple(refused), self.screen(current))
+        return current, refused
 
     @property
     def _least_t(self) -> float:
@@ -330,21 +350,6 @@ class Search:
         """How effects of the last model are judged against the model without them."""
         return self._judge(self._drop(fit, names), fit, is_final=True)
 
-    def _exchange(self, current: PartFit) -> PartFit | None:
-        """A better model with others in the place of one effect, or with an effect for its special cases."""
-        for names in self._list_groups(current):
-            if self.budget.is_spent():
-                return None
-            without = self._drop(current, names)
-            best = _choose([one for one in self.list_rivals(current, without, names) if not one.refusal])
-            if best is not None and best.cost < find_cost(current) - EQUAL:
-                return self.prune(best.fit)
-        for candidate in self.candidates:
-            whole = self._try_whole(current, candidate)
-            if whole is not None:
-                return whole
-        return None
-
     def _list_groups(self, current: PartFit) -> list[tuple[str, ...]]:
         """Effects that may stand for others: each, and each two whose numbers the data hardly separate."""
         free = [name for name in current.ids if name not in self.given]
@@ -379,6 +384,10 @@ class Search:
         parts = new if len(new) > 1 else []
         return all(find_cost(self.fit(current.state.add(one))) > other.cost + margin for one in parts)
 
+    def _try_wholes(self, current: PartFit) -> PartFit | None:
+        """A better model with an effect in the place of its special cases and companions."""
+        return next((one for candidate in self.candidates if (one := self._try_whole(current, candidate))), None)
+
     def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""
         effect = candidate()
@@ -396,7 +405,7 @@ class Search:
         if find_cost(fit) > own - EQUAL:
             return None
         judged = self._judge(base, fit, is_final=False)
-        return None if judged.refusal else self.prune(fit)
+        return None if judged.refusal else fit
 
 
 def _choose(judged: Sequence[Judged]) -> Judged | None:
