@@ -175,7 +175,7 @@ class Search:
         while other is not None:
             # Models are compared with all that improves them, what is not accepted in the end included.
             extended, refused = self._extend_all(other)
-            if result is not None and not find_cost(extended) < least:
+            if result is not None and not find_cost(extended) < least - EQUAL:
                 break
             least = find_cost(extended)
             result, other = self._conclude(first, extended, refused)
@@ -197,7 +197,7 @@ class Search:
                 is_possible = not other.refusal or self._is_unnamed(other)
                 if is_new and is_possible and self.replaces(current, other):
                     rivals.append(Rival(name, other, behind))
-                if not other.refusal and behind < -EQUAL:
+                if not other.refusal and behind < -EQUAL and not set(other.fit.ids) <= set(extended.ids):
                     better.append(other)
         result = SearchResult(
             first, current, tuple(judged), judged, tuple(rivals), tuple(refused), self.screen(current)
@@ -342,9 +342,12 @@ class Search:
                 refused = [one for one in pairs if one.refusal]
             if not refused:
                 return fit, alone
-            # The least gain goes first.
-            least = min(refused, key=lambda one: (float(np.nan_to_num(one.gain)), one.added))
-            fit = self._drop(fit, least.added)
+            while refused:
+                # The least gain goes first; without it the next may be accepted.
+                least = min(refused, key=lambda one: (float(np.nan_to_num(one.gain)), one.added))
+                fit = self._drop(fit, least.added)
+                others = [one.added for one in refused if not set(one.added) & set(least.added)]
+                refused = [one for names in others if (one := self._judge_last(fit, names)).refusal]
 
     def _judge_last(self, fit: PartFit, names: Collection[str]) -> Judged:
         """How effects of the last model are judged against the model without them."""

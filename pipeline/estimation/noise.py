@@ -40,6 +40,8 @@ _SAME, _MOST_ROUNDS = 0.005, 80
 """Difference of chi-square at which the likelihood of both numbers has converged, and rounds until then."""
 _FARTHEST = 8.0
 """Largest logit of a share or a correlation."""
+_LOGS = 16
+"""Variances whose product is taken before its logarithm."""
 _SCALE_ROUNDS = 30
 _SAME_SCALE = 1e-4
 """Relative change of a scale at which it has converged."""
@@ -270,24 +272,30 @@ def _find_cost(
         size: room for the sizes of the innovations, shape (n,).
     """
     noise, decay = 1.0 - share, math.log(max(phi, 1e-300)) / step_s
-    of_a, of_both, of_n, a, n, logs, span, keep = share, 0.0, noise, 0.0, 0.0, 0.0, 0.0, 1.0
+    of_a, of_both, of_n, a, n, span, keep = share, 0.0, noise, 0.0, 0.0, 0.0, 1.0
+    logs, product = 0.0, 1.0
     for row in range(values.size):
         if fresh[row]:
             of_a, of_both, of_n, a, n = share, 0.0, noise, 0.0, 0.0
         variance = of_a + of_n - 2.0 * of_both + noise
-        gain_a, gain_n = (of_a - of_both) / variance, noise / variance
+        inverse = 1.0 / variance
+        gain_a, gain_n = (of_a - of_both) * inverse, noise * inverse
         if spans[row] != span:
             span = spans[row]
             keep = math.exp(decay * span)
         fresh_part = values[row] - a + n
-        size[row] = abs(fresh_part) / math.sqrt(variance)
+        size[row] = abs(fresh_part) * math.sqrt(inverse)
         a = keep * (a + gain_a * fresh_part)
         n = gain_n * fresh_part
         after = of_a - gain_a * gain_a * variance
         of_both = -keep * gain_a * gain_n * variance
         of_n = noise - gain_n * gain_n * variance
         of_a = keep * keep * after + (1.0 - keep * keep) * share
-        logs += math.log(variance)
+        # One logarithm for some variances, all between a thousandth and a few.
+        product *= variance
+        if row % _LOGS == 0:
+            logs, product = logs + math.log(product), 1.0
+    logs += math.log(product)
     scale, cost = _find_scale(size), 0.0
     for value in size:
         z = value / scale
