@@ -52,7 +52,7 @@ STAGES = {
         "pipeline.estimation.ambiguity.choose_reaching",
     ),
     "ladder: fits": ("pipeline.estimation.fit.fit_model",),
-    "ladder: data not seen": ("pipeline.estimation.folds.hold_out",),
+    "ladder: data not seen": ("pipeline.estimation.held_out.hold_out",),
     "ladder: which effect is next": ("pipeline.estimation.ladder._predict_error",),
     "noise floor": ("pipeline.estimation.floor.estimate_floor",),
     "intervals": ("pipeline.estimation.intervals.estimate_intervals",),

@@ -36,7 +36,6 @@ from pipeline.core import SlipError
 from pipeline.core.arrays import Floats
 from pipeline.estimation import Fitted, HeldOut, Input, Problem, hold_out
 from pipeline.estimation.learned_step import add_term, learn_where_it_helps, make_learned_step
-from pipeline.estimation.problem import fit_as_it_is
 from pipeline.estimation.rivals import (
     Contest,
     Learned,
@@ -48,6 +47,7 @@ from pipeline.estimation.rivals import (
     time_fit,
 )
 from pipeline.estimation.stored_diagnosis import find_diagnosis
+from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import Model
 from pipeline.models.effect import Late
 from pipeline.models.literature import list_models

@@ -24,7 +24,7 @@ os.environ.update({"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"})
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Problem, choose_input, fit_model
-from pipeline.estimation.folds import score
+from pipeline.estimation.held_out import score
 from pipeline.models import Model, find_effect
 from pipeline.run import load_motion_run
 from pipeline.simulate import simulate_case

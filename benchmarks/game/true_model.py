@@ -14,7 +14,7 @@ from pathlib import Path
 
 from game.draw import Answer
 from pipeline.estimation import Input, Problem, Recording, fit_model, hold_out, load_recording
-from pipeline.estimation.folds import measure_errors
+from pipeline.estimation.errors import measure_errors
 from pipeline.models import Effect, Model, ModelFile, find_effect, format_model
 from pipeline.models.effect import Late, find_late
 from pipeline.models.model_file import parse_model

@@ -17,11 +17,12 @@ from pipeline.datasets import ModelFit, fit_to_runs, read_runs
 from pipeline.estimation import Problem, State
 from pipeline.estimation.additions import Tries
 from pipeline.estimation.comparison import choose_input
+from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import list_parameters
-from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import find_share_removed
-from pipeline.estimation.problem import carry_over, fit_as_it_is, predict_at_from
+from pipeline.estimation.prediction import predict_at_from
 from pipeline.estimation.tolerance import limit_speeds, limits_as_json
+from pipeline.estimation.transfer import carry_over, fit_as_it_is
 from pipeline.export import export_model, read_current
 from pipeline.models import (
     CHANNELS,

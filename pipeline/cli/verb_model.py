@@ -47,7 +47,7 @@ from pipeline.core import INPUT_WORDS
 if TYPE_CHECKING:
     from pipeline.datasets import ModelFit
     from pipeline.estimation.across_runs import Coverage
-    from pipeline.estimation.problem import Transfer
+    from pipeline.estimation.transfer import Transfer
     from pipeline.models import Model, ModelFile
     from pipeline.run import MotionRun
 
@@ -232,7 +232,7 @@ def compare(  # noqa: D417 - the shared options document themselves
     from pipeline.estimation.across_runs import describe_coverage  # noqa: PLC0415
     from pipeline.estimation.comparison import choose_input  # noqa: PLC0415 - heavy
     from pipeline.estimation.learned_step import check_bands  # noqa: PLC0415
-    from pipeline.estimation.problem import carry_over  # noqa: PLC0415
+    from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
 
     paths = list(dict.fromkeys(path for path in (model, other) if path is not None))
     if against is None:
@@ -380,7 +380,7 @@ def _change(
         MotionError: ``no_help``, with ``must_help``: the file is unchanged.
     """
     from pipeline.datasets import fit_to_runs  # noqa: PLC0415 - heavy
-    from pipeline.estimation.problem import carry_over  # noqa: PLC0415
+    from pipeline.estimation.transfer import carry_over  # noqa: PLC0415
     from pipeline.models import format_model, write_model  # noqa: PLC0415
 
     # Excluded effects would be lost from the file: raise this error before a long fit.
@@ -448,7 +448,7 @@ def _terrains(file: ModelFile) -> list[str]:
 
 
 def _transfer_as_json(name: str, item: Transfer) -> dict[str, object]:
-    from pipeline.estimation.folds import errors_as_json  # noqa: PLC0415 - heavy
+    from pipeline.estimation.errors import errors_as_json  # noqa: PLC0415 - heavy
 
     return {
         "model": name,

@@ -32,7 +32,7 @@ from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast,
 from pipeline.datasets.levels import draw_run
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.problem import predict_at_from, predict_from
+from pipeline.estimation.prediction import predict_at_from, predict_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
 from pipeline.run import TABLE_COLUMNS, MotionError, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle

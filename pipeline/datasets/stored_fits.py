@@ -8,8 +8,9 @@ from pipeline.datasets.compared_runs import find_run_refusal
 from pipeline.datasets.pooling import ComparisonError
 from pipeline.estimation.additions import explain_refusals
 from pipeline.estimation.comparison import InputChoice, choose_input
+from pipeline.estimation.errors import Errors, errors_as_json
 from pipeline.estimation.estimates import correlations_as_json, parameters_as_json
-from pipeline.estimation.folds import Errors, errors_as_json, measure_by_terrain
+from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, note_fit, step_as_json
 from pipeline.estimation.learned_step import judge_learned_term, judge_with_term
 from pipeline.estimation.problem import Problem

@@ -13,19 +13,15 @@ if TYPE_CHECKING:
     from pipeline.estimation.comparison import Comparison, Input, choose_input
     from pipeline.estimation.diagnose import diagnose_runs, parse_budget
     from pipeline.estimation.diagnosis import Diagnosis
-    from pipeline.estimation.folds import Errors, HeldOut, hold_out, score
+    from pipeline.estimation.errors import Errors
+    from pipeline.estimation.held_out import HeldOut, hold_out, score
     from pipeline.estimation.intervals import Estimates, estimate_intervals
     from pipeline.estimation.ladder import climb
     from pipeline.estimation.model_fit import Fitted, fit_model
-    from pipeline.estimation.problem import (
-        Prediction,
-        Problem,
-        carry_over,
-        predict_at,
-        predict_at_from,
-        predict_from,
-    )
+    from pipeline.estimation.prediction import Prediction, predict_at, predict_at_from, predict_from
+    from pipeline.estimation.problem import Problem
     from pipeline.estimation.recordings import Recording, load_recording
     from pipeline.estimation.state import Free, State
+    from pipeline.estimation.transfer import carry_over
 else:
     __getattr__ = open_door(__name__, __file__)

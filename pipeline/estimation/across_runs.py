@@ -27,7 +27,7 @@ from pipeline.core import CONFIDENCE, Floats, Ints, format_share
 from pipeline.estimation.comparison import Comparison
 from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import PartFit, invert
-from pipeline.estimation.folds import HeldOut, number_predictions
+from pipeline.estimation.held_out import HeldOut, number_predictions
 from pipeline.estimation.parts import tie_prior
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import Prior, State

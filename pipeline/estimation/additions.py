@@ -16,7 +16,8 @@ from pipeline.core import format_share
 from pipeline.estimation.candidates import Screen
 from pipeline.estimation.context import Context
 from pipeline.estimation.decision import LEAST_T, measure_t
-from pipeline.estimation.folds import Errors, number_predictions
+from pipeline.estimation.errors import Errors
+from pipeline.estimation.held_out import number_predictions
 from pipeline.estimation.intervals import estimate_intervals
 from pipeline.estimation.ladder import LadderStep, judge_whole, lowers_errors, raises_errors
 from pipeline.estimation.learned_step import explain_no_help

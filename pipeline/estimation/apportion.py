@@ -24,7 +24,7 @@ from pipeline.core import (
     nearest_indices,
     student_quantile,
 )
-from pipeline.estimation.folds import HeldOut, score
+from pipeline.estimation.held_out import HeldOut, score
 from pipeline.estimation.ladder import Judgement
 from pipeline.estimation.problem import Problem
 from pipeline.results import ABOVE_FLOOR, Moments, Share, SlipBudget, Span

@@ -24,6 +24,7 @@ from pipeline.estimation.constancy import find_change
 from pipeline.estimation.diagnosis import Diagnosis
 from pipeline.estimation.driving_need import Curve, measure_need, narrow_intervals, thin_growth
 from pipeline.estimation.error_regions import find_main_region, is_narrow, map_errors, pick_regions
+from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import (
     list_by_run,
     list_estimates,
@@ -32,7 +33,6 @@ from pipeline.estimation.estimates import (
     note_grounds,
     was_aligned,
 )
-from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, list_order, note_fit
 from pipeline.estimation.learned_step import learn_beyond, summarize_learned
 from pipeline.estimation.plausibility import measure_moves

@@ -18,7 +18,8 @@ import numpy as np
 
 from pipeline.core import Flags, Floats, enumerate_texts, format_errors, suffix_unit
 from pipeline.estimation.decision import LEAST_T, list_costs
-from pipeline.estimation.folds import find_in_test, refit, refit_fold, score
+from pipeline.estimation.folds import refit
+from pipeline.estimation.held_out import find_in_test, refit_fold, score
 from pipeline.models import name_term
 from pipeline.results import CHANGE, ERRORS_OVER_2S, Finding
 
@@ -27,7 +28,7 @@ if TYPE_CHECKING:
 
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.fit import PartFit
-    from pipeline.estimation.folds import HeldOut
+    from pipeline.estimation.held_out import HeldOut
     from pipeline.estimation.ladder import Judgement
     from pipeline.estimation.parts import Part
     from pipeline.estimation.state import Free, State

@@ -8,7 +8,7 @@ by anything after it. Models are compared by their likelihood less `PRICE` for e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -24,7 +24,7 @@ from pipeline.estimation.parts import HORIZONS_S
 from pipeline.estimation.plausibility import is_nameable, is_too_small
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Iterable, Sequence
+    from collections.abc import Collection, Sequence
 
     from pipeline.core import Floats, Ints
     from pipeline.estimation.noise import Noise
@@ -170,14 +170,15 @@ class Search:
 
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
-        first = other = self.fit(start)
-        result, least = None, math.inf
+        first = self.fit(start)
+        extended, refused = self._extend_all(first)
+        result, other = self._conclude(first, extended, refused)
         while other is not None:
             # Models are compared with all that improves them, what is not accepted in the end included.
+            before = find_cost(extended)
             extended, refused = self._extend_all(other)
-            if result is not None and not find_cost(extended) < least - EQUAL:
+            if not find_cost(extended) < before - EQUAL:
                 break
-            least = find_cost(extended)
             result, other = self._conclude(first, extended, refused)
         return result
 
@@ -185,7 +186,7 @@ class Search:
         self, first: PartFit, extended: PartFit, refused: Sequence[Judged]
     ) -> tuple[SearchResult, PartFit | None]:
         """The result with a model's accepted effects, and a better model with others in the place of one."""
-        current, judged = self._refuse(extended)
+        current, judged = self.refuse(extended)
         rivals, better = list[Rival](), list[Judged]()
         for name, one in judged.items():
             if self.budget.is_spent():
@@ -203,8 +204,8 @@ class Search:
             first, current, tuple(judged), judged, tuple(rivals), tuple(refused), self.screen(current)
         )
         chosen = _choose(better)
-        other = self._try_wholes(current) if chosen is None else chosen.fit
-        return result, None if other is None else self.prune(other)
+        fit = self._try_wholes(current) if chosen is None else chosen.fit
+        return result, None if fit is None else self.prune(fit)
 
     def _extend_all(self, current: PartFit) -> tuple[PartFit, list[Judged]]:
         """The model extended until nothing is accepted, and the extensions of it that were not."""
@@ -324,11 +325,7 @@ class Search:
                 return fit
             fit = self._drop(fit, [min(weak)[1]])
 
-    def refuse(self, fit: PartFit, given: Collection[str]) -> PartFit:
-        """The model without effects that are not accepted beside its others, those given among them."""
-        return replace(self, given=self.given.union(given))._refuse(fit)[0]
-
-    def _refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
+    def refuse(self, fit: PartFit) -> tuple[PartFit, dict[str, Judged]]:
         """The model without effects that are not accepted beside its others, and how each was judged.
 
         Effects whose numbers are correlated are judged together, too: one may only undo what the other does.
@@ -389,7 +386,8 @@ class Search:
 
     def _try_wholes(self, current: PartFit) -> PartFit | None:
         """A better model with an effect in the place of its special cases and companions."""
-        return next((one for candidate in self.candidates if (one := self._try_whole(current, candidate))), None)
+        tried = (self._try_whole(current, candidate) for candidate in self.candidates)
+        return next((one for one in tried if one is not None), None)
 
     def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""

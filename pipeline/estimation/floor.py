@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pipeline.estimation.folds import Errors
+from pipeline.estimation.errors import Errors
 from pipeline.estimation.window_residuals import average_lags, make_features, regress_robustly
 from pipeline.models import Timing
 from pipeline.run import HORIZON_S, WINDOW_S
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from pipeline.core import Floats
     from pipeline.estimation.comparison import Comparison
     from pipeline.estimation.parts import Part
-    from pipeline.estimation.problem import Problem
 
 # Noise floor: the errors that remain for a model that explains all but noise.
 #
@@ -24,16 +23,16 @@ if TYPE_CHECKING:
 # of what it leaves (`noise.Noise`) says in closed form how the sum of increments spreads with time.
 
 
-def estimate_floor(problem: Problem, residual: Floats) -> Errors:
+def estimate_floor(part: Part, residual: Floats, windows: int) -> Errors:
     """The errors of a model that explains everything but noise and random motion.
 
     They refer to measured wheels if all runs have them, else to the command.
 
     Args:
-        problem: the runs.
+        part: of the path, which ends at the body.
         residual: increments that a model leaves, from which it is estimated, shape (n, 3).
+        windows: number of windows of the runs.
     """
-    part = problem.parts[0]
     rest = _explain_all(part, residual)
     noise = part.learn(rest)
     after = np.linspace(noise.step_s, HORIZON_S, 8)
@@ -56,7 +55,7 @@ def estimate_floor(problem: Problem, residual: Floats) -> Errors:
         r_mean_rad=math.sqrt(2.0 / math.pi) * float(yaw.mean()),
         t_median_m=math.sqrt(math.log(2.0)) * float(position.mean()),
         r_median_rad=0.6745 * float(yaw.mean()),
-        windows=int(problem.whole.run.size),
+        windows=windows,
     )
 
 

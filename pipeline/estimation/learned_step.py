@@ -17,18 +17,13 @@ from threadpoolctl import threadpool_limits
 
 from pipeline.core import FOLDS, Flags, Floats, Ints, format_share, robust_spreads
 from pipeline.estimation.comparison import Input
-from pipeline.estimation.folds import (
-    Errors,
-    HeldOut,
-    find_in_test,
-    hold_out,
-    number_predictions,
-    score,
-)
+from pipeline.estimation.errors import Errors
+from pipeline.estimation.held_out import HeldOut, find_in_test, hold_out, number_predictions, score
 from pipeline.estimation.ladder import Judgement, LadderStep, find_share_removed, judge_whole
 from pipeline.estimation.model_fit import Fitted, fit_model
-from pipeline.estimation.problem import FEWEST_WINDOWS, Problem, fit_as_it_is
+from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.state import State
+from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.estimation.window_residuals import CLIP
 from pipeline.models import (
     INPUTS,

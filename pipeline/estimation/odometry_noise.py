@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import Complex, Floats
-from pipeline.estimation.folds import find_in_test, refit_fold
+from pipeline.estimation.held_out import find_in_test, refit_fold
 from pipeline.estimation.problem import FEWEST_WINDOWS
 from pipeline.estimation.tolerance import fit_mean_squares
 from pipeline.export.odometry import UPDATE_M, UPDATE_RAD

@@ -34,7 +34,8 @@ from pipeline.core import (
     student_quantile,
 )
 from pipeline.estimation.comparison import Comparison, Input
-from pipeline.estimation.folds import HeldOut, errors_as_json, hold_out, number_predictions, score
+from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.held_out import HeldOut, hold_out, number_predictions, score
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
@@ -43,7 +44,7 @@ from pipeline.results import ERRORS_OVER_2S, read_error
 from pipeline.run import WINDOW_S, MeasuredDrive, MotionError, Rolling, RunContext, Velocity, roll_ideally
 
 if TYPE_CHECKING:
-    from pipeline.estimation.folds import HeldOut
+    from pipeline.estimation.held_out import HeldOut
     from pipeline.estimation.model_fit import Fitted
     from pipeline.estimation.state import State
 

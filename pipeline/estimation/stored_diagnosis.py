@@ -64,7 +64,7 @@ def add_model(
         MotionError: the model is of another kind of vehicle.
     """
     from pipeline.estimation import Input  # noqa: PLC0415 - heavy
-    from pipeline.estimation.problem import predict_at  # noqa: PLC0415 - heavy
+    from pipeline.estimation.prediction import predict_at  # noqa: PLC0415 - heavy
 
     slip, model = _remove_model(slip), file.model
     findings = [

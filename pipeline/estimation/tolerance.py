@@ -23,9 +23,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from pipeline.core import CONFIDENCE, JSON_DIGITS, STRETCH_S, Floats, Ints, finite_or_none, pick_finite
-from pipeline.estimation.folds import find_in_test, number_predictions, refit_fold
+from pipeline.estimation.held_out import find_in_test, number_predictions, refit_fold
 from pipeline.estimation.model_fit import fit_model
-from pipeline.estimation.problem import Problem, fit_as_it_is
+from pipeline.estimation.problem import Problem
+from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import drop_learned
 from pipeline.run import HORIZON_S, NODE_S, STILL_MPS, WINDOW_S, MotionError
 

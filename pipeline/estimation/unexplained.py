@@ -11,7 +11,7 @@ import numpy as np
 
 from pipeline.estimation.candidates import PRICE
 from pipeline.estimation.decision import EQUAL, Search, SearchResult, find_cost
-from pipeline.estimation.folds import errors_as_json
+from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.terms import CHANNELS, is_term, join_formula, list_terms
 from pipeline.models import format_effect
@@ -63,7 +63,8 @@ def search_formula(
         beside = wide.run(final.state)
         for fit in (beside.final, *(rival.judged.fit for rival in beside.rivals)):
             # An effect that only imitated what a formula describes goes.
-            offer = search.refuse(fit, [one.id for one in _list_terms(fit)])
+            beside_it = replace(search, given=search.given.union(one.id for one in _list_terms(fit)))
+            offer, _ = beside_it.refuse(fit)
             gone = set(final.ids) - set(offer.ids)
             offers.append(
                 (offer, search.fit(final.state.drop(gone)), 2.0 * PRICE) if gone else (offer, final, EQUAL)

@@ -14,8 +14,8 @@ from pipeline.estimation import Comparison, Input, Problem, State, fit_model
 from pipeline.estimation.across_runs import tie_to_prior
 from pipeline.estimation.decision import list_costs
 from pipeline.estimation.fit import PartFit
+from pipeline.estimation.largest import average_sustained, measure_largest
 from pipeline.estimation.model_fit import Fitted
-from pipeline.estimation.problem import average_sustained, measure_largest
 from pipeline.estimation.state import Free
 from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models import Effect, Excitation, Largest, Model, Place, Timing

@@ -30,11 +30,12 @@ from pipeline.estimation.additions import explain_refusal, explain_refusals
 from pipeline.estimation.apportion import apportion, find_half
 from pipeline.estimation.context import Context
 from pipeline.estimation.error_regions import map_errors, pick_regions
-from pipeline.estimation.folds import errors_as_json, score
+from pipeline.estimation.errors import errors_as_json
+from pipeline.estimation.held_out import score
 from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
-from pipeline.estimation.problem import predict_at_from
+from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.results import RunDiagnosis, SlipBudget, list_excess, read_result

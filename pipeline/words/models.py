@@ -13,7 +13,7 @@ from pipeline.core import (
     number_in,
     split_interval,
 )
-from pipeline.estimation.folds import Errors
+from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import Ladder, LadderStep
 from pipeline.estimation.rivals import Contest, Rival
 from pipeline.estimation.tolerance import FEWEST_PREDICTIONS, Answer, SpeedLimit

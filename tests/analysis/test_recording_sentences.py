@@ -19,7 +19,7 @@ from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.core import JSON_DIGITS, finite_or_none
 from pipeline.datasets.check import check_runs
-from pipeline.estimation.problem import average_sustained
+from pipeline.estimation.largest import average_sustained
 from pipeline.estimation.stored_diagnosis import read_diagnosis
 from pipeline.models.parameter import EXCEEDED_SHARE, OVERSHOOT
 from pipeline.store import Store

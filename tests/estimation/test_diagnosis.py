@@ -23,8 +23,8 @@ from pipeline.estimation import (
     diagnose_runs,
     load_recording,
 )
+from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import expect_another_run, list_values
-from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.intervals import Estimate
 from pipeline.estimation.ladder import judge_whole
 from pipeline.estimation.state import Free

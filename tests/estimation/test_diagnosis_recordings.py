@@ -11,7 +11,7 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Comparison, Errors, Input, Problem, diagnose_runs, fit_model, load_recording
-from pipeline.estimation.folds import measure_errors
+from pipeline.estimation.errors import measure_errors
 from pipeline.estimation.plausibility import find_implausible
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import Model, Timing, find_effect

@@ -15,8 +15,8 @@ import pytest
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Input, Problem, carry_over, diagnose_runs, load_recording
+from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.estimates import parameters_as_json
-from pipeline.estimation.folds import errors_as_json
 from pipeline.estimation.ladder import judge_model, ladder_as_json
 from pipeline.estimation.stored_diagnosis import read_recording
 from pipeline.models import read_model, write_model

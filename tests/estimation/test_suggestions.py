@@ -11,9 +11,9 @@ import pytest
 from verbs import run_verb
 
 from pipeline.estimation.additions import rank_named
-from pipeline.estimation.folds import Errors
+from pipeline.estimation.errors import Errors
 from pipeline.estimation.ladder import lowers_errors, raises_errors
-from pipeline.estimation.problem import _is_one_speed
+from pipeline.estimation.largest import _is_one_speed
 from pipeline.estimation.terms import list_terms
 from pipeline.models import Model, find_effect, read_model
 from pipeline.models.formula import FormulaEffect

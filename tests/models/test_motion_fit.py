@@ -16,7 +16,8 @@ from pipeline.estimation import (
     predict_from,
     score,
 )
-from pipeline.estimation.folds import GAP_S, measure_by_terrain
+from pipeline.estimation.folds import GAP_S
+from pipeline.estimation.held_out import measure_by_terrain
 from pipeline.estimation.ladder import judge_model, judge_whole
 from pipeline.estimation.unexplained import summarize_disturbance
 from pipeline.models import Model, Timing, find_effect

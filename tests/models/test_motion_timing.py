@@ -10,7 +10,7 @@ from motion_runs import QUIET, align, make_scenario, tables_of, vehicle_of
 from pipeline.core import rigid
 from pipeline.core.arrays import nearest_indices
 from pipeline.estimation import Comparison, Input, Problem, fit_model
-from pipeline.estimation.problem import predict_from
+from pipeline.estimation.prediction import predict_from
 from pipeline.models import Model, find_effect
 from pipeline.run import MotionRun, load_run
 from pipeline.simulate import Imu, simulate_run

@@ -5,7 +5,7 @@ import pytest
 
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
-from pipeline.estimation.problem import predict_at_from
+from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Model, Timing, find_effect
 from pipeline.report.motion_view import MotionStage
 from pipeline.run import load_run

@@ -9,7 +9,7 @@ import pytest
 from workbench_server import RUN, Workbench
 
 from pipeline.estimation import Input
-from pipeline.estimation.problem import predict_at
+from pipeline.estimation.prediction import predict_at
 from pipeline.models import read_model
 from pipeline.run import load_motion_run
 from pipeline.sources.one_vehicle import load_vehicle
