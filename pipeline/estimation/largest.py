@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from pipeline.core import Floats
 from pipeline.models import EXCEEDED_SHARE, Largest
 from pipeline.run import WINDOW_S, MotionRun, find_fastest_wheel, name_inputs, split_wheels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from pipeline.core import Floats
     from pipeline.sources import Vehicle
 
 _MOSTLY = 0.99
