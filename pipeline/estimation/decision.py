@@ -50,8 +50,10 @@ _UNUSUAL = 8.0
 a wrong track, a lag or a limit."""
 SHOWN = 0.1
 """Share by which an effect must lower a held-out error over one of `HORIZONS_S`."""
+_RISE = SHOWN / 2.0
+"""Share by which it may raise one: a smaller rise is nothing that anybody would notice."""
 _RISEN = 0.02
-"""Probability below which a rise of any of the held-out errors by half of `SHOWN` is no chance. Where few
+"""Probability below which a rise of any of the held-out errors by `_RISE` is no chance. Where few
 blocks tell nothing of chance, none may rise by more than the largest fall."""
 _ALIKE = 0.3
 """Correlation of two numbers from which on their effects may stand for one common cause."""
@@ -198,14 +200,13 @@ class Search:
                 is_possible = not other.refusal or self._is_unnamed(other)
                 if is_new and is_possible and self.replaces(current, other):
                     rivals.append(Rival(name, other, behind))
-                if not other.refusal and behind < -EQUAL and not set(other.fit.ids) <= set(extended.ids):
+                if self._is_better(other, current):
                     better.append(other)
         result = SearchResult(
             first, current, tuple(judged), judged, tuple(rivals), tuple(refused), self.screen(current)
         )
         chosen = _choose(better)
-        fit = self._try_wholes(current) if chosen is None else chosen.fit
-        return result, None if fit is None else self.prune(fit)
+        return result, None if chosen is None else self.prune(chosen.fit)
 
     def _extend_all(self, current: PartFit) -> tuple[PartFit, list[Judged]]:
         """The model extended until nothing is accepted, and the extensions of it that were not."""
@@ -223,11 +224,35 @@ class Search:
                 self.given |= set(small.added)
                 continue
             better = None if chosen is None else self.prune(chosen.fit)
-            # What an extension makes superfluous may have been worth more than it.
             if better is None or not find_cost(better) < find_cost(current):
+                # What an extension makes superfluous may have been worth more than it.
+                better = self._exchange(current)
+            if better is None:
                 break
             current = better
         return current, refused
+
+    def _exchange(self, current: PartFit) -> PartFit | None:
+        """A better model with others in the place of one effect, or with an effect for its special cases."""
+        for candidate in self.candidates:
+            whole = self._try_whole(current, candidate)
+            if whole is not None:
+                return whole
+        for name in current.ids:
+            if name in self.given or self.budget.is_spent():
+                continue
+            others = self.list_rivals(current, self._drop(current, [name]), [name])
+            best = _choose([one for one in others if self._is_better(one, current)])
+            if best is not None:
+                return self.prune(best.fit)
+        return None
+
+    def _is_better(self, other: Judged, current: PartFit) -> bool:
+        """Whether a model is accepted, more likely than another one, and raises none of its errors."""
+        if other.refusal or other.cost >= find_cost(current) - EQUAL:
+            return False
+        _, rise, _ = _compare_horizons(current.horizon_errors, other.fit.horizon_errors)
+        return rise <= _RISE
 
     @property
     def _least_t(self) -> float:
@@ -384,11 +409,6 @@ class Search:
         parts = new if len(new) > 1 else []
         return all(find_cost(self.fit(current.state.add(one))) > other.cost + margin for one in parts)
 
-    def _try_wholes(self, current: PartFit) -> PartFit | None:
-        """A better model with an effect in the place of its special cases and companions."""
-        tried = (self._try_whole(current, candidate) for candidate in self.candidates)
-        return next((one for one in tried if one is not None), None)
-
     def _try_whole(self, current: PartFit, candidate: Candidate) -> PartFit | None:
         """The model with an effect in the place of its special cases and companions, where it is better."""
         effect = candidate()
@@ -406,7 +426,7 @@ class Search:
         if find_cost(fit) > own - EQUAL:
             return None
         judged = self._judge(base, fit, is_final=False)
-        return None if judged.refusal else fit
+        return None if judged.refusal else self.prune(fit)
 
 
 def _choose(judged: Sequence[Judged]) -> Judged | None:
@@ -489,7 +509,7 @@ def judge(
         refusal = "the held-out error does not fall"
     elif stable < STABLE_T:
         refusal = "ten seconds bring it all"
-    elif (is_final and rise > SHOWN / 2.0) or float(np.nanmin(falls, initial=0.0)) < -most:
+    elif (is_final and rise > _RISE) or float(np.nanmin(falls, initial=0.0)) < -most:
         refusal = f"the error {risen} rises"
     elif most < (SHOWN if is_final else SHOWN / 2.0):
         refusal = f"no error falls by more than {format_share(most)}"
