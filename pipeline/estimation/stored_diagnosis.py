@@ -106,7 +106,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 49
+VERSION = 50
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
