@@ -16,7 +16,7 @@ from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
 from pipeline.stages import (
-    TOLD_POSES,
+    POSE_FINDINGS,
     Finding,
     align_tables,
     checks,
@@ -182,7 +182,7 @@ class Work:
         reports = {name: checked.report for name, checked in extracted.items()}
         broken = {name: report for name, report in reports.items() if report.quarantined}
         # Of poses the stage itself tells which they are.
-        told = {"poses": sum(one.count or 0 for one in made.findings if one.id in TOLD_POSES)}
+        counted = {"poses": sum(one.count or 0 for one in made.findings if one.id in POSE_FINDINGS)}
         excluded = [
             Finding(
                 "quarantined_rows",
@@ -193,7 +193,7 @@ class Work:
                 count=report.quarantined,
             )
             for name, report in broken.items()
-            if report.quarantined != told.get(name)
+            if report.quarantined != counted.get(name)
         ]
         notes = [Finding("log_note", "info", note, where="log") for note in data.notes]
         notes += [Finding("log_unchecked", "info", data.unchecked, where="log")] if data.unchecked else []

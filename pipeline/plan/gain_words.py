@@ -27,17 +27,17 @@ def list_gains(plan: Plan) -> list[Row]:
     for is_within in (True, False):
         same = [one for one in presences if math.isfinite(one.decided_after_s) == is_within]
         if same:
-            after = f"seen {_say_when(same, duration_s)}, if {'it acts' if len(same) == 1 else 'they act'}"
+            after = f"seen {_format_when(same, duration_s)}, if {'it acts' if len(same) == 1 else 'they act'}"
             rows.append((_join(same), "not seen", after))
-    return [*rows, *_describe_left(plan.left)]
+    return [*rows, *_describe_unanswered(plan.unanswered)]
 
 
 def summarize_gains(plan: Plan) -> str:
     """How many questions are open, and of how many the drive tells something."""
     answered = sum(math.isfinite(one.decided_after_s) for one in plan.promises)
     parts = [f"answers {answered} of them"] if answered else []
-    if told := len(plan.promises) - answered:
-        parts.append(f"adds to {told}")
+    if added := len(plan.promises) - answered:
+        parts.append(f"adds to {added}")
     count = format_count(len(plan.gains), "question")
     return f"{count}; this drive {' and '.join(parts)}" if parts else count
 
@@ -45,21 +45,21 @@ def summarize_gains(plan: Plan) -> str:
 def _describe(gain: ExpectedGain, duration_s: float) -> Row:
     if gain.kind != "interval":
         now = f"{name_term(gain.effects[0])} likelier" if gain.now > 0.0 else "undecided"
-        return _name(gain), now, f"decided {_say_when([gain], duration_s)}"
+        return _name(gain), now, f"decided {_format_when([gain], duration_s)}"
     unit = suffix_unit(gain.unit)
     after = [f"±{format_digits(gain.expected)}{unit}"]
     if gain.drives:
-        after.append(f"±{format_digits(gain.goal)} (5 %) {_say_when([gain], duration_s)}")
+        after.append(f"±{format_digits(gain.goal)} (5 %) {_format_when([gain], duration_s)}")
     return _name(gain), f"{gain.value:.3g} ±{format_digits(gain.now)}{unit}", "; ".join(after)
 
 
-def _describe_left(gains: Sequence[ExpectedGain]) -> Iterator[Row]:
+def _describe_unanswered(gains: Sequence[ExpectedGain]) -> Iterator[Row]:
     """Questions that the drive leaves open, those that need the same together."""
     for needs in dict.fromkeys(one.needs for one in gains):
         yield _join([one for one in gains if one.needs == needs]), "not by this drive", needs
 
 
-def _say_when(gains: Sequence[ExpectedGain], duration_s: float) -> str:
+def _format_when(gains: Sequence[ExpectedGain], duration_s: float) -> str:
     """From when on all of these are answered."""
     if all(math.isfinite(one.decided_after_s) for one in gains):
         return f"after {format_duration(max(one.decided_after_s for one in gains))}"

@@ -83,7 +83,7 @@ class ExpectedGain:
     needs: str = ""
 
     @property
-    def tells(self) -> bool:
+    def informs(self) -> bool:
         """Whether the drive tells something: repeated it answers the question, or it narrows the interval."""
         narrows = self.kind == "interval" and format_digits(self.expected) != format_digits(self.now)
         return self.drives > 0 or (narrows and self.expected < self.now)
@@ -127,12 +127,12 @@ class Plan:
     @property
     def promises(self) -> tuple[ExpectedGain, ...]:
         """Questions of which the drive tells something."""
-        return tuple(one for one in self.gains if one.tells)
+        return tuple(one for one in self.gains if one.informs)
 
     @property
-    def left(self) -> tuple[ExpectedGain, ...]:
+    def unanswered(self) -> tuple[ExpectedGain, ...]:
         """Questions of which it tells nothing."""
-        return tuple(one for one in self.gains if not one.tells)
+        return tuple(one for one in self.gains if not one.informs)
 
     def format_limits(self) -> str:
         """All limits, and which of them are what the runs reached."""
@@ -165,7 +165,7 @@ class Plan:
             ],
             "impossible": [
                 {"question": one.question, "effects": list(one.effects), "because": one.needs}
-                for one in self.left
+                for one in self.unanswered
             ],
         }
 
@@ -223,12 +223,12 @@ def make_plan(
             chosen = [library[number] for number in chooser.choose(reserve)]
             trial = _rehearse(knowledge, questions, request.area, chosen, models)
             # What tells nothing is not driven.
-            if trial.answered <= best.answered or not any(one.tells for one in trial.gains):
+            if trial.answered <= best.answered or not any(one.informs for one in trial.gains):
                 break
             best = trial
-            if all(math.isfinite(one.decided_after_s) for one in best.gains if one.tells):
+            if all(math.isfinite(one.decided_after_s) for one in best.gains if one.informs):
                 break
-        notify("what other drives would tell")
+        notify("what other drives would add")
         best = replace(best, gains=_advise(best, chooser, knowledge, questions, request.limits))
     commands, ways = best.commands, best.ways
     return Plan(
@@ -268,8 +268,8 @@ def _advise(
 
     An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at twice the limits.
     """
-    left = {one.question for one in best.gains if not one.tells}
-    asked = [one for one in questions if one.text in left]
+    unanswered = {one.question for one in best.gains if not one.informs}
+    asked = [one for one in questions if one.text in unanswered]
     harder, options = limits.raise_within(knowledge.vehicle)
     judged = {one.question.text: one for one in chooser.questions}
     faster = {one.question.text: one for one in _judge_library(knowledge, asked, harder)[1]} if asked else {}
@@ -277,7 +277,7 @@ def _advise(
     gains = []
     for one in best.gains:
         needs = ""
-        if one.question in left:
+        if one.question in unanswered:
             if any(
                 Excitation.SLOPE in effect.needs for effect in list_concerned(judged[one.question].question)
             ):

@@ -110,8 +110,8 @@ def _leave_out_sizes(case: Case, drives: Sequence[Candidate]) -> list[Candidate]
         for role in ("command", "wheels"):
             if getattr(case.sources, role) == one.source:
                 others = case.sources.rank_drives(role)
-                left = next((other for other in others if other.signals != one.source.signals), None)
-                case.sources = replace(case.sources, **{role: left})  # type: ignore[arg-type]
+                instead = next((other for other in others if other.signals != one.source.signals), None)
+                case.sources = replace(case.sources, **{role: instead})  # type: ignore[arg-type]
     return signed
 
 

@@ -136,7 +136,7 @@ class Track:
     findings: tuple[Finding, ...] = field(default=())
 
 
-TOLD_POSES: Final = frozenset({"bad_quaternion", "bad_pose", "poses_apart"})
+POSE_FINDINGS: Final = frozenset({"bad_quaternion", "bad_pose", "poses_apart"})
 """Ids of the findings that count the poses that go to quarantine."""
 
 

@@ -38,6 +38,7 @@ PUBLIC = {
     # A field of the sentences of effects, which are texts of their files, and the stage that an effect names.
     "pipeline/models/effect.py": {"Place"},
     "pipeline/plan/plan_files.py": {"kept"},
+    "pipeline/recording/roles.py": {"left"},  # a key of run.toml
     "pipeline/report/map_page.py": {"left"},  # a value of a template
     "schemas/run_tables.py": {"rung"},  # a column
 }
