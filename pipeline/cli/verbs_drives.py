@@ -124,7 +124,13 @@ def plan(  # noqa: D417 - the runs document themselves
         print_json({**made.to_json(), **written})
     elif not quiet:
         driven_s = studied.knowledge.driven_s
-        print_lines([*_format_known(studied.forecast), *format_plan(made, driven_s, files, said), *shown])
+        print_lines(
+            [
+                *_format_known(studied.forecast),
+                *format_plan(made, driven_s, files, said, wanted or ()),
+                *shown,
+            ]
+        )
     return LOSSY if gathered is not None and gathered.lossy else CLEAN
 
 
@@ -247,7 +253,9 @@ def _check(path: Path, names: list[str], options: Options, said: str, *, json: b
     return LOSSY if lossy else CLEAN
 
 
-def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = "") -> list[str]:
+def format_plan(
+    made: Plan, driven_s: float, files: Sequence[Path], said: str = "", wanted: Sequence[str] = ()
+) -> list[str]:
     """The plan on one screen.
 
     Args:
@@ -255,12 +263,15 @@ def format_plan(made: Plan, driven_s: float, files: Sequence[Path], said: str = 
         driven_s: length of the logs so far [s]; 0 without logs.
         files: the files that were written.
         said: flags that the next command needs again.
+        wanted: ids of the effects that were asked for; all that is open without any.
     """
     from pipeline.plan import SAFETY, list_gains, summarize_gains  # noqa: PLC0415 - heavy
 
     runs = f" after {format_count(len(made.runs), 'run')} of {format_duration(driven_s)}" if made.runs else ""
     if not made.gains:
-        return [f"open         nothing{runs}: no cause is undecided, and each number is known within 5 %"]
+        if wanted:
+            return [f"open         nothing about {', '.join(wanted)}{runs}"]
+        return [f"open         nothing{runs}: no cause is undecided, and each number is known well enough"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
     lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in align_rows(list_gains(made)))]
     most = f"limits       {made.format_limits()}"

@@ -172,14 +172,17 @@ class Search:
 
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
-        first = self.fit(start)
+        first, asked = self.fit(start), self.given
         extended, refused = self._extend_all(first)
         result, other = self._conclude(first, extended, refused)
         while other is not None:
             # Models are compared with all that improves them, what is not accepted in the end included.
-            before = find_cost(extended)
+            before, given = find_cost(extended), self.given
+            small = {one.id for one in other.state.effects if is_too_small(one, self.conditions)}
+            self.given = asked | small
             extended, refused = self._extend_all(other)
-            if not find_cost(extended) < before - EQUAL:
+            if self.budget.is_spent() or not find_cost(extended) < before - EQUAL:
+                self.given = given
                 break
             result, other = self._conclude(first, extended, refused)
         return result
@@ -191,8 +194,6 @@ class Search:
         current, judged = self.refuse(extended)
         rivals, better = list[Rival](), list[Judged]()
         for name, one in judged.items():
-            if self.budget.is_spent():
-                break
             for other in self.list_rivals(current, one.base, [name]):
                 behind = other.cost - find_cost(current)
                 is_new = behind < EQUAL and not set(other.added) & set(current.ids)
@@ -227,7 +228,7 @@ class Search:
             if better is None or not find_cost(better) < find_cost(current):
                 # What an extension makes superfluous may have been worth more than it.
                 better = self._exchange(current)
-            if better is None:
+            if better is None or not find_cost(better) < find_cost(current):
                 break
             current = better
         return current, refused
@@ -248,7 +249,7 @@ class Search:
         return None
 
     def _is_better(self, other: Judged, current: PartFit) -> bool:
-        """Whether a model is accepted, more likely than another one, and raises none of its errors."""
+        """Whether a model is accepted, more likely than another one, and raises no error beyond chance."""
         if other.refusal or other.cost >= find_cost(current) - EQUAL:
             return False
         _, rise, _ = _compare_horizons(current.horizon_errors, other.fit.horizon_errors)

@@ -16,13 +16,8 @@ from pipeline.core import (
 from pipeline.estimation.fit import PartFit, invert
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
-
     from pipeline.estimation.state import State
     from pipeline.estimation.window_residuals import WindowResiduals
-    from pipeline.models import Effect
-
-    Learn = Callable[[State, Flags], Callable[[int], Sequence[Effect]]]
 
 # Blocked cross-validation: ten-second stretches are tested with parameters fitted without them.
 #

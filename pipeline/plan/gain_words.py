@@ -49,7 +49,7 @@ def _describe(gain: ExpectedGain, duration_s: float) -> Row:
     unit = suffix_unit(gain.unit)
     after = [f"±{format_digits(gain.expected)}{unit}"]
     if gain.drives:
-        after.append(f"±{format_digits(gain.goal)} (5 %) {_format_when([gain], duration_s)}")
+        after.append(f"±{format_digits(gain.goal)} {_format_when([gain], duration_s)}")
     return _name(gain), f"{gain.value:.3g} ±{format_digits(gain.now)}{unit}", "; ".join(after)
 
 

@@ -66,10 +66,11 @@ class Limits:
         return ", ".join([*texts, f"{self.lateral_mps2:.3g} m/s^2 sideways"])
 
     def raise_within(self, vehicle: Vehicle) -> tuple["Limits", str]:
-        """Twice the speed, turn and sideways acceleration, within the vehicle's own; the options for them."""
+        """Twice the limits, within the vehicle's own, and the options for them."""
         raised = replace(
             self,
             speed_mps=min(_RAISED * self.speed_mps, vehicle.max_speed_mps or math.inf),
+            acceleration_mps2=_RAISED * self.acceleration_mps2,
             lateral_mps2=_RAISED * self.lateral_mps2,
         )
         if not is_steered(vehicle):
@@ -78,6 +79,7 @@ class Limits:
         pairs = {
             "--max-speed": (raised.speed_mps, self.speed_mps),
             "--max-yaw-rate": (raised.turn, self.turn),
+            "--max-acceleration": (raised.acceleration_mps2, self.acceleration_mps2),
             "--max-lateral": (raised.lateral_mps2, self.lateral_mps2),
         }
         return raised, " ".join(f"{name} {new:.3g}" for name, (new, old) in pairs.items() if new > old)

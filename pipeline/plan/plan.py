@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 
 from pipeline.core import Complex, Floats, enumerate_texts, finite_or_none, format_digits, pick
+from pipeline.estimation.terms import SUGGESTION
 from pipeline.models import Effect, Excitation, Largest, list_effects
 from pipeline.plan.chooser import Chooser, Shape
 from pipeline.plan.manoeuvres import (
@@ -67,7 +68,7 @@ class ExpectedGain:
         drives: how many times the drive answers it together; 0 if that takes more than an hour of driving.
         unit: of an interval.
         value: of the parameter of an interval.
-        needs: what would tell it where this drive does not.
+        needs: what would answer it where this drive does not.
     """
 
     question: str
@@ -266,7 +267,7 @@ def _advise(
 ) -> tuple[ExpectedGain, ...]:
     """What is expected, with what would tell the questions of which the drive tells nothing.
 
-    An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at twice the limits.
+    An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at higher limits.
     """
     unanswered = {one.question for one in best.gains if not one.informs}
     asked = [one for one in questions if one.text in unanswered]
@@ -283,13 +284,14 @@ def _advise(
             ):
                 needs = "drive by hand on a slope, in several directions"
             elif _answers(judged[one.question], room):
-                needs = f"plan for it alone, --for {one.effects[0]}"
+                is_alone = len(best.gains) == 1 or SUGGESTION in one.effects
+                needs = "give more --time" if is_alone else f"plan for it alone, --for {one.effects[0]}"
             elif _answers(judged[one.question], np.ones(room.size)):
                 needs = "give a larger --area"
             elif _answers(faster[one.question], np.ones(faster[one.question].groups.seconds.size)):
                 needs = f"give {options}, where the robot and the ground allow it"
             else:
-                needs = "no drive that was tried tells it: an hour, anywhere, at twice these limits"
+                needs = "no drive that was tried answers it: an hour, anywhere, at the highest limits"
         gains.append(replace(one, needs=needs))
     return tuple(gains)
 

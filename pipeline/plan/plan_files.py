@@ -1,4 +1,4 @@
-"""Files of a plan, and the comparison of its promises with the drive and with other protocols."""
+"""Files of a plan, and the comparison of its promises with the drive."""
 
 import csv
 import math
@@ -13,6 +13,7 @@ import numpy as np
 from mcap_ros2.writer import Writer
 
 from pipeline.core import Floats, TomlError, format_share, parse_toml, read_bounded_text
+from pipeline.estimation.terms import SUGGESTION
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
 from pipeline.plan.manoeuvres import (
@@ -28,6 +29,8 @@ from pipeline.store import TEMPORARY, replace_file
 from pipeline.words import describe_separation, suggest_drive
 
 PAGE = "plan.html"
+_CHECKED = ("question", "effects", "kind", "goal", "now", "expected", "decided_after_s", "drives")
+"""What a file says of a question, which `slip plan --check` compares with the drive."""
 _NAMES = ("plan.toml", "plan.csv", "plan.mcap")
 FILES = (*_NAMES, PAGE)
 # Fields of speed and turn by message type.
@@ -196,8 +199,9 @@ def _format_toml(plan: Plan) -> str:
     for name, start in plan.manoeuvres:
         lines += ["", "[[manoeuvre]]", *_format_table({"name": name, "start_s": start})]
     for one in plan.promises:
-        if math.isfinite(one.decided_after_s):
-            lines += ["", "[[promises]]", *_format_table(msgspec.to_builtins(one))]
+        # Another diagnosis may suggest another term: what is said of it cannot be checked.
+        if math.isfinite(one.decided_after_s) and SUGGESTION not in one.effects:
+            lines += ["", "[[promises]]", *_format_table({name: getattr(one, name) for name in _CHECKED})]
     return "\n".join(lines) + "\n"
 
 

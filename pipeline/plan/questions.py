@@ -390,7 +390,7 @@ def ask_apart(knowledge: Knowledge, settled: Container[str] = ()) -> list[Separa
 
 
 def ask_numbers(model: Hypothesis, stated: Mapping[str, float]) -> list[Precision]:
-    """Precision of each parameter of a model that is not yet known to five percent.
+    """Precision of each parameter of a model that is not yet known as well as `find_goal` asks.
 
     Args:
         model: the model.

@@ -64,7 +64,7 @@ def settle_turn(case: Case, drive: Candidate, motion: Motion) -> None:
 
 
 def report_turn(case: Case, command: Candidate | None) -> None:
-    """A body command that holds steering angles; see `_settle_turn`."""
+    """A body command that holds steering angles; see `settle_turn`."""
     if command is None or not command.is_angle:
         return
     speed, turn = command.source.signals

@@ -456,6 +456,6 @@ def _write_spans(spans: Sequence[OutageSection]) -> str:
     parts = []
     for one in spans:
         ends = {"start_s": one.start_s, "end_s": one.end_s}
-        keys = [f'side = "{one.side}"', *(f"{key} = {at:g}" for key, at in ends.items() if at is not None)]
+        keys = [f'side = "{one.side}"', *(f"{key} = {at:.10g}" for key, at in ends.items() if at is not None)]
         parts.append(f"{{{', '.join(keys)}}}")
     return f"[{', '.join(parts)}]"

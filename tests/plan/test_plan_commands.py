@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -167,6 +168,14 @@ def test_the_official_reader_reads_body_commands_within_the_limits(
     assert np.allclose(speed, np.loadtxt(csv, delimiter=",", skiprows=1)[:, 1], atol=1e-6)
     promised = read_promises(toml)
     assert [one.question for one in promised.promises] == [one.question for one in plan.promises]
+
+
+def test_what_a_plan_says_of_a_suggested_term_is_no_promise(plan: Plan, tmp_path: Path) -> None:
+    """Another diagnosis may suggest another term, or none: the rest of the plan is checked without it."""
+    seen = next(one for one in plan.gains if math.isfinite(one.decided_after_s))
+    of_term = replace(seen, question="suggested_term.k_1", effects=("suggested_term",))
+    toml = write_plan(replace(plan, gains=(of_term, seen)), tmp_path / "plan")[0]
+    assert [one.question for one in read_promises(toml).promises] == [seen.question]
 
 
 @pytest.mark.parametrize("type_name", list_types(steered=True))
