@@ -195,8 +195,8 @@ def _format_largest_fall(before: Step, after: Step) -> str:
 def _list_rest(run: RunDiagnosis) -> list[str]:
     """What the effects do not explain, and a suggested term."""
     rest = run.unexplained
-    if rest is None or (rest.with_formula is None and measure_excess(run) < ABOVE_FLOOR):
-        # What stays at the noise floor and has no suggestion stands behind --all.
+    if rest is None or (rest.kind == "lasting" and measure_excess(run) < ABOVE_FLOOR):
+        # Noise that lasts, at the noise floor, stands behind --all.
         return []
     return [describe_unexplained(rest), *list_terms(rest), format_suggestion(rest)]
 

@@ -236,9 +236,9 @@ def test_what_no_drive_within_the_limits_tells_leads_to_the_limits_that_do() -> 
     knowledge, limits = assume(vehicle), choose_limits(vehicle, speed_mps=0.2)
     questions = ask_presence(knowledge, ["speed_slip"], find_largest(knowledge, limits, 15.0))
     request = Request(limits, parse_area("20x10m", vehicle), 15.0)
-    (left,) = make_plan(knowledge, questions, request).left
+    (unanswered,) = make_plan(knowledge, questions, request).unanswered
     # At 0.2 m/s there is little to see: faster driving is named, not the room or the time.
-    assert left.needs.startswith("give --max-speed 0.4 ")
+    assert unanswered.needs.startswith("give --max-speed 0.4 ")
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("60s", 60.0), ("2min", 120.0), ("45", 45.0)])
