@@ -169,6 +169,7 @@ class Search:
     budget: Budget = field(default_factory=Budget)
     shapes: int = 1
     _fits: dict[tuple[object, ...], PartFit] = field(default_factory=dict)
+    _rivals: dict[tuple[object, ...], list[Judged]] = field(default_factory=dict, init=False)
 
     def run(self, start: State) -> SearchResult:
         """Search from a model."""
@@ -268,7 +269,7 @@ class Search:
 
     def fit(self, state: State, noise: Noise | None = None) -> PartFit:
         """The fit from a state; made once."""
-        key = (*(effect.key for effect in state.effects), repr(state.own))
+        key = _make_key(state)
         if key not in self._fits:
             self._fits[key] = fit_part(self.part, state, noise=noise)
         return self._fits[key]
@@ -388,11 +389,14 @@ class Search:
         return [*((name,) for name in free), *(two for two in combinations(sorted(free), 2) if two in pairs)]
 
     def list_rivals(self, current: PartFit, without: PartFit, names: Sequence[str]) -> list[Judged]:
-        """Models with other effects in the place of some, judged against the one with neither."""
-        screen = self.screen(without, names)
-        own = without.score - current.score
-        wanted = 0.3 * own - PRICE * len(names)
-        return self._judge_extensions(without, screen, 2, 1, wanted, find_cost(current))
+        """Models with other effects in the place of some, judged against the one with neither; made once."""
+        key = (_make_key(current.state), *names, self.given)
+        if key not in self._rivals:
+            screen = self.screen(without, names)
+            own = without.score - current.score
+            wanted = 0.3 * own - PRICE * len(names)
+            self._rivals[key] = self._judge_extensions(without, screen, 2, 1, wanted, find_cost(current))
+        return self._rivals[key]
 
     def replaces(self, current: PartFit, other: Judged, margin: float = 0.0) -> bool:
         """Whether other effects do what one of a model does, and not only something else.
@@ -428,6 +432,11 @@ class Search:
             return None
         judged = self._judge(base, fit, is_final=False)
         return None if judged.refusal else self.prune(fit)
+
+
+def _make_key(state: State) -> tuple[object, ...]:
+    """What two equal states have in common."""
+    return (*(effect.key for effect in state.effects), repr(state.own))
 
 
 def _choose(judged: Sequence[Judged]) -> Judged | None:
