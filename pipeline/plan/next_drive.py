@@ -28,7 +28,7 @@ from pipeline.estimation.decision import find_cost
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
-from pipeline.models import Effect, Late, Model, find_effect
+from pipeline.models import Effect, Late, Model
 from pipeline.plan.manoeuvres import Area, Limits, is_steered
 from pipeline.plan.plan import Plan
 from pipeline.plan.plan_files import WHEELS, list_types
@@ -356,8 +356,8 @@ def ask(
     numbers = ask_numbers(knowledge.base, stated)
     questions: list[Question] = [*ask_undecided(knowledge, groups), *ask_apart(knowledge, open_ones)]
     questions += [one for one in numbers if not open_ones & {*one.effects}]
-    hidden = list_names(knowledge) if diagnosis is None else tuple(diagnosis.unobservable_why)
-    hidden = tuple(name for name in hidden if find_effect(name)().acts_in(knowledge.base.names))
+    acting = list_names(knowledge)
+    hidden = [one for one in (acting if diagnosis is None else diagnosis.unobservable_why) if one in acting]
     if wanted:
         questions = [one for one in questions if {*wanted} & {*one.effects}]
     largest = find_largest(knowledge, limits, time_s)

@@ -270,30 +270,29 @@ def _advise(
     An hour of all manoeuvres that fit into the area, of all manoeuvres, and of all at higher limits.
     """
     unanswered = {one.question for one in best.gains if not one.informs}
-    asked = [one for one in questions if one.text in unanswered]
-    harder, options = limits.raise_within(knowledge.vehicle)
-    judged = {one.question.text: one for one in chooser.questions}
-    faster = {one.question.text: one for one in _judge_library(knowledge, asked, harder)[1]} if asked else {}
     room = np.array([chooser.fits([number]) for number in range(chooser.durations.size)], dtype=np.float64)
-    gains = []
-    for one in best.gains:
-        needs = ""
-        if one.question in unanswered:
-            if any(
-                Excitation.SLOPE in effect.needs for effect in list_concerned(judged[one.question].question)
-            ):
-                needs = "drive by hand on a slope, in several directions"
-            elif _answers(judged[one.question], room):
-                is_alone = len(best.gains) == 1 or SUGGESTION in one.effects
-                needs = "give more --time" if is_alone else f"plan for it alone, --for {one.effects[0]}"
-            elif _answers(judged[one.question], np.ones(room.size)):
-                needs = "give a larger --area"
-            elif _answers(faster[one.question], np.ones(faster[one.question].groups.seconds.size)):
-                needs = f"give {options}, where the robot and the ground allow it"
-            else:
-                needs = "no drive that was tried answers it: an hour, anywhere, at the highest limits"
-        gains.append(replace(one, needs=needs))
-    return tuple(gains)
+    needs = dict[str, str]()
+    for one in chooser.questions:
+        question = one.question
+        if question.text not in unanswered:
+            continue
+        if any(Excitation.SLOPE in effect.needs for effect in list_concerned(question)):
+            needs[question.text] = "drive by hand on a slope, in several directions"
+        elif _answers(one, room):
+            is_alone = len(best.gains) == 1 or SUGGESTION in question.effects
+            alone = f"plan for it alone, --for {question.effects[0]}"
+            needs[question.text] = "give more --time" if is_alone else alone
+        elif _answers(one, np.ones(room.size)):
+            needs[question.text] = "give a larger --area"
+    rest = [one for one in questions if one.text in unanswered - needs.keys()]
+    harder, options = limits.raise_within(knowledge.vehicle)
+    for one in _judge_library(knowledge, rest, harder)[1] if rest else ():
+        needs[one.question.text] = (
+            f"give {options}, where the robot and the ground allow it"
+            if _answers(one, np.ones(one.groups.seconds.size))
+            else "no drive that was tried answers it: an hour, anywhere, at the highest limits"
+        )
+    return tuple(replace(one, needs=needs.get(one.question, "")) for one in best.gains)
 
 
 def _answers(one: Answerable, weight: Floats) -> bool:

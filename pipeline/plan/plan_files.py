@@ -16,11 +16,7 @@ from pipeline.core import Floats, TomlError, format_share, parse_toml, read_boun
 from pipeline.estimation.terms import SUGGESTION
 from pipeline.logs.schema import definition_text
 from pipeline.models import find_effect, format_value
-from pipeline.plan.manoeuvres import (
-    LONGEST_S,
-    RATE_HZ,
-    PlanError,
-)
+from pipeline.plan.manoeuvres import LONGEST_S, RATE_HZ, PlanError
 from pipeline.plan.plan import SAFETY, ExpectedGain, Plan
 from pipeline.results import RunDiagnosis
 from pipeline.run import DriveSeries, MotionRun, name_inputs
