@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 RECORDINGS = ("warthog_gravel_1", "husky_snow_boreal")
 """Real recordings whose reports are looked at, too, where they are."""
 HANDBOOK = ("index", "screen", "effects/effective_track", "symptoms/turns-too-little")
-SIZES = {"phone": (390, 844), "laptop": (1440, 900)}
+SIZES = {"phone": (390, 844), "laptop": (1280, 800)}
 LOOKS = tuple(product(SIZES, (False, True)))
 """Windows, and whether they are dark."""
 PIECE_PX = 2400
@@ -192,7 +192,8 @@ def write_check(results: Path, work: Path) -> Screen:
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8"><title>slip check</title>'
         '<meta name="viewport" content="width=device-width, initial-scale=1">'
         '<meta name="color-scheme" content="light dark"><style>body { font: 1rem/1.5 sans-serif; '
-        "margin: 1rem; overflow-wrap: anywhere } td, th { padding: .2rem .5rem; text-align: left }</style>"
+        "margin: 1rem; overflow-wrap: break-word } table { display: block; overflow: auto } "
+        "td, th { padding: .2rem .5rem; text-align: left }</style>"
         f"<body><main>{text}</main></body></html>",
         encoding="utf-8",
     )

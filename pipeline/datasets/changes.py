@@ -35,6 +35,8 @@ MOST_MORE = 30
 """Additional runs per side up to which more runs are recommended."""
 _BISECTIONS = 60
 """Bisections of an interval: doubles have 53 bits."""
+_TAIL = 0.025
+"""Probability beyond either end of an interval of 95 %."""
 _LEAST_ERROR = 1e-6
 """Smallest standard error, in typical errors of a quantity: an exactly known quantity also needs an error."""
 _LEAST_LEFT = 1e-3
@@ -87,6 +89,8 @@ class Change:
         p_alone: probability of a difference as large in this quantity alone without a change.
         asked: the underlying test.
         outlook: what more runs would show.
+        within: interval of the difference of these recordings, by their errors alone; those of all
+            quantities hold together with 95 %.
     """
 
     status: Status
@@ -102,6 +106,7 @@ class Change:
     p_alone: float = math.nan
     asked: Asked | None = field(default=None, repr=False, compare=False)
     outlook: Outlook | None = field(default=None, repr=False, compare=False)
+    within: tuple[float, float] = (math.nan, math.nan)
 
     @property
     def difference(self) -> float:
@@ -270,7 +275,16 @@ def compare_sides(
     seen = within.find_changed()
     significant = seen if alike else whole.find_changed()
     judged = within if alike else whole
-    return [_make_change(judged, index, significant, seen, float(size[index])) for index in range(usual.size)]
+    changes = []
+    for index, scale in enumerate(size.tolist()):
+        change = _make_change(judged, index, significant, seen, scale)
+        if change.status != "unknown":
+            alone = within.ask(index, [index])
+            half = alone.find_quantile(_TAIL / len(within.family))
+            ends = (scale * (alone.difference - half), scale * (alone.difference + half))
+            change = replace(change, within=ends)
+        changes.append(change)
+    return changes
 
 
 def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
@@ -376,7 +390,7 @@ def _make_change(
     asked = judged.ask(index, judged.family)
     smallest = asked.find_smallest()
     alone = judged.ask(index, [index])
-    half = alone.find_quantile(0.025)
+    half = alone.find_quantile(_TAIL)
     p, p_within = significant[index], seen[index]
     status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest

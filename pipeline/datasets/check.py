@@ -313,6 +313,17 @@ class Check:
         """Number of further runs of the vehicle that tell how much runs differ."""
         return sum(map(len, self.sides.others.values()))
 
+    @property
+    def is_spread_known(self) -> bool:
+        """Whether some runs tell how much runs of this robot differ without a change."""
+        return self.simulated or any(change.freedom > 0 for change in self.changes.values())
+
+    def find_difference(self, name: str) -> tuple[float, float, float]:
+        """Difference of a quantity and its 95 % interval: of these recordings where the spread is unknown."""
+        change = self.changes[name]
+        ends = (change.low, change.high) if self.is_spread_known else change.within
+        return (change.difference, *ends)
+
     def is_unseen(self, name: str) -> bool:
         """Whether no change of a quantity was shown, and one of its own size could have been missed.
 
@@ -517,12 +528,14 @@ def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object
     is_logarithm = name in LOGARITHMS
     unit = next((label.parameter.unit for label in sides.labels if label.name == name), "1")
     sizes = [change.before, change.after]
-    parts = [change.low, change.high, change.smallest, change.spread]
+    parts = [change.low, change.high, *change.within, change.smallest, change.spread]
     if is_logarithm:
         unit = {POSITION_ERROR: "m", HEADING_ERROR: "rad"}.get(name, "1")
         pace = find_pace(sides) if name in ERRORS else 1.0
         sizes, parts = [pace * math.exp(one) for one in sizes], [math.expm1(one) for one in parts]
-    before, after, low, high, smallest, spread = map(finite_or_none, (*sizes, *parts))
+    before, after, low, high, low_within, high_within, smallest, spread = map(
+        finite_or_none, (*sizes, *parts)
+    )
     return {
         "number": name,
         "unit": unit,
@@ -532,6 +545,8 @@ def tabulate_change(sides: Sides, name: str, change: Change) -> dict[str, object
         "change_is": "share" if is_logarithm else "difference",
         "low": low,
         "high": high,
+        "low_within_runs": low_within,
+        "high_within_runs": high_within,
         "p": finite_or_none(change.p),
         "p_within_runs": finite_or_none(change.p_within),
         "p_alone": finite_or_none(change.p_alone),

@@ -1,11 +1,20 @@
 """Text formats of a check: verdict, lines for a screen, Markdown, and JUnit for a build server."""
 
+import itertools
 import math
 import re
 from collections.abc import Iterable, Sequence
 from xml.etree import ElementTree as ET
 
-from pipeline.core import enumerate_texts, format_angle, format_length, format_share, make_plain, suffix_unit
+from pipeline.core import (
+    enumerate_texts,
+    format_angle,
+    format_length,
+    format_share,
+    make_plain,
+    split_interval,
+    suffix_unit,
+)
 from pipeline.datasets import (
     ERRORS,
     HEADING_ERROR,
@@ -23,7 +32,6 @@ Line = tuple[str, str]
 _MOST_NAMED = 3
 """Largest number of quantities in a sentence; the lines list all."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
-_DIFFERENT = ("changed", "differs")
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
@@ -33,6 +41,10 @@ _LEAST_SHARE = 0.01
 """Smallest share of cases that is printed as a number."""
 _LEAST_P = 1e-4
 """Smallest p value that is printed."""
+_ONE_A_SIDE = "One run a side: differences between runs of this robot without a change are not known"
+_WITH_SPREAD = "AFTER - BEFORE [95 % interval, with the differences between runs]"
+_WITHIN = "AFTER - BEFORE [95 % interval over all rows, of these recordings alone]"
+"""What stands in the third column."""
 _NAMES = {
     POSITION_ERROR: "position error over 2 s",
     HEADING_ERROR: "heading error over 2 s",
@@ -53,8 +65,12 @@ def format_verdict(check: Check) -> str:
         sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
     rest = "and no effect of the model explains it: run slip diagnose on AFTER"
     sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
-    if not changed and differs:
-        sentences.append(_format_doubts(check, differs[:_MOST_NAMED]))
+    if changed and _is_one_a_side(check):
+        sentences.append(f"{_ONE_A_SIDE}; usual ones were assumed")
+    elif not changed and differs:
+        sentences += _list_doubts(check, differs)
+    elif not changed and _is_one_a_side(check) and len(check.changes) > len(check.list_status("unknown")):
+        sentences += [_ONE_A_SIDE, "No quantity differs by more than the errors of these two recordings"]
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "No conclusion: no quantity is known on both sides"
@@ -91,21 +107,35 @@ def _format_shares(change: Change) -> str:
     return f"{before.removesuffix(' %')} -> {after}"
 
 
-def _format_doubts(check: Check, differs: Sequence[str]) -> str:
+def _is_one_a_side(check: Check) -> bool:
+    """Whether a recording is compared with a recording, and nothing tells how much such runs differ."""
+    counts = (len(check.sides.before), len(check.sides.after))
+    return check.sides.kind == "runs" and counts == (1, 1) and not check.is_spread_known
+
+
+def _list_doubts(check: Check, differs: Sequence[str]) -> list[str]:
     """What differs between the recordings, and how often runs without a change differ by as much."""
-    changes = [check.changes[name] for name in differs]
-    listed = enumerate_texts(
-        [
-            f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(change.p_within, 1)})"
-            for name, change in zip(differs, changes, strict=True)
-        ]
-    )
+    changes = [check.changes[name] for name in differs[:_MOST_NAMED]]
     least = min(change.p_alone for change in changes)
     often = format_share(max(least, _LEAST_SHARE), 1)
     rate = f"{'less than ' if least < _LEAST_SHARE else ''}{often}"
-    opening = "Likely changed" if min(change.p for change in changes) <= LIKELY else "No conclusion"
+    likely = min(change.p for change in changes) <= LIKELY
+    others = [f"{len(differs) - _MOST_NAMED} more"] if len(differs) > _MOST_NAMED else []
     chance = f"runs without a change differ by as much in {rate} of cases"
-    return f"{opening}: the recordings differ in {listed}; {chance}"
+    if _is_one_a_side(check):
+        texts = [f"{_name(check, name)} by {_format_difference(check, name)}" for name in differs]
+        listed = enumerate_texts([*texts[:_MOST_NAMED], *others])
+        guess = "A change is likely" if likely else "This may be chance"
+        return [_ONE_A_SIDE, f"These two differ in {listed}", f"{guess}: {chance}"]
+    listed = enumerate_texts(
+        [
+            f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(change.p_within, 1)})"
+            for name, change in zip(differs[:_MOST_NAMED], changes, strict=True)
+        ]
+        + others
+    )
+    opening = "Likely changed" if likely else "No conclusion"
+    return [f"{opening}: the recordings differ in {listed}; {chance}"]
 
 
 def _format_simulated(check: Check, named: Sequence[str]) -> str:
@@ -144,6 +174,22 @@ def _format_pair(check: Check, name: str) -> str:
     label = _find(check, name)
     unit = suffix_unit(label.parameter.unit)
     return f"{change.before:.3g} -> {change.after:.3g}{unit}"
+
+
+def _format_difference(check: Check, name: str) -> str:
+    """After minus before with its interval and unit; of a logarithm the growth in percent."""
+    parts = check.find_difference(name)
+    if not all(map(math.isfinite, parts)):
+        return "-"
+    if name in LOGARITHMS:
+        low, value, high = (100.0 * math.expm1(one) for one in (parts[1], parts[0], parts[2]))
+        value_text, *ends = split_interval(value, low, high)
+        unit = " %"
+    else:
+        value_text, *ends = split_interval(*parts)
+        unit = suffix_unit(_find(check, name).parameter.unit)
+    sign = "" if value_text.startswith("-") else "+"
+    return f"{sign}{value_text}{unit} [{', '.join(ends)}]"
 
 
 def _find(check: Check, name: str) -> Label:
@@ -201,6 +247,12 @@ def _format_power(check: Check) -> list[str]:
     ]
     if not asked or check.list_status("changed"):
         return []
+    if _is_one_a_side(check):
+        missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
+        needed = "a few more runs" if missing is None else f"{missing} more run{'s' * (missing != 1)}"
+        return [
+            f"{needed} a side would {'decide' if check.list_status('differs') else 'show smaller changes'}"
+        ]
     asked.sort(key=lambda name: _share(check, name))
     text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
     count = len(check.sides.after) + (len(check.sides.before) if check.sides.kind != "model" else 0)
@@ -236,21 +288,32 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
 
     Args:
         check: the check.
-        everything: a row with its resolution for every quantity; else what did not change is a list of names.
+        everything: a row with its id and resolution for every quantity; else what did not change is a list
+            of names, but where one run is compared with one: the differences are then the answer.
     """
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     ranked = [name for status in STATUSES for name in check.list_status(status)]
     known = _list_known(check)
-    shown = [name for name in ranked if everything or check.changes[name].status in _DIFFERENT]
-    names = max(map(len, shown), default=0)
-    pairs = max((len(_format_pair(check, name)) for name in shown if name in known), default=0)
-    for name in shown:
-        lines.append((check.name_outcome(name), _format_row(check, name, names, pairs)))
+    one = _is_one_a_side(check)
+    listed = known if one else [*check.list_status("changed"), *check.list_status("differs")]
+    shown = ranked if everything else [name for name in ranked if name in listed]
+    texts = [_list_columns(check, name) for name in shown]
+    # The reason why a quantity is unknown is longer than what stands in its column.
+    columns = [row if name in known else row[:1] for name, row in zip(shown, texts, strict=True)]
+    widths = [max(map(len, column)) for column in itertools.zip_longest(*columns, fillvalue="")]
+    for name, row in zip(shown, texts, strict=True):
+        pairs = itertools.zip_longest(row, widths, fillvalue="")
+        text = "  ".join(f"{cell:<{width}}" for cell, width in pairs).rstrip()
+        alike = one and check.changes[name].status == "unchanged"
+        lines.append(("not shown" if alike else check.name_outcome(name), text))
         if everything and name in known:
-            lines.append(("", f"{_INDENT}{_format_resolution(check, name)}"))
+            lines += [("", f"{_INDENT}{detail}") for detail in _list_details(check, name)]
+    if any(name in known for name in shown):
+        by_spread = check.is_spread_known and not check.simulated
+        lines.append(("", _WITH_SPREAD if by_spread else _WITHIN))
     if not everything:
-        lines += _list_names(check, ranked)
+        lines += _list_names(check, [name for name in ranked if name not in shown])
     if check.commanded is not None:
         share = f"the robot turns at {_format_shares(check.commanded)} of the commanded yaw rate"
         lines.append(("commanded", share))
@@ -265,64 +328,58 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
     return lines + [("note", note) for note in check.sides.notes]
 
 
-def _list_names(check: Check, ranked: Sequence[str]) -> list[Line]:
+def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
     """Names of the quantities of which no change is shown, a line for each outcome."""
     groups: dict[str, list[str]] = {}
-    for name in ranked:
-        if check.changes[name].status not in _DIFFERENT:
-            groups.setdefault(check.name_outcome(name), []).append(name)
+    for name in names:
+        groups.setdefault(check.name_outcome(name), []).append(name)
     outcomes: dict[str, set[str]] = {}
-    for name in ranked:
+    for name in check.changes:
         outcomes.setdefault(name.partition(".")[0], set()).add(check.name_outcome(name))
     lines = []
-    for outcome, names in groups.items():
+    for outcome, alike in groups.items():
         # An effect of several parameters is one name where all of them share an outcome.
         texts = [
             name_term(_find(check, name).effect.id)
             if name not in LOGARITHMS and len(outcomes[name.partition(".")[0]]) == 1
             else _name(check, name)
-            for name in names
+            for name in alike
         ]
         few = "; too few runs to tell" if outcome == "not shown" else ""
         lines.append((outcome, enumerate_texts(list(dict.fromkeys(texts))) + few))
-    return [*lines, ("", "numbers and detectable changes: --all")] if lines else []
+    return [*lines, ("", "all numbers, and the changes that could be detected: --all")] if lines else []
 
 
 def _list_known(check: Check) -> list[str]:
     return [name for name, change in check.changes.items() if change.status != "unknown"]
 
 
-def _format_row(check: Check, name: str, names: int = 0, pairs: int = 0) -> str:
-    """One line for a quantity; columns of at least these widths."""
+def _list_columns(check: Check, name: str) -> list[str]:
+    """A quantity as columns: its name, before and after, and the difference."""
     change = check.changes[name]
     if change.status == "unknown":
         sides = (("BEFORE", change.before), ("AFTER", change.after))
         lacking = " and ".join(side for side, value in sides if math.isnan(value))
-        why = (
-            "not stated by the model"
-            if check.sides.kind == "model" and name in ERRORS
-            else "not determined in"
-        )
-        return f"{name:<{names}}  {why} {lacking}"
-    text = f"{name:<{names}}  {_format_pair(check, name):<{pairs}}"
-    within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
-    size = "a factor of two" if name in LOGARITHMS else "a change of its own size"
-    few = f"; too few runs to detect {size}" if check.is_unseen(name) else ""
-    return f"{text}  {_format_p(change.p)}{within}{few}"
+        stated = check.sides.kind != "model" or name not in ERRORS
+        why = "not determined in" if stated else "not stated by the model"
+        return [_name(check, name), f"{why} {lacking}"]
+    return [_name(check, name), _format_pair(check, name), _format_difference(check, name)]
 
 
-def _format_resolution(check: Check, name: str) -> str:
-    """Smallest detectable change of a quantity, and the spread between runs."""
+def _list_details(check: Check, name: str) -> list[str]:
+    """How sure a change of a quantity is, with its id, and which change would have been detected."""
     change = check.changes[name]
+    within = f" ({_format_p(change.p_within)} within the recordings)" if change.status == "differs" else ""
+    first = f"{name}  {_format_p(change.p)}{within}"
     show = _format_ratio if name in LOGARITHMS else _format_size
     text = f"detectable change {show(change.smallest)}"
     text += "; errors scaled to the speed of AFTER" if name in ERRORS else ""
-    if check.simulated:
-        return text
-    count = check.count_others()
-    known = f"with {count} others" if count else "these runs"
-    source = "(default)" if change.is_default else f"({known})"
-    return f"{text}; spread between runs {show(change.spread)} {source}"
+    if not check.simulated:
+        count = check.count_others()
+        source = "default" if change.is_default else f"with {count} others" if count else "these runs"
+        text += f"; spread between runs {show(change.spread)} ({source})"
+    size = "a factor of two" if name in LOGARITHMS else "a change of its own size"
+    return [first, text, *([f"too few runs to detect {size}"] if check.is_unseen(name) else [])]
 
 
 def _format_p(p: float, digits: int = 2) -> str:
@@ -368,13 +425,14 @@ def format_markdown(check: Check) -> str:
             f"| {_escape(one.name)}: {one.limit} | {one.measured} | {one.outcome} |" for one in check.limits
         ]
         rows.append("")
-    rows += ["| number | before -> after | p | outcome |", "|---|---|---|---|"]
+    rows += ["| quantity | before -> after | difference | p | outcome |", "|---|---|---|---|---|"]
     for status in STATUSES:
         for name in check.list_status(status):
             change = check.changes[name]
             known = status != "unknown"
             pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
-            rows.append(f"| {_escape(name)} | {pair} | {p} | {check.name_outcome(name)} |")
+            columns = [_name(check, name), pair, _format_difference(check, name), p, check.name_outcome(name)]
+            rows.append(f"| {' | '.join(map(_escape, columns))} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
 
@@ -398,8 +456,8 @@ def format_junit(check: Check) -> str:
     for name, change in check.changes.items():
         kind = {"changed": "failure" if gate else "", "unchanged": ""}.get(change.status, "skipped")
         kind = "skipped" if check.is_unseen(name) else kind
-        text = _format_row(check, name)
-        text += "" if change.status == "unknown" else f"; {_format_resolution(check, name)}"
+        text = "  ".join(_list_columns(check, name))
+        text += "" if change.status == "unknown" else f"; {'; '.join(_list_details(check, name))}"
         cases.append(("number", name, kind, text))
     counts = [sum(case[2] == kind for case in cases) for kind in ("failure", "skipped")]
     suite = ET.Element(

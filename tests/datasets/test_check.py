@@ -32,6 +32,7 @@ from pipeline.words.check import format_junit, format_markdown, format_verdict, 
 USUAL = {"drive_lag": {"tau": 0.3}, "effective_track": {"k": 1.6}}
 LATE = {**USUAL, "drive_lag": {"tau": 0.45}}
 RUNS = 3
+LAG = "lag of the drive"
 
 
 def drive(effects: dict[str, dict[str, float]], first: int) -> list[MotionRun]:
@@ -108,12 +109,13 @@ def test_a_check_in_which_most_numbers_are_unknown_shows_nothing(same: Sides) ->
 def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> None:
     check = compare(same)
     name = "drive_lag.tau"
-    assert ("unchanged", name) in {(label, text.split()[0]) for label, text in list_lines(check)}
+    assert ("unchanged", LAG) in {(label, text[: len(LAG)]) for label, text in list_lines(check)}
     blind = replace(check.changes[name], smallest=10.0)
     unseen = replace(check, changes={**check.changes, name: blind})
-    rows = [text for label, text in list_lines(unseen) if label == "not shown"]
-    (row,) = (text for text in rows if text.startswith(name))
-    assert row.endswith("too few runs to detect a change of its own size")
+    lines = list_lines(unseen)
+    (row,) = (index for index, (_, text) in enumerate(lines) if text.startswith(LAG))
+    assert lines[row][0] == "not shown"
+    assert lines[row + 3][1].strip() == "too few runs to detect a change of its own size"
     (case,) = (one for one in read_suite(unseen).iter("testcase") if one.get("name") == name)
     assert case.find("skipped") is not None
     assert "| not shown |" in format_markdown(unseen)
@@ -122,7 +124,9 @@ def test_what_could_not_have_been_seen_is_not_called_unchanged(same: Sides) -> N
 def test_a_screen_has_a_row_for_what_changed_and_names_for_the_rest(late: Sides) -> None:
     found = compare(late)
     lines = list_lines(found, everything=False)
-    assert [text.split()[0] for label, text in lines if label == "changed"] == ["drive_lag.tau"]
+    (changed,) = (text for label, text in lines if label == "changed")
+    assert changed.startswith(f"{LAG}  0.")
+    assert changed.count("[") == 1
     named = " ".join(text for label, text in lines if label in {"unchanged", "not shown"})
     assert "effective track" in named
     assert not any("detectable change 0" in text for _, text in lines)
@@ -134,20 +138,51 @@ def test_an_error_that_could_double_unseen_is_not_called_unchanged(same: Sides) 
     for smallest, outcome in ((0.5, "unchanged"), (3.4, "not shown")):
         one = replace(check.changes[POSITION_ERROR], status="unchanged", smallest=smallest)
         changed = replace(check, changes={**check.changes, POSITION_ERROR: one})
-        (row,) = ((label, text) for label, text in list_lines(changed) if text.startswith(POSITION_ERROR))
-        assert row[0] == outcome
-        assert row[1].endswith("too few runs to detect a factor of two") == (outcome == "not shown")
+        lines = list_lines(changed)
+        (row,) = (index for index, (_, text) in enumerate(lines) if text.startswith("position error over"))
+        assert lines[row][0] == outcome
+        assert lines[row + 3][1].endswith("too few runs to detect a factor of two") == (
+            outcome == "not shown"
+        )
 
 
-def test_two_single_runs_say_that_runs_may_differ_as_much(late: Sides) -> None:
+def test_one_run_a_side_says_how_the_two_differ_and_that_runs_may_differ_as_much(late: Sides) -> None:
     found = compare(replace(late, before=late.before[:1], after=late.after[:1]))
 
     assert found.code == UNDETERMINED
     assert found.list_status("differs") == ["drive_lag.tau"]
     verdict = format_verdict(found)
-    assert verdict.startswith("No conclusion: the recordings differ in lag of the drive")
-    assert "at the default spread between runs" in verdict
-    assert "more run" in verdict
+    assert verdict.startswith(
+        "One run a side: differences between runs of this robot without a change are not known."
+    )
+    assert "These two differ in lag of the drive by +0.1" in verdict
+    assert "more runs a side would decide" in verdict
+    # The differences are the answer: each with its interval, of these recordings alone.
+    lines = list_lines(found, everything=False)
+    known = [name for name, change in found.changes.items() if change.status != "unknown"]
+    assert sum(label in {"differs", "not shown"} and text.endswith("]") for label, text in lines) == len(
+        known
+    )
+    change = found.changes["drive_lag.tau"]
+    assert 0.0 < change.within[0] < 0.15 < change.within[1]
+    assert change.low < change.within[0]
+    row = next(one for one in check_as_json(found, lines)["numbers"] if one["number"] == "drive_lag.tau")  # type: ignore[attr-defined]
+    assert [row["low_within_runs"], row["high_within_runs"]] == pytest.approx(change.within)
+
+
+def test_two_single_runs_that_are_alike_are_not_called_unchanged(same: Sides) -> None:
+    found = compare(replace(same, before=same.before[:1], after=same.after[:1]))
+
+    verdict = format_verdict(found)
+    assert "No quantity differs by more than the errors of these two recordings." in verdict
+    assert "unchanged" not in {label for label, _ in list_lines(found)}
+
+
+def test_other_runs_of_the_robot_tell_how_much_single_runs_differ(late: Sides) -> None:
+    others = {"grass": (*late.before[1:], *late.after[1:])}
+    found = compare(replace(late, before=late.before[:1], after=late.after[:1], others=others))
+
+    assert "One run a side" not in format_verdict(found)
 
 
 def test_an_error_that_no_number_explains_is_a_finding_of_its_own(windy: Sides) -> None:
@@ -283,7 +318,7 @@ def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides)
     failed = [case.get("name") for case in suite if case.find("failure") is not None]
     assert failed == ["drive_lag.tau"]
     assert suite.get("failures") == "1"
-    assert "drive\\_lag.tau" in markdown
+    assert "| lag of the drive | 0." in markdown
     assert "<b>" not in markdown
     assert "\x1b" not in markdown
 
