@@ -27,6 +27,7 @@ if TYPE_CHECKING:
         join_parts,
         nearest_indices,
         number_stretches,
+        recur,
         robust_spread,
         robust_spreads,
         spread_equal,
@@ -55,8 +56,8 @@ if TYPE_CHECKING:
     )
     from pipeline.core.machine_code import (
         LANES,
+        compile_loops,
         compiled,
-        count_loops,
         deal_lanes,
         list_caches,
         require_compiler,

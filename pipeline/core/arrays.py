@@ -32,6 +32,19 @@ def group_rows(number: NDArray[Any]) -> list[Ints]:
     return np.split(order, np.flatnonzero(np.diff(number[order])) + 1)
 
 
+def recur(values: Floats, factors: Floats) -> Floats:
+    """Solve x_k = v_k + f_k x_(k-1) for each column.
+
+    Args:
+        values: v, shape (n,) or (n, c).
+        factors: f of the rows after the first, shape (n - 1,).
+    """
+    bands = np.ones((2, values.shape[0]))
+    bands[1, :-1] = -factors
+    solved, _ = scipy.linalg.lapack.dtbtrs(bands, values, uplo="L", diag="U")
+    return np.asarray(solved, dtype=np.float64)
+
+
 def turn_units(angle: Floats) -> Complex:
     """exp(i angle) of angles [rad], shape (n,): tabulated points of the circle times a series.
 

@@ -1,26 +1,22 @@
-"""Loops over signals, written as plain Python and compiled by Numba when their module is imported.
+"""Loops over signals, written as plain Python and compiled by Numba when they are called for the first time.
 
 The machine code is cached beside the source, or in the user's cache directory, or in ``NUMBA_CACHE_DIR``;
 `slip doctor` says where. ``NUMBA_DISABLE_JIT=1`` runs the Python source instead, with the same results, as it
-is where Numba is not installed: slip tables take some seconds longer then, and fits are refused
-(`require_compiler`). A loop allocates nothing: it writes into its array arguments.
+is where Numba is not installed: fits are refused then (`require_compiler`). A loop allocates nothing: it
+writes into its array arguments.
 """
 
 from __future__ import annotations
 
-import contextlib
 import functools
 import importlib
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from pipeline.core.processes import require_package
-
-numba: Any = None
-with contextlib.suppress(ImportError):  # the extra `diagnose` may not be installed
-    numba = importlib.import_module("numba")
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -31,7 +27,33 @@ LANES = 16
 """Most walks through a signal in one loop: the numbers of twice as many do not fit the fastest memory."""
 
 _HOW: dict[str, Any] = {"nogil": True, "error_model": "numpy", "_nrt": False}
-_loops: list[Any] = []
+_loops: list[_Loop] = []
+
+
+class _Loop:
+    """A loop that takes the place of its name in its file by its machine code when it is called."""
+
+    def __init__(self, function: Callable[..., Any], signature: str | None) -> None:
+        functools.update_wrapper(self, function)
+        self._function, self.signature = function, signature
+
+    def __call__(self, *values: Any) -> Any:  # noqa: ANN401 - of any loop
+        return self.made(*values)
+
+    @functools.cached_property
+    def made(self) -> Any:  # noqa: ANN401 - Numba has no types
+        """The machine code; the function itself where Numba is not installed."""
+        function, names = self._function, self._function.__globals__
+        if find_spec("numba") is None:
+            return function
+        for name in function.__code__.co_names:
+            if isinstance(names.get(name), _Loop):
+                names[name] = names[name].made
+        compile_it = functools.partial(importlib.import_module("numba").njit, *filter(None, [self.signature]))
+        try:
+            return compile_it(cache=True, **_HOW)(function)
+        except RuntimeError:  # no directory of the cache can be written to
+            return compile_it(**_HOW)(function)
 
 
 def compiled(signature: str | None = None) -> Callable[[Function], Function]:
@@ -39,21 +61,14 @@ def compiled(signature: str | None = None) -> Callable[[Function], Function]:
 
     Args:
         signature: types of its arguments in Numba's notation, for example ``void(float64[::1], int64)``; a
-            call with other types raises TypeError. None for a loop that only other loops call: it is defined
-            above them.
+            call with other types raises TypeError. None for a loop that only other loops call.
     """
 
     def decorate(function: Function) -> Function:
-        if numba is None:
-            return function
-        compile_it: Any = numba.njit
-        try:
-            loop = compile_it(signature, cache=True, **_HOW)(function)
-        except RuntimeError:  # no directory of the cache can be written to
-            loop = compile_it(signature, **_HOW)(function)
+        loop = _Loop(function, signature)
         if signature:
             _loops.append(loop)
-        return loop  # type: ignore[no-any-return]
+        return loop  # type: ignore[return-value]
 
     return decorate
 
@@ -72,14 +87,15 @@ def require_compiler(*, otherwise: str = "") -> None:
 
 def list_caches() -> set[str | None]:
     """Directories with cached loops, None for loops that are not cached; empty if loops run as Python."""
-    if numba is None or numba.config.DISABLE_JIT:
+    if find_spec("numba") is None or importlib.import_module("numba").config.DISABLE_JIT:
         return set()
-    return {None if loop.stats.cache_path is None else str(loop.stats.cache_path) for loop in _loops}
+    paths = (loop.made.stats.cache_path for loop in _loops)
+    return {None if path is None else str(path) for path in paths}
 
 
-def count_loops() -> int:
-    """Number of the loops imported so far."""
-    return len(_loops)
+def compile_loops() -> int:
+    """Compile the loops of all files imported so far; their number."""
+    return len([loop.made for loop in _loops])
 
 
 def deal_lanes(count: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
@@ -103,7 +119,7 @@ def deal_lanes(count: int) -> Iterator[tuple[int, NDArray[np.int64], int]]:
 @functools.cache
 def _find_pack() -> int:
     """Walks that the processor computes at a time: a loop of another count does the rest one by one."""
-    if numba is None:
+    if find_spec("numba") is None:
         return 1
     import llvmlite.binding  # noqa: PLC0415 - comes with Numba
 

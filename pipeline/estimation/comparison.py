@@ -22,7 +22,7 @@ from pipeline.models import (
     replace_context,
 )
 from pipeline.run import (
-    WINDOW_S,
+    SPAN_S,
     Grid,
     HeadingSource,
     MotionError,
@@ -447,7 +447,7 @@ class Comparison:
         known = known[~has_excluded(self._silences, known - SILENT_S, known + SILENT_S)]
         begin = grid.locate_edges(known).astype(np.int64)
         begin = np.minimum(begin, grid.times.size - 1)
-        before = np.searchsorted(nodes.times, nodes.times[origin] - WINDOW_S - 0.01)
+        before = np.searchsorted(nodes.times, nodes.times[origin] - SPAN_S - 0.01)
         first = np.unique(np.concatenate((grid.first, begin)))
         number = np.searchsorted(first, np.arange(grid.times.size), side="right") - 1
         wheels = base.wheels
@@ -477,7 +477,7 @@ class Comparison:
         one, two = np.clip(first, 0, top), np.clip(last, 0, top)
         span = nodes.times[two] - nodes.times[one]
         good = (
-            (two > one) & (nodes.piece[one] == nodes.piece[two]) & (span > _LEAST_S) & (span < 2.0 * WINDOW_S)
+            (two > one) & (nodes.piece[one] == nodes.piece[two]) & (span > _LEAST_S) & (span < 2.0 * SPAN_S)
         )
         span = np.where(good, span, 1.0)
         moved = (self._path[two] - self._path[one]) * np.exp(-0.5j * (heading[one] + heading[two])) / span

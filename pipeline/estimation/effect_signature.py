@@ -11,7 +11,7 @@ from pipeline.estimation.problem import Problem
 from pipeline.estimation.state import State
 from pipeline.estimation.window_residuals import CLIP, average_windows, locate_windows, number_stretches
 from pipeline.models import Place, Timing
-from pipeline.run import WINDOW_S
+from pipeline.run import SPAN_S
 
 # The signature of an effect: the residual against the variable that it acts on, with the effect's curve.
 #
@@ -383,7 +383,7 @@ def _standardise(values: Floats, *, clip: bool = True) -> Floats:
 
 def _stride(times: Floats) -> int:
     """Number of windows from one to the next non-overlapping one."""
-    return max(round(WINDOW_S / float(np.median(np.diff(times)))), 1)
+    return max(round(SPAN_S / float(np.median(np.diff(times)))), 1)
 
 
 def _longest(times: Floats) -> int:

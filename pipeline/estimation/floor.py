@@ -10,7 +10,7 @@ import numpy as np
 from pipeline.estimation.errors import Errors
 from pipeline.estimation.window_residuals import average_lags, make_features, regress_robustly
 from pipeline.models import Timing
-from pipeline.run import HORIZON_S, WINDOW_S
+from pipeline.run import HORIZON_S, SPAN_S
 
 if TYPE_CHECKING:
     from pipeline.core import Floats
@@ -43,8 +43,8 @@ def estimate_floor(part: Part, residual: Floats, windows: int) -> Errors:
     lever = float(np.mean(speed**2)) * after**2 * turned
     position = np.sqrt(poses[:, 0] + poses[:, 1] + motion[:, 0] + motion[:, 1] + lever)
     yaw = np.sqrt(poses[:, 2] + motion[:, 2])
-    at_window, moved = noise.spread_after(np.array([WINDOW_S]))
-    x, y, w = (np.sqrt(at_window[0] + moved[0]) / WINDOW_S).tolist()
+    at_window, moved = noise.spread_after(np.array([SPAN_S]))
+    x, y, w = (np.sqrt(at_window[0] + moved[0]) / SPAN_S).tolist()
     # For normal errors, the size of two coordinates is Rayleigh distributed, that of one half-normal.
     return Errors(
         velocity_rms=(x, y, w),

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.core import Floats
 from pipeline.models import EXCEEDED_SHARE, Largest
-from pipeline.run import WINDOW_S, MotionRun, find_fastest_wheel, name_inputs, split_wheels
+from pipeline.run import SPAN_S, MotionRun, find_fastest_wheel, name_inputs, split_wheels
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -99,9 +99,9 @@ def _find_fastest_mean(means: Floats) -> Floats:
 
 
 def average_sustained(times: Floats, signal: Floats) -> Floats:
-    """Means of a signal over the complete stretches of `WINDOW_S` that begin at each sample."""
-    count = max(round(WINDOW_S / float(np.median(np.diff(times)))), 1) if times.size > 1 else 1
-    whole = times[count - 1 :] - times[: times.size - count + 1] <= WINDOW_S
+    """Means of a signal over the complete stretches of `SPAN_S` that begin at each sample."""
+    count = max(round(SPAN_S / float(np.median(np.diff(times)))), 1) if times.size > 1 else 1
+    whole = times[count - 1 :] - times[: times.size - count + 1] <= SPAN_S
     return np.convolve(signal, np.full(count, 1.0 / count), "valid")[whole]
 
 

@@ -41,7 +41,7 @@ from pipeline.estimation.problem import FEWEST_WINDOWS, Problem
 from pipeline.estimation.window_residuals import CLIP, locate_windows
 from pipeline.models import AddedEffect, Effect, Model, Place, Timing
 from pipeline.results import ERRORS_OVER_2S, read_error
-from pipeline.run import WINDOW_S, MeasuredDrive, MotionError, Rolling, RunContext, Velocity, roll_ideally
+from pipeline.run import SPAN_S, MeasuredDrive, MotionError, Rolling, RunContext, Velocity, roll_ideally
 
 if TYPE_CHECKING:
     from pipeline.estimation.held_out import HeldOut
@@ -456,4 +456,4 @@ def average_features(comparison: Comparison, features: Floats) -> tuple[Floats, 
     reset = context.body.number
     # The velocity at the start is measured over the window before, and refers to the middle of it.
     since = context.times[first] - context.times[context.body.at[reset[first]]]
-    return means, (reset[first] == reset[last]) & (since > 0.5 * WINDOW_S - 1.5 * context.step_s)
+    return means, (reset[first] == reset[last]) & (since > 0.5 * SPAN_S - 1.5 * context.step_s)

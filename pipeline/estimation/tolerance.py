@@ -28,7 +28,7 @@ from pipeline.estimation.model_fit import fit_model
 from pipeline.estimation.problem import Problem
 from pipeline.estimation.transfer import fit_as_it_is
 from pipeline.models import drop_learned
-from pipeline.run import HORIZON_S, NODE_S, STILL_MPS, WINDOW_S, MotionError
+from pipeline.run import HORIZON_S, NODE_S, SPAN_S, STILL_MPS, MotionError
 
 if TYPE_CHECKING:
     from pipeline.estimation.comparison import Comparison, Input
@@ -322,7 +322,7 @@ def _hold_out_at(problem: Problem, fitted: Fitted, ahead_s: float) -> Samples:
 
 
 def _find_fastest(moved: Floats, edges: Ints, step_s: float) -> Floats:
-    """Largest predicted speed, a mean over `WINDOW_S`, from that time before each prediction to its end.
+    """Largest predicted speed, a mean over `SPAN_S`, from that time before each prediction to its end.
 
     What happens after braking is the error of the speed before it: a limit of the speed avoids both.
 
@@ -331,7 +331,7 @@ def _find_fastest(moved: Floats, edges: Ints, step_s: float) -> Floats:
         edges: cell edges of the starts and ends of predictions, shape (n, 2).
         step_s: width of a cell [s].
     """
-    count = max(round(WINDOW_S / step_s), 1)
+    count = max(round(SPAN_S / step_s), 1)
     sustained = (moved[count:] - moved[:-count]) / (count * step_s)
     starts, ends = np.maximum(edges[:, 0] - count, 0), np.maximum(edges[:, 1] - count, 0)
     return np.array([sustained[a : b + 1].max(initial=0.0) for a, b in zip(starts, ends, strict=True)])

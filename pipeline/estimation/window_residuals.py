@@ -14,7 +14,7 @@ import numpy as np
 from pipeline.core import STRETCH_S, Flags, Floats, Ints, arrays, guarded_spread, robust_spread
 from pipeline.estimation.state import State
 from pipeline.models import Timing
-from pipeline.run import NODE_S, WINDOW_S, average_spans
+from pipeline.run import NODE_S, SPAN_S, average_spans
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -177,7 +177,7 @@ def count_seconds(part: WindowResiduals) -> Floats:
     starts = part.times[:, 0]
     further = np.append(np.diff(starts), np.inf)
     further[np.flatnonzero(np.diff(part.run))] = np.inf
-    return np.asarray(np.minimum(further, WINDOW_S), dtype=np.float64)
+    return np.asarray(np.minimum(further, SPAN_S), dtype=np.float64)
 
 
 def find_live(ideal: Floats) -> Flags:

@@ -21,8 +21,8 @@ from pipeline.estimation.window_residuals import average_windows, locate_windows
 from pipeline.models import Effect, Excitation, Largest, Model, Place, Timing
 from pipeline.plan.manoeuvres import Commands, PlanError, Reached, is_steered
 from pipeline.run import (
+    SPAN_S,
     STILL_MPS,
-    WINDOW_S,
     Alignment,
     DriveSeries,
     GyroFit,
@@ -180,7 +180,7 @@ def measure_reached(problem: Problem) -> Reached:
         parts["lateral"].append(np.abs(moved[driven, 0] * moved[driven, 2]))
         times = comparison.windows.times[:, 0]
         apart = times[2:] - times[:-2]
-        near = (apart > 0.0) & (apart < 2.0 * WINDOW_S) & driven[1:-1]
+        near = (apart > 0.0) & (apart < 2.0 * SPAN_S) & driven[1:-1]
         parts["acceleration"].append(np.abs(moved[2:, 0] - moved[:-2, 0])[near] / apart[near])
 
     def find(name: str, quantile: float) -> float:

@@ -6,12 +6,13 @@ steering angle. They are held on a fine grid, delayed, and integrated over the s
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from pipeline.core import Complex, Flags, Floats, compiled, join_parts
+from pipeline.core import Complex, Flags, Floats, join_parts, recur
 from pipeline.recording.motion import Motion
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, LEAST_NATS, Fit, Steps, compare, fit, measure_share
 
@@ -102,20 +103,12 @@ class Held:
         )
 
 
-@compiled("void(float64[::1], float64)")
-def _follow(values: Floats, gain: float) -> None:
-    state = 0.0
-    for k in range(values.size):
-        state += gain * (values[k] - state)
-        values[k] = state
-
-
 def follow(values: Floats, lag: float) -> Floats:
     """First-order lag on the grid, without the delay of half a cell that a filter of held values has."""
     if lag <= 0.0:
         return values
-    made = np.array(values, dtype=np.float64)
-    _follow(made, 1.0 - float(np.exp(-GRID_S / lag)))
+    kept = math.exp(-GRID_S / lag)
+    made = recur((1.0 - kept) * values, np.full(values.size - 1, kept))
     made[1:] = 0.5 * (made[1:] + made[:-1])
     return made
 

@@ -13,7 +13,7 @@ from functools import cached_property
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Ints, compiled, find_scale, list_likelihoods, weigh
+from pipeline.core import Flags, Floats, Ints, find_scale, list_likelihoods, recur, weigh
 
 BLOCK_S = 5.0
 """Length of a block [s], longer than any correlation of the noise that is modelled."""
@@ -78,22 +78,13 @@ class Fit:
     turned: Floats
 
 
-@compiled("void(float64[:, ::1], float64, float64, boolean[::1])")
-def _whiten_rows(values: Floats, phi: float, theta: float, fresh: Flags) -> None:
-    for j in range(values.shape[1]):
-        before = made = 0.0
-        for k in range(values.shape[0]):
-            value = values[k, j]
-            made = value if fresh[k] else value - phi * before + theta * made
-            values[k, j] = made
-            before = value
-
-
 def _whiten(values: Floats, noise: tuple[float, float], steps: Steps) -> Floats:
     """Innovations u_k = d_k - phi d_(k-1) + theta u_(k-1) of every column, restarted at gaps."""
-    made = np.array(values, dtype=np.float64, order="C")
-    _whiten_rows(made, *noise, steps.fresh)
-    return made
+    phi, theta = noise
+    goes_on = ~steps.fresh[1:, None]
+    made = np.array(values, dtype=np.float64)
+    made[1:] -= np.where(goes_on, phi * values[:-1], 0.0)
+    return recur(made, np.where(goes_on[:, 0], theta, 0.0))
 
 
 def _solve(values: Floats, columns: Floats, rounds: int = 6) -> tuple[Floats, Floats, Floats]:

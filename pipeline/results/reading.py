@@ -1,17 +1,21 @@
 """What follows from a result: refusals, the effects that count, and the distance to the noise floor."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 from pipeline.core import JSON_DIGITS, format_share, number_in, objects_in, round_digits
-from pipeline.models import Effect, ModelFile
 from pipeline.recording import FAULTS
 from pipeline.results.structs import Errors, Finding, RunDiagnosis, Step
 from pipeline.run import GROUND_UNOBSERVABLE
-from pipeline.sources import Vehicle
+
+if TYPE_CHECKING:
+    from pipeline.models import Effect, ModelFile
+    from pipeline.sources import Vehicle
 
 Entry = TypeVar("Entry")
 

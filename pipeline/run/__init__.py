@@ -6,7 +6,6 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.run.heading import (
-        SPAN_S,
         Grid,
         HeadingSource,
         HeldDrive,
@@ -40,9 +39,11 @@ if TYPE_CHECKING:
     from pipeline.run.signals import (
         ANSWERS_S,
         GROUND_UNOBSERVABLE,
+        HORIZON_S,
         LEAST_RIM_SPEED,
         LIVE_SHARE,
         MOVING_MPS,
+        SPAN_S,
         STILL_MPS,
         Commands,
         DriveSeries,
@@ -65,9 +66,7 @@ if TYPE_CHECKING:
         trace_traction,
     )
     from pipeline.run.windows import (
-        HORIZON_S,
         NODE_S,
-        WINDOW_S,
         Windows,
         average_spans,
         cut_run,

@@ -8,11 +8,10 @@ import numpy as np
 
 from pipeline.core import PERIODS, ROUNDING_S, SILENT_S, Flags, Floats, Ints, arrays, compiled, robust_spread
 from pipeline.run.motion_run import GyroFit, MotionRun, Track
-from pipeline.run.signals import STILL, Commands, DriveSeries, Signal, Wheels
+from pipeline.run.signals import SPAN_S, STILL, Commands, DriveSeries, Signal, Wheels
 
 _SHORTEST_HOLE = 0.3  # [s]: six messages at 20 Hz; shorter gaps, which last less than a window, are bridged
 _LONGEST_HOLE = 3.0  # [s]: no prediction (2 s) bridges it, however rare messages are; it bounds the cells
-SPAN_S = 0.5  # [s]: see `windows.WINDOW_S`; no window fits into a shorter span or bridges a longer gap
 _BEFORE = 1.0  # [s] before a span, from which its first command is held; lags start at the wheel speeds
 
 

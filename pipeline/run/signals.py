@@ -283,6 +283,11 @@ speed may be noise, friction or drift of the poses."""
 ANSWERS_S = 2.0
 """Time [s] in which a drive follows a command: longer than dead times and pauses; with a lag of 1.2 s, 19 %
 of a step remain after it."""
+HORIZON_S = 2.0
+"""Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
+SPAN_S = 0.5
+"""Span of the displacements that models are compared by [s]: the noise of poses is a larger share of shorter
+ones, and longer ones are less sensitive to lags. None fits into a shorter stretch or bridges a longer gap."""
 LEAST_RIM_SPEED = 0.01
 """Speed of the fastest rim [m/s] above which effects of driving act."""
 

@@ -5,20 +5,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pipeline.core import LONGEST_WAIT_S, ROUNDING_S, Complex, Flags, Floats, Ints, compiled
-from pipeline.run.heading import SPAN_S, Grid, has_excluded
+from pipeline.run.heading import Grid, has_excluded
 from pipeline.run.motion_run import MotionError, MotionRun, Track
-from pipeline.run.signals import DriveSeries, Signal, find_fastest_wheel
+from pipeline.run.signals import HORIZON_S, SPAN_S, DriveSeries, Signal, find_fastest_wheel
 
 # Models are compared by displacements over half a second and predictions over two seconds from a pose.
 #
 # Poses are averaged to nodes; windows connect nodes of one segment. No window crosses a gap, a jump, a bad
 # stretch or the end of an interval with live commands.
 
-WINDOW_S = SPAN_S
-"""Span of the displacements that models are fitted to [s]: the noise of poses is a larger share of shorter
-ones, and longer ones are less sensitive to lags."""
-HORIZON_S = 2.0
-"""Length of a prediction [s] by which models are judged, as those of Samson et al. 2024 and of planners."""
 NODE_S = 0.25
 """Step between means of poses [s]: windows overlap by half."""
 STEP_S = 0.2
@@ -164,15 +159,15 @@ def find_lead(run: MotionRun, delay_s: float) -> float:
 def join_windows(run: MotionRun, grid: Grid, nodes: Nodes, lead_s: float) -> Windows:
     """All windows of half a second, a quarter of a second apart where poses are dense."""
     start = np.arange(nodes.times.size)
-    at = np.searchsorted(nodes.times, nodes.times + WINDOW_S)
+    at = np.searchsorted(nodes.times, nodes.times + SPAN_S)
     before = np.clip(at - 1, 0, nodes.times.size - 1)
     after = np.clip(at, 0, nodes.times.size - 1)
-    nearer = np.abs(nodes.times[after] - nodes.times - WINDOW_S) < np.abs(
-        nodes.times[before] - nodes.times - WINDOW_S
+    nearer = np.abs(nodes.times[after] - nodes.times - SPAN_S) < np.abs(
+        nodes.times[before] - nodes.times - SPAN_S
     )
     end = np.where(nearer, after, before)
     length = nodes.times[end] - nodes.times
-    mask = (length > 0.6 * WINDOW_S) & (length < 1.5 * WINDOW_S)
+    mask = (length > 0.6 * SPAN_S) & (length < 1.5 * SPAN_S)
     mask &= _is_clean(run, grid, nodes, (start, end), lead_s)
     start, end = start[mask], end[mask]
     times = np.column_stack((nodes.times[start], nodes.times[end]))

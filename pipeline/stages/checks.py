@@ -8,7 +8,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, robust_spread
-from pipeline.models import Late, find_late_effect
 from pipeline.run import LIVE_SHARE, MOVING_MPS, STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.findings import SURE, Finding
@@ -414,6 +413,8 @@ def check_delays(samples: Samples, _vehicle: Vehicle) -> list[Finding]:
                 f"compared with the wheels, the heading {order} the position by {abs(skew) * 1e3:.0f} ms: "
                 "the localization delays them differently (similar to lateral skid), or the body has inertia"
             )
+            from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
+
             name = find_late_effect(Late.HEADING).id
             findings.append(Finding(name, "warning", text, where="pose", value=skew))
     return findings

@@ -14,7 +14,6 @@ from typing import cast
 import numpy as np
 
 from pipeline.core import PAUSE_NS, Flags, Floats, Ints, format_duration, robust_spread
-from pipeline.models import Late, find_late_effect
 from pipeline.stages import timing
 from pipeline.stages.findings import Finding, Severity
 
@@ -499,6 +498,8 @@ def _join_time_bases(
                 f"the recorder's clock lies {_format_offset(home)} from the stamps: "
                 f"{clock.topic}, which has none, was shifted"
             )
+        from pipeline.models import Late, find_late_effect  # noqa: PLC0415 - heavy
+
         name = find_late_effect(Late.POSES).id
         findings.append(Finding(name, "warning", text, where=clock.topic, value=away))
         joined[key] = replace(clock, stamp=clock.stamp + shift, findings=())

@@ -15,7 +15,7 @@ import polars as pl
 
 from pipeline.core import Flags, Floats, SlipError, arrays, format_share, rigid
 from pipeline.logs import LogData
-from pipeline.run import LIVE_SHARE, WINDOW_S
+from pipeline.run import LIVE_SHARE, SPAN_S
 from pipeline.sources import (
     DEAD_RECKONED,
     FILTERED,
@@ -250,7 +250,7 @@ def _score_satellites(
         reasons.append("its heading is its course")
     else:
         reasons.append("its heading is the IMU's, put on its course")
-    noise = estimate_noise(position[:, :2]) / np.sqrt(arrays.count_steps(time, WINDOW_S)) / WINDOW_S
+    noise = estimate_noise(position[:, :2]) / np.sqrt(arrays.count_steps(time, SPAN_S)) / SPAN_S
     if noise > _NOISY_MPS:
         score -= 0.5
         reasons.append(f"noisy: {noise:.2g} m/s over half a second")
@@ -285,7 +285,7 @@ def _compare_with_wheels(
     time, position, yaw = time[inside], position[inside], yaw[inside]
     if time.size < FEWEST_MESSAGES:
         return None, np.inf
-    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
+    ends = np.arange(0, time.size, arrays.count_steps(time, SPAN_S))
     distance, _ = split_chords(position[ends], yaw[ends])
     rolled = np.interp(time[ends], *path[:2])
     rate = np.gradient(path[1], arrays.spread_equal(path[0]))
@@ -340,7 +340,7 @@ def _compare_with_gyro(time: Floats, yaw: Floats, imu: pl.DataFrame) -> float | 
     time, yaw = time[inside], yaw[inside]
     if time.size < FEWEST_MESSAGES:
         return None
-    ends = np.arange(0, time.size, arrays.count_steps(time, WINDOW_S))
+    ends = np.arange(0, time.size, arrays.count_steps(time, SPAN_S))
     at = time[ends]
     turned = integrate_between(at[:-1], at[1:], clock, imu["rate_z"].to_numpy())
     known = np.isfinite(turned)

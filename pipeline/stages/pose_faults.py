@@ -8,7 +8,7 @@ import polars as pl
 
 from pipeline.core import NORMAL_95, Flags, Floats, Ints, arrays, robust_spread
 from pipeline.run import (
-    WINDOW_S,
+    SPAN_S,
     Alignment,
     DriveSeries,
     MotionError,
@@ -92,7 +92,7 @@ def _pair_up(run: MotionRun) -> tuple[Ints, Ints]:
     """Poses of one segment half a second apart, and those before and after a longer wait."""
     times = run.track.times
     first = np.arange(times.size)
-    last = np.searchsorted(times, times + WINDOW_S - 1e-3)
+    last = np.searchsorted(times, times + SPAN_S - 1e-3)
     mask = last < times.size
     first, last = first[mask], last[mask].astype(np.int64)
     mask = (run.track.segment[first] == run.track.segment[last]) & (times[last] - times[first] < _LONGEST_S)

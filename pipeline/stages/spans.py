@@ -18,12 +18,12 @@ from pipeline.core import (
     LOG_PEAK,
     Flags,
     Floats,
-    compiled,
     find_runs,
     find_scale,
     format_share,
     list_likelihoods,
     number_stretches,
+    recur,
     weigh,
 )
 from pipeline.run import LIVE_SHARE, STILL_MPS
@@ -216,14 +216,6 @@ def _report_poses(bad: Sequence[Span], wrong: Flags, rims: Rims) -> Finding:
     )
 
 
-@compiled("void(float64[:, ::1], boolean[::1], float64)")
-def _follow(values: Floats, is_first: Flags, gain: float) -> None:
-    for k in range(1, values.shape[0]):
-        if not is_first[k]:
-            for i in range(values.shape[1]):
-                values[k, i] = values[k - 1, i] + gain * (values[k, i] - values[k - 1, i])
-
-
 def price_change(count: int) -> float:
     """Log-likelihood that a change of the hypothesis costs: any of so many blocks might have one."""
     return float(np.log(count / LEVEL))
@@ -289,9 +281,11 @@ class _Blocks:
 
     def follow(self, values: Floats) -> Floats:
         """Values after a first-order lag, shape (m, k)."""
-        made = np.array(values, order="C")
-        _follow(made, self.is_first, 1.0 - float(np.exp(-BLOCK_S / _SLOW_S)))
-        return made
+        kept = float(np.exp(-BLOCK_S / _SLOW_S))
+        return recur(
+            np.where(self.is_first[:, None], values, (1.0 - kept) * values),
+            np.where(self.is_first[1:], 0.0, kept),
+        )
 
     def list_columns(self, source: Floats, top: float, friction: float) -> Floats:
         """What may follow from a source, shape (m, k).

@@ -12,7 +12,7 @@ import polars as pl
 from numpy.typing import NDArray
 
 from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, rigid, student_quantile
-from pipeline.run import ANSWERS_S, LIVE_SHARE, MOVING_MPS, STILL_MPS, WINDOW_S
+from pipeline.run import ANSWERS_S, LIVE_SHARE, MOVING_MPS, SPAN_S, STILL_MPS
 from pipeline.sources import Vehicle
 from pipeline.stages.findings import Finding
 from pipeline.stages.inputs import Ideal, Steps
@@ -243,13 +243,13 @@ def _steps_evenly(drifted: Floats, swung: Floats, periods_s: Sequence[float]) ->
     (half_step,), rest = fit_robustly(swung[:, None], drifted)
     drift = float(np.median(np.abs(half_step * swung)))
     known = any(abs(2.0 * abs(half_step) / period - 1.0) <= _UNEVEN for period in periods_s if period > 0.0)
-    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * WINDOW_S)
+    regular = float(np.median(np.abs(rest))) <= max(_UNEVEN * drift, _SIDEWAYS * SPAN_S)
     return regular and (known or abs(half_step) <= _FAST_STEP)
 
 
 def list_spans(samples: Samples, known: Flags) -> tuple[Ints, Ints]:
     """First and last samples of half seconds in one segment without unknown samples, each of shape (m,)."""
-    span = arrays.count_steps(samples.times, WINDOW_S)
+    span = arrays.count_steps(samples.times, SPAN_S)
     first = np.arange(0, samples.times.size - span, span)
     last = first + span
     counted = np.concatenate(([0], np.cumsum(known)))
@@ -285,7 +285,7 @@ def _share_beside_wheels(
 def measure_rest(moved: Floats, driven: Floats, changed: Floats) -> float | None:
     """Median residual of a robust fit of ``moved`` on ``driven`` and ``changed``, relative to ``moved``."""
     size = float(np.sqrt(np.mean(moved**2)))
-    if size < STILL_MPS * WINDOW_S:
+    if size < STILL_MPS * SPAN_S:
         return None
     _, rest = fit_robustly(np.column_stack((driven, changed)), moved)
     return float(np.median(np.abs(rest))) / size

@@ -41,7 +41,7 @@ def give_no_room(_: Path) -> shutil._ntuple_diskusage:
 @pytest.fixture
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
     """Loops that are kept; what takes seconds is looked at once, below."""
-    monkeypatch.setattr(machine_code, "count_loops", lambda: 1)
+    monkeypatch.setattr(machine_code, "compile_loops", lambda: 1)
     monkeypatch.setattr(machine_code, "list_caches", lambda: {"/cache"})
 
 
