@@ -16,12 +16,15 @@ import argparse
 import math
 import sys
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, cast
 from unittest.mock import patch
 
+import polars as pl
 from injections import Drive, Injection, list_injections
 from measuring import RECORDINGS, add_row, read_rows
 
@@ -30,13 +33,12 @@ from pipeline.analysis.analyze import analyze_log
 from pipeline.core import SlipError
 from pipeline.estimation import diagnose_runs
 from pipeline.estimation.stored_diagnosis import read_recording
-from pipeline.logs import LogData
+from pipeline.logs import read_topics
 from pipeline.models import find_effect
+from pipeline.recording.log_setup import set_up_log
 from pipeline.results import Named, Value
-from pipeline.sources import Vehicle
-from pipeline.sources.candidates import Sources
-from pipeline.sources.configuration import Configuration
-from pipeline.stages.extract import Extracted, extract_tables
+from pipeline.sources import DriveSection, DriveSource, Sources, Vehicle
+from pipeline.stages import Extraction, extract_tables, list_wanted
 
 STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
@@ -108,17 +110,55 @@ class Answer:
         return abs(value - find_neutral(label)) > half and is_close((value, half), other.numbers[label])
 
 
+@lru_cache(maxsize=1)
+def _extract(log: Path) -> tuple[Sources, Vehicle, Mapping[str, pl.DataFrame]]:
+    """Sources, vehicle and tables of a recording as it is."""
+    setup = set_up_log(log, Options(out=Path()))
+    data = setup.choice.data if setup.choice.extracted is None else None
+    data = data or read_topics(setup.index, list_wanted(setup.sources, setup.index.types))
+    made = extract_tables(data, setup.sources, setup.configuration, setup.vehicle, where=str(log))
+    return setup.sources, setup.vehicle, made.tables
+
+
+@contextmanager
+def inject(log: Path, injection: Injection) -> Iterator[None]:
+    """Let every reader of a recording, its examination first, see a change."""
+    sources, vehicle, tables = _extract(log)
+    drive = Drive(vehicle.wheel_radius_m, vehicle.track_width_m or math.nan)
+    changed = injection.change(tables, drive)
+    poses, imu, read_drive = Extraction.poses, Extraction.imu, Extraction.read_drive
+
+    def read_poses(self: Extraction) -> pl.DataFrame:
+        # What is found while they are read stays as it was.
+        recorded = poses(self)
+        return changed["poses"] if str(self.sources.pose) == str(sources.pose) else recorded
+
+    def read_imu(self: Extraction) -> pl.DataFrame:
+        recorded = imu(self)
+        return changed.get("imu", recorded) if str(self.sources.imu) == str(sources.imu) else recorded
+
+    def read_changed(
+        self: Extraction, source: DriveSource | None, section: DriveSection, *, held: bool
+    ) -> pl.DataFrame:
+        table = read_drive(self, source, section, held=held)
+        for role, own in (("commands", sources.command), ("wheels", sources.wheels)):
+            is_own = source is not None and own is not None and source.signals == own.signals
+            if is_own and changed.get(role) is not tables.get(role):
+                # In the units of who reads it.
+                return injection.change({**tables, role: table}, drive)[role]
+        return table
+
+    with (
+        patch.object(Extraction, "poses", read_poses),
+        patch.object(Extraction, "imu", read_imu),
+        patch.object(Extraction, "read_drive", read_changed),
+    ):
+        yield
+
+
 def ask(log: Path, injection: Injection, *, both: bool) -> Answer:
     """Analyze and diagnose a recording with a change."""
-
-    def changed(
-        data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
-    ) -> Extracted:
-        made = extract_tables(data, sources, configuration, vehicle, where=where)
-        drive = Drive(vehicle.wheel_radius_m, vehicle.track_width_m or math.nan)
-        return replace(made, tables=dict(injection.change(made.tables, drive)))
-
-    with tempfile.TemporaryDirectory() as folder, patch("pipeline.analysis.work.extract_tables", changed):
+    with tempfile.TemporaryDirectory() as folder, inject(log, injection):
         manifest = analyze_log(log, Options(out=Path(folder), report=False)).manifest
         vehicle, recording = read_recording(manifest)
         inputs = ("command", "measured") if both else ("measured",)

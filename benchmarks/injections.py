@@ -1,8 +1,8 @@
 """What is injected into recordings: faults of sensors and wiring, and effects with their formulas.
 
 Each change takes the tables of a run as they were extracted and returns changed ones. It uses numpy and
-polars alone: nothing here knows how the tool looks for what is injected. Faults of the wiring, which are
-found before tables are extracted, are written into logs (`front`).
+polars alone: nothing here knows how the tool looks for what is injected. The examination of a log reads what
+is changed as every stage does. Faults of the wiring and of messages are written into logs (`front`).
 """
 
 import math
