@@ -44,6 +44,8 @@ STANDING = ("husky_wheels_avide2", "husky_wheels_plank")
 _SURE = 1.96
 # Relative change of a finding's number that is news.
 _OTHER = 0.02
+# Share of what was put in by which a finding's number may be off.
+_MOVED = 0.2
 _VERDICTS = ("recovered", "reported", "one of", "edge", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
@@ -194,7 +196,7 @@ def _list_values(told: Iterable[tuple[str, Mapping[str, Value]]]) -> dict[str, N
 
 def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, list[str]]:
     """One of `_VERDICTS`, and names that the unchanged recording neither has nor considers."""
-    told = [name for name in injection.findings if _is_news(name, before, after)]
+    told = [name for name in injection.findings if _is_news(name, injection.moved, before, after)]
     if told:
         return "reported", []
     effects = {label.split(".")[0] for label in injection.numbers}
@@ -237,11 +239,13 @@ def _judge_same(before: Answer, after: Answer, extra: Sequence[str]) -> str:
     return "edge" if known else "missed"
 
 
-def _is_news(finding: str, before: Answer, after: Answer) -> bool:
+def _is_news(finding: str, moved: float | None, before: Answer, after: Answer) -> bool:
     """Whether a finding is new, or says another number than it did of the unchanged recording."""
     if finding not in after.findings:
         return False
     old, new = before.findings.get(finding), after.findings[finding]
+    if moved is not None and old and new:
+        return abs(new - old - moved) < _MOVED * abs(moved)
     return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
 
 

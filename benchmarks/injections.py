@@ -42,6 +42,8 @@ class Injection:
             are right.
         same: the answer must stay what it was.
         both: needs the way from command to wheels.
+        moved: by how much a finding's number changes that the unchanged recording has, too; None where any
+            other number tells.
     """
 
     name: str
@@ -52,6 +54,7 @@ class Injection:
     along: Mapping[str, Callable[[float], float]] = field(default_factory=dict)
     same: bool = False
     both: bool = False
+    moved: float | None = None
 
 
 def list_injections() -> list[Injection]:
@@ -74,8 +77,12 @@ def list_injections() -> list[Injection]:
             {"drive_gain.g": lambda g: g / 1.5}, both=True,
         ),
         Injection(
-            "commands .2 s early", _on("commands", lambda t: _later(t, -0.2)), (),
-            {"transport_delay.d": shift(0.2)}, both=True,
+            "commands .2 s early", _on("commands", lambda t: _later(t, -0.2)), ("command_delay",),
+            {"transport_delay.d": shift(0.2)}, moved=0.2, both=True,
+        ),
+        Injection(
+            "commands .8 s late", _on("commands", lambda t: _later(t, 0.8)),
+            ("command_corrected", "command_late"), both=True,
         ),
         Injection("gyro negated", _on("imu", lambda t: t.with_columns(-pl.col("rate_z"))), same=True),
         Injection("map turned and moved", _map_moved, same=True),

@@ -27,6 +27,7 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     "pose": {"up": 'up = "z"', "heading_deg": "heading_deg = 0", "unit": 'unit = "m"'},
     "wheels": {"unit": 'unit = "rad/s"', "steering_unit": 'steering_unit = "rad"'},
     "command": {
+        "late_s": "late_s = 0",
         "unit": 'unit = "m/s"',
         "yaw_unit": 'yaw_unit = "rad/s"',
         "steering_unit": 'steering_unit = "rad"',
@@ -183,8 +184,12 @@ class Case:
         """What the user says of a source: of the topic that is named, or of any if none is."""
         of_role = self.configuration.wheels if is_measured else self.configuration.command
         chosen = self.sources.wheels if is_measured else self.sources.command
-        is_another = chosen is not None and chosen.reason == CONFIGURED and chosen.signals != source.signals
-        return DriveSection() if is_another else of_role
+        if chosen is None or chosen.signals == source.signals:
+            return of_role
+        if chosen.reason == CONFIGURED:
+            return DriveSection()
+        # A clock is one topic's.
+        return msgspec.structs.replace(of_role, late_s=None)
 
     def read_again(self, wheels: Candidate, motion: Motion, kind: str = "differential") -> bool:
         """Read the wheels as corrected, or of another kind of vehicle; whether the body turns by them."""

@@ -13,8 +13,9 @@ from pipeline.core import enumerate_texts
 from pipeline.logs import LogData
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.command_scale import measure_command
+from pipeline.recording.delays import settle_delay
 from pipeline.recording.examination import Recording, describe
-from pipeline.recording.geometry import Geometry, Length, roll_wheels
+from pipeline.recording.geometry import Geometry, Length, explain_wheels, roll_wheels
 from pipeline.recording.motion import Motion
 from pipeline.recording.outages import leave_out
 from pipeline.recording.roles import choose_roles
@@ -113,6 +114,8 @@ def _stand_in(case: Case) -> Recording | None:
         _find_unit(case, wheels, command)
     if not case.findings or case.findings[-1].severity != "error":
         _report_opposite(case, command, wheels)
+    case.driven = explain_wheels(command.reading, wheels.reading)
+    settle_delay(case, command, wheels, None)
     sources = replace(case.sources, command=command.source)
     alignment = measure_command(case, command, wheels, "ackermann" if steered else "", None)
     return Recording(

@@ -9,8 +9,9 @@ from pipeline.core import SlipError
 from pipeline.logs import LogData
 from pipeline.recording.case import Case
 from pipeline.recording.command_scale import measure_command
+from pipeline.recording.delays import settle_delay
 from pipeline.recording.encoders import settle_wheels
-from pipeline.recording.geometry import Geometry, measure_lengths
+from pipeline.recording.geometry import Geometry, explain_wheels, measure_lengths
 from pipeline.recording.kinds import find_kind, leave_out_steered, report_turn
 from pipeline.recording.motion import measure_motion
 from pipeline.recording.readings import Reading
@@ -121,7 +122,10 @@ def examine(
         report_signs(case, motion, command, wheels, gyro)
     if wheels is not None and case.changes.get("wheels", {}).keys() & {"sign", "exchanged"}:
         case.read_again(wheels, motion, (kind if kind == "ackermann" else "") or "differential")
+    if command is not None and wheels is not None:
+        case.driven = explain_wheels(command.reading, wheels.reading)
     find_units(case, command, wheels)
+    settle_delay(case, command, wheels, motion)
     alignment = measure_command(case, command, wheels, kind, motion)
     used = (("command", command), ("wheels", wheels))
     roles = {id(one.reading): role for role, one in used if one is not None}

@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pipeline.core import format_share, join_parts
+from pipeline.core import Floats, format_share, join_parts
 from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.motion import STEP_S, Motion
-from pipeline.recording.readings import SIDES, Explained, Reading
+from pipeline.recording.readings import DELAYS_S, SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
 from pipeline.sources import RANGES, find_alike
 
@@ -90,38 +90,33 @@ def roll_wheels(wheels: Reading) -> Motion | None:
     return Motion(steps, join_parts(ahead, 0.0), np.zeros(turned.size), turned, "z")
 
 
-def explain_wheels(command: Reading, wheels: Reading) -> Explained | None:
+def explain_wheels(command: Reading, wheels: Reading, delays: Floats = DELAYS_S) -> Explained | None:
     """What wheels do of a command: their motion takes the place of a pose's.
 
     Args:
-        command: of the body or of both sides.
-        wheels: speeds of both sides.
+        command: of the body, of both sides, or of speed and steering.
+        wheels: what is measured of them.
+        delays: see `Reading.explain`.
 
     Returns:
         The fit; None if the wheels do not follow the command, or one of its sides counts backward.
     """
-    if len(wheels.inputs) < len(SIDES) or command.form not in {"body", "sides"}:
-        return None
-    motion = roll_wheels(wheels)
+    motion = roll_wheels(wheels) if len(wheels.inputs) >= len(SIDES) else None
     if motion is None:
         return None
-    made = Reading(command.form, command.name, command.first, command.second).explain(motion)
+    made = Reading(command.form, command.name, command.first, command.second).explain(motion, delays)
     return None if made is None or not made.is_sure or made.crossed else made
 
 
-def measure_controller(command: Reading, wheels: Reading) -> tuple[Length | None, Length | None] | None:
+def measure_controller(made: Explained) -> tuple[Length | None, Length | None]:
     """Wheel radius and track by which a controller turns body commands into wheel speeds.
 
     Args:
-        command: speed [m/s] and yaw rate [rad/s].
-        wheels: speeds of both sides [rad/s].
+        made: speeds of both sides [rad/s] by commanded speed [m/s] and yaw rate [rad/s].
 
     Returns:
-        Radius and track, each None where it is not excited; None if the wheels do not follow a body command.
+        Radius and track, each None where it is not excited.
     """
-    made = explain_wheels(command, wheels) if command.form == "body" else None
-    if made is None:
-        return None
     ahead, bent = (float(one.gains[0]) for one in (made.ahead, made.turned))
     errors = _list_errors(made)
     radius = Length(1.0 / ahead, errors[0] / ahead) if ahead > 0.0 and 1.0 / errors[0] > CLEAR else None
@@ -269,12 +264,12 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
         and wheels is not None
         and wheels.reading.form == "sides"
         and command.reading.form == "body"
+        and case.driven is not None
     ):
-        lengths = measure_controller(command.reading, wheels.reading)
-        if lengths is not None:
-            speed, rate = case.command_factors()
-            radius = _scale(lengths[0], speed * case.wheel_factor())
-            made = replace(made, radius=radius, track=_scale(lengths[1], speed / rate))
+        radius, track = measure_controller(case.driven)
+        speed, rate = case.command_factors()
+        radius = _scale(radius, speed * case.wheel_factor())
+        made = replace(made, radius=radius, track=_scale(track, speed / rate))
     changes = case.changes.get("wheels", {})
     return replace(made, is_taken="scale" in changes or changes.get("unit") == "m/s")
 

@@ -26,7 +26,7 @@ _FEW_CELLS = 2.0
 _LONGEST_S = 6.0 * 3600.0
 """Distance [s] from the middle message beyond which a stamp is wrong, or more of a drive adds nothing."""
 SIDES = ("left", "right")
-_DELAYS_S = np.arange(-0.3, 0.81, 0.05)
+DELAYS_S = np.arange(-0.3, 0.81, 0.05)
 _LAGS_S = (0.0, 0.08, 0.16, 0.25, 0.35, 0.5, 0.8)
 _MOST_ROWS = 2000
 """Number of steps on which delays are compared first."""
@@ -284,8 +284,13 @@ class Reading:
             return np.zeros((steps.start.size, 0))
         return aside.integrate(steps, lag, delay)[:, None]
 
-    def explain(self, whole: Motion) -> Explained | None:
-        """Fit the motion; also kept as ``explained``."""
+    def explain(self, whole: Motion, delays: Floats = DELAYS_S) -> Explained | None:
+        """Fit the motion; also kept as ``explained``.
+
+        Args:
+            whole: the motion.
+            delays: that are tried first, shape (k,), and near which the delay is [s].
+        """
         self.explained = None
         if not self.inputs:
             return None
@@ -300,7 +305,7 @@ class Reading:
         may_cross = self.form in {"sides", "body"} and len(two) == len(SIDES)
         may_cross = may_cross and (self.third is None or self.third_crossed is not None)
         patterns = (False, True) if may_cross else (False,)
-        tried = {crossed: self._fit(motion, crossed=crossed) for crossed in patterns}
+        tried = {crossed: self._fit(motion, delays, crossed=crossed) for crossed in patterns}
         # Laps of one radius are explained either way, for speed and yaw rate are proportional: where the
         # command explains the motion as it is, nothing is reversed.
         if may_cross and self.form == "body" and min(tried[False].shares) > _AS_IT_IS:
@@ -328,8 +333,8 @@ class Reading:
         ahead, yaw = motion.body.real, motion.yaw
         return np.asarray(near | _is_large(ahead / elapsed, 0.2) | _is_large(yaw / elapsed, 0.2))
 
-    def _fit(self, motion: Motion, *, crossed: bool) -> Explained:
-        lag, delay = self._find_delay(motion, crossed=crossed)
+    def _fit(self, motion: Motion, delays: Floats, *, crossed: bool) -> Explained:
+        lag, delay = self._find_delay(motion, delays, crossed=crossed)
         ahead, yaw = motion.body.real, motion.yaw
         first, second = self.columns(motion.steps, lag, delay, crossed=crossed)
         empty = np.zeros((yaw.size, 0))
@@ -363,7 +368,7 @@ class Reading:
         )
         return made
 
-    def _find_delay(self, motion: Motion, *, crossed: bool) -> tuple[float, float]:
+    def _find_delay(self, motion: Motion, delays: Floats, *, crossed: bool) -> tuple[float, float]:
         """Lag and delay [s] by the least residual, jumps of the pose limited."""
         count = motion.moved.size
         some = np.ones(count, dtype=bool)
@@ -380,13 +385,15 @@ class Reading:
                 scores[key] = self._rate_delay(part, *key, limits, crossed=crossed)
             return scores[key]
 
-        for lag in _LAGS_S:
-            for delay in _DELAYS_S:
-                score(lag, float(delay))
+        # Beside a delay that is given a lag may be any.
+        for lag in _LAGS_S if delays.size > 1 else np.arange(0.0, 2.0, 0.05):
+            for delay in delays:
+                score(float(lag), float(delay))
         for step in (0.03, 0.01):
             lag, delay = max(scores, key=lambda key: scores[key])
             for longer in (-step, 0.0, step):
-                for later in (-step, 0.0, step):
+                # One that is given is as it is.
+                for later in (-step, 0.0, step) if delays.size > 1 else (0.0,):
                     score(max(0.0, lag + longer), delay + later)
         return max(scores, key=lambda key: scores[key])
 

@@ -18,7 +18,6 @@ from pipeline.recording.evidence import (
     find_wheel_unit,
     is_unit_exact,
 )
-from pipeline.recording.geometry import explain_wheels
 from pipeline.recording.motion import Motion, measure_motion
 from pipeline.recording.readings import Bent, Reading
 from pipeline.sources import DriveForm, PoseContent
@@ -159,10 +158,7 @@ def _report_units(
 def _find_wheel_unit(case: Case, command: Candidate | None, wheels: Candidate) -> None:
     """Unit of wheel speeds by the controller of a known vehicle, else by the motion."""
     explained, share = wheels.reading.explained, 1.0
-    radius = case.vehicle.wheel_radius_m if case.is_known else None
-    driven = None
-    if radius is not None and command is not None:
-        driven = case.driven = explain_wheels(command.reading, wheels.reading)
+    radius, driven = case.vehicle.wheel_radius_m if case.is_known else None, case.driven
     if driven is not None and radius is not None and command is not None and driven.sign("ahead") > 0:
         # Wheels follow a command closely on any ground.
         of_command = radius if command.reading.form == "sides" else case.command_factors()[0]

@@ -139,6 +139,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
         factors: the same of a side (``left``, ``right``) or of a joint, below zero where it counts backward.
         ignore: spans whose readings are none; empty: all are taken as recorded.
         time: which of the message's times to use.
+        late_s: how much later than its moment a message is stamped; below zero: earlier.
         hold_s: how long a command stays valid.
     """
 
@@ -163,6 +164,7 @@ class DriveSection(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     factors: dict[str, float] | None = None
     ignore: list[OutageSection] | None = None
     time: Clock | None = None
+    late_s: float | None = None
     hold_s: Positive | None = None
 
 

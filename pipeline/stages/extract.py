@@ -556,6 +556,8 @@ class Extraction:
                 source.form, first, second, section, self.vehicle, nominal=nominal, sideways=sideways
             )
         self.findings += drive.findings
+        if section.late_s:
+            stamp = stamp - round(section.late_s * 1e9)
         if not held and section.scale is not None:
             text = f"the readings of the encoders are multiplied by {section.scale:g}, as configured"
             self.findings.append(

@@ -231,3 +231,10 @@ def test_a_special_case_with_the_same_number_is_no_extra_name() -> None:
     assert judge(track, plain, Answer({"effective_track.k": (2.05, 0.03)}))[0] == "recovered"
     assert judge(track, plain, Answer({**sliding, "effective_track.k": (1.2, 0.02)}))[0] == "recovered"
     assert judge(track, plain, Answer(wider))[0] == "number"
+
+
+def test_a_finding_tells_by_what_was_put_in() -> None:
+    injection = BY_NAME["commands .2 s early"]
+    before = Answer({}, {"command_delay": 0.31})
+    told = [judge(injection, before, Answer({}, {"command_delay": one}))[0] for one in (0.5, 0.31, 0.4)]
+    assert told == ["reported", "missed", "missed"]

@@ -19,7 +19,7 @@ from pipeline.recording.evidence import (
     find_wheel_unit,
     rate_command,
 )
-from pipeline.recording.geometry import measure_controller, measure_geometry
+from pipeline.recording.geometry import explain_wheels, measure_controller, measure_geometry
 from pipeline.recording.motion import measure_motion
 from pipeline.recording.readings import Held, Reading
 from pipeline.recording.score import FEWEST_STEPS, Steps, compare, fit
@@ -92,8 +92,9 @@ def test_radius_and_track_come_from_the_motion_and_from_the_controller() -> None
     assert track is not None
     assert radius.value == pytest.approx(RADIUS, rel=0.01)
     assert track.value == pytest.approx(TRACK / GAIN, rel=0.01)
-    found = measure_controller(command(drive), wheels)
-    assert found is not None
+    driven = explain_wheels(command(drive), wheels)
+    assert driven is not None
+    found = measure_controller(driven)
     assert [one.value for one in found if one] == pytest.approx([RADIUS, TRACK], rel=0.01)
 
 
@@ -101,8 +102,9 @@ def test_lengths_are_as_good_as_is_said_of_them() -> None:
     far = []
     for seed in range(40, 48):
         drive = draw(seed, 60.0)
-        found = measure_controller(command(drive), sides(drive))
-        assert found is not None
+        driven = explain_wheels(command(drive), sides(drive))
+        assert driven is not None
+        found = measure_controller(driven)
         far += [
             (one.value - true) / one.error for one, true in zip(found, (RADIUS, TRACK), strict=True) if one
         ]
