@@ -16,15 +16,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.optimize import minimize
 
 from pipeline.core import compiled
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from pipeline.core import Flags, Floats, Ints
 
@@ -36,15 +36,19 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _MOST_ROUNDS = 0.005, 80
+_SAME, _MOST_ROUNDS = 0.005, 30
 """Difference of chi-square at which the likelihood of both numbers has converged, and rounds until then."""
-_FARTHEST = 8.0
-"""Largest logit of a share or a correlation."""
+_FAR, _CLOSER = 2.0, 0.3
+"""Longest step along an axis, in radii of the points around, and factor of the radius after a step within."""
+_LEAST_KEPT = 1e-6
+"""Least correlation, whose logarithm is taken."""
 _LOGS = 16
 """Variances whose product is taken before its logarithm."""
 _SCALE_ROUNDS = 30
 _SAME_SCALE = 1e-4
 """Relative change of a scale at which it has converged."""
+_MEAN_SIZE = 1.2533
+"""Ratio of the standard deviation of a normal distribution to its mean absolute value."""
 _GAUSSIAN = 1.4826
 """Ratio of the standard deviation of a normal distribution to its median absolute value."""
 
@@ -62,6 +66,21 @@ class Steps:
     spans: Floats
     fresh: Flags
     run: Ints
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """The lengths that there are, to a thousandth of a second, shape (kinds,)."""
+        return self._kinds[0]
+
+    @cached_property
+    def kind(self) -> Ints:
+        """Which of them each has, shape (n,)."""
+        return self._kinds[1]
+
+    @cached_property
+    def _kinds(self) -> tuple[Floats, Ints]:
+        lengths, kind = np.unique(np.round(self.spans, 3), return_inverse=True)
+        return lengths, kind.astype(np.int64)
 
 
 @dataclass(frozen=True)
@@ -191,40 +210,69 @@ def huber_cost(innovations: Floats) -> Floats:
 def _maximize(
     values: Floats, steps: Steps, step_s: float, known: tuple[float, float] | None, *, exact: bool
 ) -> tuple[float, float]:
-    """Correlation and share of the disturbance."""
+    """Correlation and share of the disturbance.
+
+    They are squares of sines: a bound is a place like others then, where the likelihood is level.
+    """
     most = math.exp(-step_s / _LONGEST_S)
+    flat, size = np.ascontiguousarray(values[:, 0]), np.empty((values.shape[0], _LANES))
+    costs, rows = np.empty(_LANES), np.empty(_ROWS * _LANES)
 
-    def read(at: Sequence[float]) -> tuple[float, float]:
-        phi, part = (1.0 / (1.0 + math.exp(-min(max(one, -_FARTHEST), _FARTHEST))) for one in at)
-        return phi * most, part
+    def read(at: Floats) -> tuple[Floats, Floats]:
+        phi, part = np.ascontiguousarray(np.sin(at.T) ** 2)
+        return np.maximum(most * phi, _LEAST_KEPT), part
 
-    flat, size = np.ascontiguousarray(values[:, 0]), np.empty(values.shape[0])
+    def rate(at: Floats) -> Floats:
+        phi, part = read(at)
+        keeps = np.exp(np.outer(steps.lengths / step_s, np.log(phi)))
+        _rate(flat, steps.fresh, steps.kind, keeps, part, rows, size, costs)
+        return costs
 
-    def cost(at: Floats) -> float:
-        return _find_cost(flat, steps.fresh, steps.spans, step_s, *read(at.tolist()), size)
-
-    starts, width = [(2.0, -2.0), (0.0, 1.0)], 1.2
+    starts, radius = np.array([(1.22, 0.35), (0.79, 1.02)]), 0.3
     if known is not None and not exact:
-        logits = (math.log(max(one, 1e-9) / max(1.0 - one, 1e-9)) for one in (known[0] / most, known[1]))
-        # Near the ends the likelihood is flat, and nothing would lead away from there.
-        first, second = (min(max(one, -_FARTHEST / 2.0), _FARTHEST / 2.0) for one in logits)
-        starts, width = [(first, second)], 0.4
-    outcome = [
-        minimize(
-            cost,
-            np.array(start),
-            method="Nelder-Mead",
-            options={
-                # Where one of them says nothing, as the correlation of no disturbance, it may be anything.
-                "maxiter": _MOST_ROUNDS,
-                "xatol": math.inf,
-                "fatol": _SAME,
-                "initial_simplex": np.add(start, [[0.0, 0.0], [-width, 0.0], [0.0, -width]]),
-            },
-        )
-        for start in starts
-    ]
-    return read(min(outcome, key=lambda one: float(one.fun)).x.tolist())
+        starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.06
+    best = min((_descend(rate, start, radius) for start in starts), key=lambda one: one[0])
+    phi, part = read(best[1][None])
+    return float(phi[0]), float(part[0])
+
+
+def _descend(rate: Callable[[Floats], Floats], center: Floats, radius: float) -> tuple[float, Floats]:
+    """Least cost and where, by quadratics through the costs of a point and of seven around it."""
+    least, where = math.inf, np.array(center)
+    for _ in range(_MOST_ROUNDS):
+        at = center + radius * _AROUND
+        costs = rate(at)
+        lowest = int(costs.argmin())
+        is_lower = costs[lowest] < least
+        if is_lower:
+            least, where = float(costs[lowest]), at[lowest]
+        level, *slope, xx, xy, yy = _QUADRATIC @ costs
+        curvature, axes = np.linalg.eigh(np.array([[xx, xy], [xy, yy]]))
+        along = axes.T @ slope
+        # Downhill where it is curved downwards, too: a bound is a top where it is not the best place.
+        away = np.where(curvature > 0.0, np.abs(along) / np.maximum(curvature, 1e-12), _FAR)
+        step = axes @ -np.copysign(np.minimum(away, _FAR), along)
+        terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
+        if max(least - float(terms[0]), float(np.abs(costs - terms[1:]).max())) < _SAME:
+            break
+        center = np.asarray(center + radius * step) if is_lower else where
+        radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER
+    return least, where
+
+
+def _list_terms(at: Floats) -> Floats:
+    """Terms of a quadratic in two numbers, shape (n, 6)."""
+    x, y = at.T
+    return np.column_stack((np.ones(x.size), x, y, 0.5 * x * x, x * y, 0.5 * y * y))
+
+
+_LANES = 8
+"""Pairs of numbers whose likelihoods are computed at once."""
+_AROUND: Floats = np.array(
+    [(0.0, 0.0), *((math.cos(one), math.sin(one)) for one in 2.0 * np.pi * np.arange(7) / 7)]
+)
+_QUADRATIC: Floats = np.asarray(np.linalg.pinv(_list_terms(_AROUND)), dtype=np.float64)
+"""Terms of the quadratic through the costs of these points, shape (6, 8)."""
 
 
 def _filter(values: Floats, steps: Steps, step_s: float, phi: float, share: float) -> tuple[Floats, Floats]:
@@ -241,7 +289,7 @@ def _find_scale(size: Floats) -> float:
     mean = 0.0
     for value in size:
         mean += value
-    scale = max(1.2533 * mean / size.size, 1e-12)
+    scale = max(_MEAN_SIZE * mean / size.size, 1e-12)
     for _ in range(_SCALE_ROUNDS):
         total, slope = 0.0, 0.0
         for value in size:
@@ -256,52 +304,125 @@ def _find_scale(size: Floats) -> float:
     return scale
 
 
-@compiled("float64(float64[::1], boolean[::1], float64[::1], float64, float64, float64, float64[::1])")
-def _find_cost(
-    values: Floats, fresh: Flags, spans: Floats, step_s: float, phi: float, share: float, size: Floats
-) -> float:
-    """Minus twice the logarithm of the likelihood of increments, at the scale of most likelihood.
+# Rows of what `_rate` knows of each lane.
+_ROWS = 14
+_OF_A, _OF_BOTH, _OF_N, _A, _N, _PRODUCT, _LOGS_SUM, _INVERSE, _TOTAL, _SLOPE, _COST, _KEEP, _SIZE, _SHARE = (
+    _LANES * row for row in range(_ROWS)
+)
+
+
+@compiled()
+def _start(rows: Floats, lanes: int) -> None:
+    for k in range(lanes):
+        share = rows[_SHARE + k]
+        rows[_OF_A + k], rows[_OF_BOTH + k], rows[_OF_N + k] = share, 0.0, 1.0 - share
+        rows[_A + k], rows[_N + k] = 0.0, 0.0
+
+
+@compiled()
+def _take_logs(rows: Floats, lanes: int) -> None:
+    for k in range(lanes):
+        rows[_LOGS_SUM + k] += math.log(rows[_PRODUCT + k])
+        rows[_PRODUCT + k] = 1.0
+
+
+@compiled()
+def _predict(rows: Floats, lanes: int, value: float) -> None:
+    """One step of the filter in all lanes; see the module for the equations."""
+    for k in range(lanes):
+        share, keep, of_a, of_both = rows[_SHARE + k], rows[_KEEP + k], rows[_OF_A + k], rows[_OF_BOTH + k]
+        noise = 1.0 - share
+        variance = of_a + rows[_OF_N + k] - 2.0 * of_both + noise
+        inverse = 1.0 / variance
+        gain_a, gain_n = (of_a - of_both) * inverse, noise * inverse
+        fresh_part = value - rows[_A + k] + rows[_N + k]
+        rows[_SIZE + k] = abs(fresh_part) * math.sqrt(inverse)
+        rows[_A + k] = keep * (rows[_A + k] + gain_a * fresh_part)
+        rows[_N + k] = gain_n * fresh_part
+        rows[_OF_BOTH + k] = -keep * gain_a * gain_n * variance
+        rows[_OF_N + k] = noise - gain_n * gain_n * variance
+        after = of_a - gain_a * gain_a * variance
+        rows[_OF_A + k] = keep * keep * after + (1.0 - keep * keep) * share
+        rows[_PRODUCT + k] *= variance
+
+
+@compiled()
+def _add_costs(rows: Floats, lanes: int) -> None:
+    """Add what an innovation contributes to Huber's cost and to the equation of the scale."""
+    for k in range(lanes):
+        z = rows[_SIZE + k] * rows[_INVERSE + k]
+        held = min(CLIP, z)
+        rows[_TOTAL + k] += held * z
+        rows[_SLOPE + k] += held * (z + (z if z < CLIP else 0.0))
+        rows[_COST + k] += held * (2.0 * z - held)
+
+
+@compiled()
+def _scale(rows: Floats, lanes: int, size: Floats, costs: Floats) -> float:
+    """Costs at the present scales; moves the scales, and returns the largest relative change."""
+    for k in range(lanes):
+        rows[_TOTAL + k], rows[_SLOPE + k], rows[_COST + k] = 0.0, 0.0, 0.0
+    count = size.shape[0]
+    for row in range(count):
+        for k in range(lanes):
+            rows[_SIZE + k] = size[row, k]
+        _add_costs(rows, lanes)
+    away = 0.0
+    for k in range(lanes):
+        grown = (rows[_TOTAL + k] - count) / max(rows[_SLOPE + k], 1e-300)
+        costs[k] = rows[_COST + k] - 2.0 * count * math.log(rows[_INVERSE + k]) + rows[_LOGS_SUM + k]
+        rows[_INVERSE + k] *= math.exp(-grown)
+        away = max(away, abs(grown))
+    return away
+
+
+@compiled(
+    "void(float64[::1], boolean[::1], int64[::1], float64[:, ::1], float64[::1], float64[::1], "
+    "float64[:, ::1], float64[::1])"
+)
+def _rate(
+    values: Floats,
+    fresh: Flags,
+    kind: Ints,
+    keeps: Floats,
+    shares: Floats,
+    rows: Floats,
+    size: Floats,
+    costs: Floats,
+) -> None:
+    """Minus twice the logarithm of the likelihood of increments, at the scales of most likelihood.
 
     Args:
         values: increments, shape (n,).
         fresh: steps that do not continue the one before, shape (n,).
-        spans: length of each step [s], shape (n,).
-        step_s: time to which the correlation refers [s].
-        phi: correlation of the disturbance.
-        share: its share in the variance.
-        size: room for the sizes of the innovations, shape (n,).
+        kind: of the length of each step, shape (n,).
+        keeps: what remains of a disturbance after a step of each length, shape (kinds, lanes).
+        shares: of the disturbance in the variance, shape (lanes,).
+        rows: room for what belongs to each lane, shape (`_ROWS` * lanes,).
+        size: room for the sizes of the innovations, shape (n, lanes).
+        costs: the result, shape (lanes,).
     """
-    noise, decay = 1.0 - share, math.log(max(phi, 1e-300)) / step_s
-    of_a, of_both, of_n, a, n, span, keep = share, 0.0, noise, 0.0, 0.0, 0.0, 1.0
-    logs, product = 0.0, 1.0
-    for row in range(values.size):
+    lanes, count = shares.size, values.size
+    for k in range(lanes):
+        rows[_SHARE + k], rows[_PRODUCT + k] = shares[k], 1.0
+        rows[_LOGS_SUM + k], rows[_INVERSE + k] = 0.0, 0.0
+    for row in range(count):
         if fresh[row]:
-            of_a, of_both, of_n, a, n = share, 0.0, noise, 0.0, 0.0
-        variance = of_a + of_n - 2.0 * of_both + noise
-        inverse = 1.0 / variance
-        gain_a, gain_n = (of_a - of_both) * inverse, noise * inverse
-        if spans[row] != span:
-            span = spans[row]
-            keep = math.exp(decay * span)
-        fresh_part = values[row] - a + n
-        size[row] = abs(fresh_part) * math.sqrt(inverse)
-        a = keep * (a + gain_a * fresh_part)
-        n = gain_n * fresh_part
-        after = of_a - gain_a * gain_a * variance
-        of_both = -keep * gain_a * gain_n * variance
-        of_n = noise - gain_n * gain_n * variance
-        of_a = keep * keep * after + (1.0 - keep * keep) * share
+            _start(rows, lanes)
+        for k in range(lanes):
+            rows[_KEEP + k] = keeps[kind[row], k]
+        _predict(rows, lanes, values[row])
+        for k in range(lanes):
+            size[row, k] = rows[_SIZE + k]
+            rows[_INVERSE + k] += rows[_SIZE + k]
         # One logarithm for some variances, all between a thousandth and a few.
-        product *= variance
-        if row % _LOGS == 0:
-            logs, product = logs + math.log(product), 1.0
-    logs += math.log(product)
-    scale, cost = _find_scale(size), 0.0
-    for value in size:
-        z = value / scale
-        held = min(z, CLIP)
-        cost += held * (2.0 * z - held)
-    return cost + 2.0 * size.size * math.log(scale) + logs
+        if row % _LOGS == 0 or row == count - 1:
+            _take_logs(rows, lanes)
+    for k in range(lanes):
+        rows[_INVERSE + k] = 1.0 / max(_MEAN_SIZE * rows[_INVERSE + k] / count, 1e-12)
+    for _ in range(_SCALE_ROUNDS):
+        if _scale(rows, lanes, size, costs) < _SAME_SCALE:
+            break
 
 
 @compiled(
