@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import App, Parameter
 from cyclopts.types import PositiveFloat
 
-from pipeline.cli.conventions import Results, format_value, open_results, print_result
+from pipeline.cli.conventions import All, Results, format_value, open_results, print_result
 from pipeline.core import (
     INPUT_WORDS,
     PACKAGE,
@@ -54,6 +54,7 @@ def compare(  # noqa: D417 - arguments document themselves
     as_published: bool = False,
     causes: bool = False,
     figures: FigureFormat | None = None,
+    everything: All = False,
     json: bool = False,
     quiet: bool = False,
 ) -> int:
@@ -67,7 +68,8 @@ def compare(  # noqa: D417 - arguments document themselves
         causes: compare budgets: which effects contribute to the slip, and which to the differences. Writes
             causes.html, causes.csv, causes.tex, cause_differences.csv and cause_differences.tex.
         figures: also write the figures in this format, for papers.
-        json: print one JSON object in place of the tables.
+        everything: also print the tables of datasets and pairs, and all notes.
+        json: print one JSON object in place of the lines.
         quiet: print nothing.
     """
     from pipeline.datasets import Question, compare_results  # noqa: PLC0415 - heavy
@@ -83,15 +85,23 @@ def compare(  # noqa: D417 - arguments document themselves
     question = Question(names, fed, as_published=as_published, datasets=datasets, vehicle=vehicle)
     store = Store(results)
     if causes:
-        return _compare_causes(store, question, figures, json=json, quiet=quiet)
+        return _compare_causes(store, question, figures, everything=everything, json=json, quiet=quiet)
     answer = compare_results(store, question)
     written = write_answer(store, answer, figures)
     content = {**summarize_answer(answer), "page": _find_page(written, "comparison.html")}
-    return print_result(content, lambda: _format_answer(answer, written), json=json, quiet=quiet)
+    return print_result(
+        content, lambda: _format_answer(answer, written, everything=everything), json=json, quiet=quiet
+    )
 
 
 def _compare_causes(
-    store: Store, question: Question, figures: FigureFormat | None, *, json: bool, quiet: bool
+    store: Store,
+    question: Question,
+    figures: FigureFormat | None,
+    *,
+    everything: bool,
+    json: bool,
+    quiet: bool,
 ) -> int:
     from pipeline.datasets import (  # noqa: PLC0415 - heavy
         find_causes,
@@ -114,10 +124,12 @@ def _compare_causes(
             f"  {parts}",
         ]
     lines += [""] * bool(causes.differences)
-    for one in causes.differences:
+    for one in causes.differences if everything else causes.differences[:_FEW]:
         lines += [format_difference(one, names), *([f"  {one.note}"] if one.note else [])]
+    if not everything and len(causes.differences) > _FEW:
+        lines.append(f"{len(causes.differences) - _FEW} more differences (--all, page)")
     page = _find_page(written, "causes.html")
-    lines += ["", *(f"! {note}" for note in causes.notes), f"page    {page or _NO_PAGE}"]
+    lines += ["", *_list_notes(causes.notes, everything=everything), f"page    {page or _NO_PAGE}"]
     return print_result({**content, "page": page}, lambda: lines, json=json, quiet=quiet)
 
 
@@ -125,7 +137,17 @@ _MOST_PAIRS = 10
 """Pairs on the screen, as many as five datasets have; the page has all."""
 
 
-def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
+_FEW = 3
+"""Differences and notes on the screen without `--all`."""
+
+
+def _list_notes(notes: Sequence[str], *, everything: bool) -> list[str]:
+    shown = notes if everything else notes[:_FEW]
+    lines = [f"! {note}" for note in shown]
+    return [*lines, f"  {len(notes) - _FEW} more notes (--all, page)"] if len(notes) > len(shown) else lines
+
+
+def _format_answer(answer: Answer, written: Mapping[str, Path], *, everything: bool) -> list[str]:
     from pipeline.datasets import MEASURES, compare_orders  # noqa: PLC0415 - heavy
     from pipeline.words import list_shown_notes, title_line  # noqa: PLC0415 - heavy
     from pipeline.words.comparison import list_lines  # noqa: PLC0415 - heavy
@@ -137,13 +159,19 @@ def _format_answer(answer: Answer, written: Mapping[str, Path]) -> list[str]:
             title = title_line(line)
             lines += [""] * bool(lines) + [f"slip of {title}"]
         lines.append(f"  {line.driving:<18}{line.text}")
-    for name in answer.inputs:
+    for name in answer.inputs if everything else ():
         lines += ["", *_format_datasets(answer, name), *_format_pairs(answer, name)]
     orders = compare_orders(answer.datasets.filter(answer.datasets["input"] == answer.input))
     sentences = [one.text for one in orders if one.tau is None or MEASURES[one.measure].unit == "1"]
     lines += [*([""] if sentences else []), *dict.fromkeys(sentences)]
-    notes = [f"! {note}" for note in list_shown_notes(answer)]
-    return [*lines, "", *notes, f"page    {_find_page(written, 'comparison.html') or _NO_PAGE}"]
+    lines += [] if everything else ["", "all datasets and pairs, with intervals: --all, or the page"]
+    notes = _list_notes(list_shown_notes(answer), everything=everything)
+    return [
+        *lines,
+        *([""] if notes else []),
+        *notes,
+        f"page    {_find_page(written, 'comparison.html') or _NO_PAGE}",
+    ]
 
 
 _NO_PAGE = f"none: pip install '{PACKAGE}[report]' draws it"

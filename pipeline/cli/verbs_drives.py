@@ -273,7 +273,8 @@ def format_plan(
             return [f"open         nothing about {', '.join(wanted)}{runs}"]
         return [f"open         nothing{runs}: no cause is undecided, and each number is known well enough"]
     ground = f"{made.area.length_m:g} x {made.area.width_m:g} m"
-    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in align_rows(list_gains(made)))]
+    rows = [("open", "so far", "with this drive"), *list_gains(made)]
+    lines = [f"open{runs}: {summarize_gains(made)}", *(f"  {row}" for row in align_rows(rows))]
     most = f"limits       {made.format_limits()}"
     if not made.manoeuvres:
         return [

@@ -247,17 +247,21 @@ def show(  # noqa: D417 - the results folder documents itself
 def _format_fleet(content: Mapping[str, object]) -> list[str]:
     rows = cast("Sequence[Mapping[str, object]]", content["parameters"])
     runs = cast("Mapping[str, Sequence[str]]", content["runs"])
-    lines = []
+    lines = [str(content["summary"])]
+    width = max([_LABEL, *(len(f"{row['effect']}.{row['parameter']}") + 2 for row in rows)])
     for vehicle, names in runs.items():
         own = [row for row in rows if row["vehicle"] == vehicle]
         lines.append(f"{vehicle}: {format_count(len(names), 'run')}")
-        lines += [line for row in own for line in _format_number(row)]
-        lines += [] if own else ["  no significant effect in any of them"]
+        lines += [_format_number(row, width) for row in own] or ["  no significant effect in any of them"]
+        reasons: dict[str, list[str]] = {}
+        for row in own:
+            reasons.setdefault(str(row["because"]), []).append(f"{row['effect']}.{row['parameter']}")
+        lines += [f"  {', '.join(labels)}: {because}" for because, labels in reasons.items()]
     notes = [f"! {note}" for note in cast("Sequence[str]", content["notes"])]
-    return [*lines, *notes, str(content["summary"])]
+    return [*lines, *notes]
 
 
-def _format_number(row: Mapping[str, object]) -> list[str]:
+def _format_number(row: Mapping[str, object], width: int) -> str:
     label = f"{row['effect']}.{row['parameter']}"
     unit = suffix_unit(row["unit"])
     spreads = [f"{words} {format_value(row[key])}" for key, words in _SPREADS if row[key] is not None]
@@ -266,10 +270,7 @@ def _format_number(row: Mapping[str, object]) -> list[str]:
         value += f" [{format_value(row['low'])}, {format_value(row['high'])}]"
     numbers = ", ".join([value, *spreads])
     name = "" if row["name"] == row["effect"] else f": {row['name']}"
-    return [
-        f"  {row['level'] or 'open':<{_LEVEL}}{label + '  ':<{_LABEL}}{numbers}{name}",
-        f"  {'':<{_LEVEL + _LABEL}}{row['because']}",
-    ]
+    return f"  {row['level'] or 'open':<{_LEVEL}}{label:<{width}}{numbers}{name}"
 
 
 _WORDS = (
@@ -445,9 +446,12 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
     ]
     for group in dict.fromkeys(one.group for one in followed.series):
         own = [one for one in followed.series if one.group == group]
-        slip = next((one for one in own if one.quantity.startswith("median_modulus")), own[0])
-        latest = f"latest {slip.latest:.3g}{suffix_unit(slip.unit)}"
-        rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
+        slip = next((one for one in own if one.quantity.startswith("median_modulus")), None)
+        if slip is None:
+            rows.append((group, own[0].points.height, "no slip"))
+        else:
+            latest = f"latest {slip.latest:.3g}{suffix_unit(slip.unit)}"
+            rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
     return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json as json_format
+import re
 import shlex
 import signal
 import sys
@@ -361,6 +362,10 @@ def stage(  # noqa: D417 - the shared choices document themselves
 
 _QUIET_S = 30.0
 _CLEAR = "\x1b[H\x1b[2J"
+_LABEL = 10
+"""Columns of a label on a screen, with the space after it."""
+_LABELLED = re.compile(r"(?:[a-z]+(?: [a-z]+)?)? +")
+"""A label, or none: sentences begin with a large letter, names of runs are longer."""
 """Escape sequence that moves the cursor to the top left corner and clears the screen."""
 
 
@@ -479,7 +484,11 @@ def _write_page(page: Path, lines: Sequence[str], *, is_live: bool) -> None:
     from pipeline.report import render_template  # noqa: PLC0415 - heavy
     from pipeline.store import replace_file  # noqa: PLC0415 - heavy
 
-    text = render_template("report/templates/watch.html", lines=lines, is_live=is_live)
+    rows = [
+        (label.strip(), line[_LABEL:]) if _LABELLED.fullmatch(label := line[:_LABEL]) else (None, line)
+        for line in lines
+    ]
+    text = render_template("report/templates/watch.html", rows=rows, is_live=is_live)
     hint = "Check the folder and its permissions."
     with naming_os_errors(SlipError, "page_unwritable", "the page cannot be written", where=page, hint=hint):
         replace_file(page, text.encode())

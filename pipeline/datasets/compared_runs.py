@@ -253,8 +253,9 @@ def _doubt(manifest: Manifest, tables: Sequence[str]) -> str:
         if entry is None:
             if name in DIAGNOSED and DIAGNOSIS in manifest.files:
                 return _explain_empty(manifest)
-            how = "slip batch LOGS --diagnosis makes it" if name in DIAGNOSED else "analyze its log again"
-            return f"it has no table {name}; {how}"
+            if name in DIAGNOSED:
+                return "it was not diagnosed; slip batch LOGS --diagnosis does that"
+            return f"it has no table {name}; analyze its log again"
         if entry.contract_version != contract_of(name).version:
             return (
                 f"its table {name} has contract version {entry.contract_version} instead of "

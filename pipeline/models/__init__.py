@@ -19,6 +19,7 @@ if TYPE_CHECKING:
         list_pages,
         list_trusted,
         name_effect,
+        name_number,
         name_parameter,
         name_term,
         read_code,

@@ -191,9 +191,19 @@ def name_effect(effect: str) -> str:
 
 def name_parameter(effect: str, parameter: str) -> str:
     """Name of a parameter in words: that of its effect, with what it is if that has several."""
+    return f"{name_effect(effect)}{_name_among(effect, parameter)}"
+
+
+def name_number(effect: str, parameter: str) -> str:
+    """As `name_parameter`, within a sentence: `wheel servo: time constant straight ahead`."""
+    return f"{name_term(effect)}{_name_among(effect, parameter)}"
+
+
+def _name_among(effect: str, parameter: str) -> str:
     kind = find_effect(effect)
-    about = f": {kind().parameter(parameter).about}" if len(kind.parameters) > 1 else ""
-    return name_effect(effect) + about
+    if len(kind.parameters) == 1:
+        return ""
+    return f": {kind().parameter(parameter).about.partition(' (')[0].partition(', ')[0]}"
 
 
 def refuse_taken(name: str, where: str = "effect") -> None:

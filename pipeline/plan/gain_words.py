@@ -11,7 +11,7 @@ from pipeline.core import (
     name_first,
     suffix_unit,
 )
-from pipeline.models import name_term
+from pipeline.models import name_number, name_term
 from pipeline.plan.plan import ExpectedGain, Plan
 
 Row = tuple[str, str, str]
@@ -70,7 +70,7 @@ def _format_when(gains: Sequence[ExpectedGain], duration_s: float) -> str:
 def _name(gain: ExpectedGain) -> str:
     if gain.kind == "interval":
         effect, _, parameter = gain.question.partition(" ")[0].rpartition(".")
-        return f"{name_term(effect)}, {parameter}"
+        return name_number(effect, parameter)
     if gain.kind == "presence":
         return name_term(gain.effects[0])
     *first, last = [name_term(name) for name in gain.effects]

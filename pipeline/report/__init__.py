@@ -124,7 +124,7 @@ def format_split(drivetrain: float, ground: float, cross: float) -> str:
         cross: share of twice their product.
     """
     if max(drivetrain, ground) <= 1.0:
-        shares = zip(("drivetrain", "ground", "cross"), (drivetrain, ground, cross), strict=True)
+        shares = zip(("drivetrain", "ground", "both together"), (drivetrain, ground, cross), strict=True)
         return ", ".join(f"{name} {format_share(share, 0)}" for name, share in shares)
     one, two = (format_number(math.sqrt(share), digits=2) for share in (drivetrain, ground))
     return f"drivetrain and ground cancel in part: {one} and {two} times the RMS of their sum"

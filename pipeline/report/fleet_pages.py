@@ -396,11 +396,15 @@ def _format_change(share: float) -> str:
 _COLOURS = (theme.MODEL, theme.ON_COMMAND, theme.ON_MEASURED, theme.SLIP, theme.DRIVETRAIN, theme.MARK)
 _LEFT = {"disturbance": theme.GROUND, "localization_noise": theme.CROSS}
 _OTHERS = "other effects"
+_FEW = 3
+"""Differences that a page shows where these runs show none to be more than chance; the others are folded."""
 
 
-def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
-    """Render the complete page as HTML; sentences: the differences in words."""
+def render_causes(causes: Causes) -> str:
+    """Render the complete page as HTML; differences that these runs cannot show are folded away."""
     budgets, names, keys = causes.budgets, causes.names, causes.keys
+    shown = [one for one in causes.differences if not one.note] or causes.differences[:_FEW]
+    others = [one for one in causes.differences if one not in shown]
     return render_figures(
         "report/templates/causes.html",
         [draw_causes(budgets, names)],
@@ -410,12 +414,18 @@ def render_causes(causes: Causes, sentences: Sequence[str]) -> str:
             format_count(len(keys), "run"),
             f"slip {INPUT_WORDS[causes.input]}",
         ],
-        sentence_list=sentences,
+        sentence_list=[_format_one(one, names) for one in shown],
+        doubtful=[_format_one(one, names) for one in others],
+        doubt="; ".join(dict.fromkeys(one.note for one in others)),
         budgets=_tabulate_budgets(budgets, names),
         differences=_tabulate_differences(causes.differences, names),
         notes=causes.notes,
         runs=keys,
     )
+
+
+def _format_one(one: Difference, names: Mapping[str, str]) -> str:
+    return format_difference(one, names) + (f" ({one.note})" if one.note else "")
 
 
 def draw_causes(budgets: Sequence[Budget], names: Mapping[str, str]) -> Picture:
@@ -539,11 +549,8 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
     ):
         written |= write_tables(store, name, frame, frame)
     names = name_causes(causes.names)
-    sentences = [
-        format_difference(one, names) + (f" ({one.note})" if one.note else "") for one in causes.differences
-    ]
     if theme.can_draw():
-        page = render_causes(replace(causes, names=names), sentences)
+        page = render_causes(replace(causes, names=names))
         written["causes.html"] = write_page(store, "causes.html", page)
     return written | add_figures(store, lambda: [draw_causes(causes.budgets, names)], figures)
 

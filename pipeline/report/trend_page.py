@@ -50,20 +50,25 @@ def render_trend(trend: Trend) -> str:
     # One mark for each ground on the whole page.
     grounds = sorted({str(ground) for one in parameters for ground in one.points["terrain"].unique()})
     groups = [
-        (f"vehicle-{number}", f"Parameters of {name}", _KEY, _draw_vehicle(parameters, name, grounds, number))
+        (
+            f"vehicle-{number}",
+            f"Parameters of {name}",
+            _KEY,
+            *_draw_vehicle(parameters, name, grounds, number),
+        )
         for number, name in enumerate(vehicles)
     ] + [
         (
             f"group-{number}",
             f"Slip and data of {name}",
             _KEY_OF_SERIES,
-            _draw_group([one for one in series if one.group == name], number),
+            *_draw_group([one for one in series if one.group == name], number),
         )
         for number, name in enumerate(names)
     ]
     return render_figures(
         "report/templates/trend.html",
-        [picture for *_, pictures in groups for picture in pictures],
+        [picture for *_, changed, others in groups for picture in (*changed, *others)],
         title="Trends",
         facts=[
             f"{format_count(len(parameters), 'parameter')} of {format_count(len(vehicles), 'vehicle')}",
@@ -74,14 +79,15 @@ def render_trend(trend: Trend) -> str:
         alerts=[alert.text for alert in alerts],
         quiet=begin_large(format_quiet(series, parameters)),
         notes=trend.notes,
-        groups=[group for group in groups if group[-1]],
+        groups=[group for group in groups if group[-2] or group[-1]],
         runs=keys,
     )
 
 
 def _draw_vehicle(
     parameters: Sequence[ParameterTrend], vehicle: str, grounds: Sequence[str], number: int
-) -> list[Picture]:
+) -> tuple[list[Picture], list[Picture]]:
+    """Figures of the parameters that changed, and of the others."""
     own = [one for one in parameters if one.vehicle == vehicle and one.points.height >= _FEWEST_POINTS]
     own.sort(key=lambda one: (not one.changes, -one.named, one.label))
     pictures = []
@@ -89,7 +95,14 @@ def _draw_vehicle(
         name = f"parameter_{number}_{index}"
         title = f"{name_parameter(one.effect, one.parameter)} ({one.label}){bracket_unit(one.unit)}"
         pictures.append(Picture(name, title, _draw_parameter(one, name, grounds)))
-    return pictures
+    return _split(own, pictures)
+
+
+def _split(
+    own: Sequence[ParameterTrend | Series], pictures: Sequence[Picture]
+) -> tuple[list[Picture], list[Picture]]:
+    changed = sum(bool(one.changes) for one in own)
+    return [*pictures[:changed]], [*pictures[changed:]]
 
 
 def _describe(trend: ParameterTrend) -> str:
@@ -173,10 +186,10 @@ def _along(points: pl.DataFrame) -> Channel:
     )
 
 
-def _draw_group(series: Sequence[Series], number: int) -> list[Picture]:
+def _draw_group(series: Sequence[Series], number: int) -> tuple[list[Picture], list[Picture]]:
     own = [one for one in series if one.points.height >= _FEWEST_POINTS]
     own.sort(key=lambda one: (not one.changes, one.quantity.startswith(_LATER), one.quantity))
-    return [_picture(one, f"trend_{number}_{index}") for index, one in enumerate(own)]
+    return _split(own, [_picture(one, f"trend_{number}_{index}") for index, one in enumerate(own)])
 
 
 def _picture(series: Series, name: str) -> Picture:

@@ -36,7 +36,7 @@ from pipeline.estimation.intervals import NOTHING, estimate_intervals
 from pipeline.estimation.ladder import Judgement, LadderStep, note_fit
 from pipeline.estimation.learned_step import fit_and_hold_out
 from pipeline.estimation.prediction import predict_at_from
-from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
+from pipeline.models import Effect, Model, ModelFile, Timing, find_effect, name_term
 from pipeline.report.motion_view import MotionStage, MotionView
 from pipeline.results import RunDiagnosis, SlipBudget, list_excess, read_result
 from pipeline.run import HORIZON_S, MotionRun, load_motion_run
@@ -386,7 +386,7 @@ class Editor:
         """
         named = {one.id: one for one in self.diagnosed}
         made = (named.get(effect) or find_effect(effect)()) if isinstance(effect, str) else effect
-        return self.add_effects([made], f"+ {made.id}", anyway=anyway)
+        return self.add_effects([made], f"+ {name_term(made.id)}", anyway=anyway)
 
     def add_effects(self, effects: Sequence[Effect], said: str, *, anyway: bool) -> Session:
         """Add several effects to the model at once, and fit the whole model.

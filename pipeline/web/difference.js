@@ -1,5 +1,5 @@
 // Two models beside each other: how far their errors are apart, when, and which numbers differ.
-import { h, inAngle, inLength, say, sayShare } from "./parts.js";
+import { h, inAngle, inLength, say, sayShare, setSquares } from "./parts.js";
 
 const LINES = "reach";
 let apart = null;
@@ -21,7 +21,7 @@ export const showDifference = (place, one, other) => {
       h("td", { class: near ? "" : fall < 0 ? "fallen" : "risen" }, near ? "the same" : `${signed(fall * factor)} (${sayShare(fall / a.errors[key])})`));
   });
   const numbers = listNumbers(a, b).map(([name, first, second]) => h("tr", { class: "parameter" },
-    h("th", { scope: "row" }, name), h("td", {}, first === null ? "not in it" : say(first, 4)), h("td", {}, second === null ? "not in it" : say(second, 4)),
+    h("th", { scope: "row" }, name), h("td", {}, first === null ? "not in it" : say(first, 3)), h("td", {}, second === null ? "not in it" : say(second, 3)),
     h("td", {}, first === null || second === null ? "" : first === second ? "the same" : signed(second - first))));
   const alike = a.run === b.run && a.input === b.input;
   place.replaceChildren(
@@ -32,7 +32,7 @@ export const showDifference = (place, one, other) => {
 
 const listNumbers = (a, b) => {
   const numbers = (session) => new Map(session.effects.filter((effect) => !effect.off).flatMap((effect) =>
-    effect.parameters.map(({ name, unit, value }) => [`${effect.id}.${name} [${unit}]`, value])));
+    effect.parameters.map(({ name, unit, value, about }) => [`${effect.id}: ${about || name}${unit === "1" ? "" : setSquares(` [${unit}]`)}`, value])));
   const [first, second] = [numbers(a), numbers(b)];
   return [...new Set([...first.keys(), ...second.keys()])].map((name) => [name, first.get(name) ?? null, second.get(name) ?? null]);
 };

@@ -26,7 +26,7 @@ from pipeline.datasets import (
     Label,
     find_pace,
 )
-from pipeline.models import Level, Place, name_term
+from pipeline.models import Level, Place, name_number, name_term
 
 Line = tuple[str, str]
 _MOST_NAMED = 3
@@ -200,8 +200,7 @@ def _name(check: Check, name: str) -> str:
     if name in LOGARITHMS:
         return _NAMES[name]
     label = _find(check, name)
-    alone = len(label.effect.parameters) == 1
-    return name_term(label.effect.id) if alone else f"{name_term(label.effect.id)} ({label.parameter.name})"
+    return name_number(label.effect.id, label.parameter.name)
 
 
 def _format_unchanged(check: Check, changed: Sequence[str]) -> str:

@@ -41,8 +41,10 @@ from pipeline.run import HORIZON_S
 from pipeline.words.effects import (
     describe_cause,
     describe_motion,
+    describe_number,
     describe_separation,
     format_numbers,
+    format_value,
     format_with_range,
     name_group,
     suggest_drive,
@@ -142,7 +144,7 @@ def list_lines(
 
 
 def _list_main(run: RunDiagnosis) -> list[str]:
-    """A line for each of the main effects: its term, value, the error that it lowers most, and its id."""
+    """A line for each of the main effects: its term, the error that it lowers most, and its value."""
     main, minor, _ = _split_effects(run)
     felt, small = _split_ambiguous(run)
     undecided = {item.in_model for item in felt}
@@ -150,11 +152,14 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     folded = len(shown[_EFFECTS_SHOWN:]) + len(minor) + len(small)
     falls = list_largest_falls(run)
     rows = [
-        (name_term(effect.id), format_short(effect), falls.get(effect.id, ""), effect.id)
+        (name_term(effect.id), falls.get(effect.id, ""), format_short(effect))
         for effect in shown[:_EFFECTS_SHOWN]
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    texts = ["  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)) for row in rows]
+    texts = [
+        "  ".join(f"{text:<{width}}" for text, width in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]
     for item in felt:
         texts.append(f"Undecided: {name_group(item.candidates)}")
         texts.append(f"{_INDENT}to separate them: {describe_separation(item)}")
@@ -174,11 +179,20 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
 
 
 def format_short(effect: Named) -> str:
-    """The first value of an effect, and how many more it has."""
+    """The first value of an effect with what it is, and how many more it has.
+
+    The name of an effect of one number with a unit says what it is: `yaw rate limit 1.01 rad/s`.
+    """
     if effect.by_run:
         return "one offset a run"
-    first = format_numbers(dict(list(effect.shown.items())[:1]))
-    return f"{first}, {len(effect.shown) - 1} more" if len(effect.shown) > 1 else first
+    if not effect.shown:
+        return ""
+    name, value = next(iter(effect.shown.items()))
+    about = describe_number(effect.id, name)
+    text = format_value(value) if about else format_numbers({name: value})
+    if about and (len(effect.parameters) > 1 or value.unit == "1"):
+        text += f", {about}"
+    return f"{text}; {len(effect.shown) - 1} more" if len(effect.shown) > 1 else text
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:

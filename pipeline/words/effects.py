@@ -69,6 +69,12 @@ def _list_beside(run: RunDiagnosis) -> tuple[Effect, ...]:
     return () if run.model is None else _read_effects(run.model)
 
 
+def describe_number(effect: str, parameter: str) -> str:
+    """What a parameter is, as `effective over nominal track`; empty for an effect that is not known here."""
+    kind = _list_known().get(effect)
+    return "" if kind is None else kind().parameter(parameter).about.partition(" (")[0]
+
+
 def list_readings(effect: Named) -> tuple[Reading, ...]:
     """Its meanings as a property of the vehicle, the ground or the run, which one run cannot separate."""
     kind = _list_known().get(effect.id)

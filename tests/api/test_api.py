@@ -123,7 +123,7 @@ def test_tables_are_lazy_and_charts_hold_their_rows(run: slip.Run, diagnosis: sl
     charts = diagnosis.figures()
     assert {"ladder", "residuals"} <= set(charts)
     ladder = charts["ladder"].to_dict()
-    assert ladder["title"] == "The ladder: error after each effect"
+    assert ladder["title"] == "The error after each effect"
     rows = ladder["datasets"]["ladder"]
     assert [row["t"] for row in rows] == pytest.approx(diagnosis.ladder["t_mrmse_m"].to_list(), abs=1e-4)
 

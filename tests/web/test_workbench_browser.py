@@ -136,7 +136,7 @@ def test_what_raises_an_error_is_not_taken_unless_it_is_said_again(
     assert chrome.run("document.querySelectorAll('.card').length") == 0
     chrome.click("#toast .anyway")
     chrome.wait("document.querySelectorAll('.card').length === 1")
-    chrome.wait("document.querySelector('.said').textContent === '+ wheel_radius'")
+    chrome.wait("document.querySelector('.said').textContent === '+ effective wheel radius'")
     assert chrome.run("document.querySelector('select.catalogue').selectedIndex") == 0
     errors = [text for text in chrome.errors if "422" not in text]
     assert errors == []

@@ -5,8 +5,19 @@ from drawn_diagnoses import draw_diagnosis
 from msgspec.structs import replace
 
 from pipeline.core import format_length
-from pipeline.results import DataNeed, Finding, Learned, PathLadder, Region, RunDiagnosis, Unexplained
-from pipeline.words.diagnosis import describe, format_learned_share, list_findings, list_lines
+from pipeline.models import name_term
+from pipeline.results import (
+    DataNeed,
+    Finding,
+    Learned,
+    Named,
+    PathLadder,
+    Region,
+    RunDiagnosis,
+    Unexplained,
+    Value,
+)
+from pipeline.words.diagnosis import describe, format_learned_share, format_short, list_findings, list_lines
 from pipeline.words.errors import describe_need, describe_regions, describe_unexplained
 
 MANY = (
@@ -26,12 +37,30 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
     drawn = draw_diagnosis({name: {} for name in MANY}, errors)
     run = replace(drawn, run="field/run", input="command", findings=tuple(WARNINGS))
     shown = [text for label, text in list_lines(run) if label != "verdict"]
-    assert [text.split()[-1] for text in shown[:5]] == list(MANY[:5])
+    assert [text.startswith(name_term(name)) for name, text in zip(MANY, shown[:5], strict=False)] == [
+        True
+    ] * 5
     assert shown[5] == "2 smaller effects (--all)"
     assert shown[6:] == ["!  warning 0", "!  warning 1", "!  warning 2", "   2 more (--all)"]
     everything = describe([run], everything=True)
     assert all(name in everything for name in (*MANY, "warning 4"))
     assert "(--all)" not in everything
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "text"),
+    [
+        ("effective_track", {"k": Value(1.8)}, "1.8, effective over nominal track"),
+        ("body_turn_limit", {"limit": Value(1.0, unit="rad/s")}, "1 rad/s"),
+        ("turn_lag", {"tau_mean": Value(0.4, unit="s"), "tau_diff": Value(0.9, unit="s")},
+         "0.4 s, time constant of the mean; 1 more"),
+        ("my_term", {"k_1": Value(0.2, unit="s/m")}, "k_1 = 0.2 s/m"),
+    ],
+)  # fmt: skip
+def test_an_effect_on_a_screen_says_what_its_number_is(
+    name: str, values: dict[str, Value], text: str
+) -> None:
+    assert format_short(Named(name, values)) == text
 
 
 def test_a_finding_of_many_runs_is_said_once_with_its_count() -> None:

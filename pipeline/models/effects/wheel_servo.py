@@ -71,7 +71,7 @@ class WheelServo(JointDrive):
     parameters = (
         replace(
             TIME_CONSTANT,
-            about="time constant of the speed straight ahead",
+            about="time constant straight ahead",
             typical=0.2,
             starts=(),
             search=Search.STARTS,

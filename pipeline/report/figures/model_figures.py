@@ -228,7 +228,7 @@ def _format_ladder(scene: Scene, rows: Mapping[str, pl.DataFrame]) -> str:
 
 
 LADDER = Figure(
-    "The ladder: error after each effect",
+    "The error after each effect",
     Section.WHY,
     draw_ladder,
     order=0,

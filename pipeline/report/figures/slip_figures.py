@@ -85,7 +85,7 @@ def draw_trajectory(scene: Scene) -> Drawing | None:
     }
     predicted = [
         Chart.of_rows("arcs")
-        .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False)
+        .mark("line", color=theme.MODEL, strokeWidth=1.6, opacity=0.9, order=False, clip=True)
         .encode(x="x:Q", y="y:Q")
     ]
     above = [*(predicted if scene.report.motion else []), *(events if happened else [])]
