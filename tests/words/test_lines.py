@@ -48,18 +48,20 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "values", "text"),
+    ("name", "units", "text"),
     [
-        ("effective_track", {"k": Value(1.8)}, "1.8, effective over nominal track"),
-        ("body_turn_limit", {"limit": Value(1.0, unit="rad/s")}, "1 rad/s"),
-        ("turn_lag", {"tau_mean": Value(0.4, unit="s"), "tau_diff": Value(0.9, unit="s")},
-         "0.4 s, time constant of the mean; 1 more"),
-        ("my_term", {"k_1": Value(0.2, unit="s/m")}, "k_1 = 0.2 s/m"),
+        ("effective_track", {"k": "1"}, "2.00 [1.90, 2.10], effective over nominal track"),
+        ("body_turn_limit", {"limit": "rad/s"}, "2.00 rad/s [1.90, 2.10]"),
+        (
+            "turn_lag",
+            {"tau_mean": "s", "tau_diff": "s"},
+            "2.00 s [1.90, 2.10], time constant of the mean; 1 more",
+        ),
+        ("my_term", {"k_1": "s/m"}, "k_1 = 2.00 s/m [1.90, 2.10]"),
     ],
-)  # fmt: skip
-def test_an_effect_on_a_screen_says_what_its_number_is(
-    name: str, values: dict[str, Value], text: str
-) -> None:
+)
+def test_an_effect_on_a_screen_says_what_its_number_is(name: str, units: dict[str, str], text: str) -> None:
+    values = {key: Value(2.0, low=1.9, high=2.1, unit=unit) for key, unit in units.items()}
     assert format_short(Named(name, values)) == text
 
 
