@@ -197,12 +197,13 @@ def _list_values(told: Iterable[tuple[str, Mapping[str, Value]]]) -> dict[str, N
 def judge(injection: Injection, before: Answer, after: Answer) -> tuple[str, list[str]]:
     """One of `_VERDICTS`, and names that the unchanged recording neither has nor considers."""
     told = [name for name in injection.findings if _is_news(name, injection.moved, before, after)]
-    if told:
-        return "reported", []
     effects = {label.split(".")[0] for label in injection.numbers}
     along = {label.split(".")[0] for label in injection.along if comes_along(injection, label, before, after)}
     expected = before.mentioned | find_contained(before, after)
     extra = sorted(after.names - expected - effects - along)
+    if told:
+        # What a fault that is undone leaves to be named is no news.
+        return "reported", [] if injection.moved is None else extra
     if injection.same:
         return _judge_same(before, after, extra), extra
     for effect in effects:
@@ -244,8 +245,9 @@ def _is_news(finding: str, moved: float | None, before: Answer, after: Answer) -
     if finding not in after.findings:
         return False
     old, new = before.findings.get(finding), after.findings[finding]
-    if moved is not None and old and new:
-        return abs(new - old - moved) < _MOVED * abs(moved)
+    if moved is not None and new:
+        # What the unchanged recording does not show may be of any size there.
+        return abs(new - old - moved) < _MOVED * abs(moved) if old else new / moved > 1.0 - _MOVED
     return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
 
 

@@ -98,14 +98,17 @@ def list_injections() -> list[Injection]:
         ),
         Injection("poses from the wheels", _from_wheels(0.5), ("pose_from_wheels",)),
         Injection("poses from the wheels, Euler's", _from_wheels(1.0), ("pose_from_wheels",)),
-        Injection("misalignment 3 deg", _misaligned, (), {"yaw_misalignment.psi": shift(math.radians(3.0))}),
         Injection(
-            "lever arm .3 m", _lever, (),
-            {"icr_offset.x_icr": shift(-0.3), "lever_arm.l_x": shift(0.3)},
+            "misalignment 3 deg", _misaligned, ("pose_angle",),
+            {"yaw_misalignment.psi": shift(math.radians(3.0))}, moved=-math.radians(3.0),
         ),
         Injection(
-            "turning about a point .15 m ahead", _moved(lambda m: (0.0, -0.15 * m.w, 0.0)), (),
-            {"icr_offset.x_icr": shift(0.15), "lever_arm.l_x": shift(-0.15)},
+            "lever arm .3 m", _lever, ("pose_lever",),
+            {"icr_offset.x_icr": shift(-0.3), "lever_arm.l_x": shift(0.3)}, moved=0.3,
+        ),
+        Injection(
+            "turning about a point .15 m ahead", _moved(lambda m: (0.0, -0.15 * m.w, 0.0)), ("pose_lever",),
+            {"icr_offset.x_icr": shift(0.15), "lever_arm.l_x": shift(-0.15)}, moved=-0.15,
         ),
         Injection(
             "skid .1 s", _moved(lambda m: (0.0, -0.1 * m.v * m.w, 0.0)), (),

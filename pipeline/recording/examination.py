@@ -14,6 +14,7 @@ from pipeline.recording.encoders import settle_wheels
 from pipeline.recording.geometry import Geometry, explain_wheels, measure_lengths
 from pipeline.recording.kinds import find_kind, leave_out_steered, report_turn
 from pipeline.recording.motion import measure_motion
+from pipeline.recording.mounting import report_mounting
 from pipeline.recording.readings import Reading
 from pipeline.recording.roles import choose_roles, name_sources, read_drives, settle_stamps
 from pipeline.recording.score import FEWEST_STEPS
@@ -126,6 +127,7 @@ def examine(
         case.driven = explain_wheels(command.reading, wheels.reading)
     find_units(case, command, wheels)
     settle_delay(case, command, wheels, motion)
+    report_mounting(case, (wheels, command))
     alignment = measure_command(case, command, wheels, kind, motion)
     used = (("command", command), ("wheels", wheels))
     roles = {id(one.reading): role for role, one in used if one is not None}
