@@ -225,7 +225,10 @@ class Case:
             self.findings.append(Finding("signs_contradict", "error", text, where=section))
             return
         self.changes.setdefault(section, {}).update(change)
-        settled = [text for key, text in _AS_RECORDED[section].items() if key in change]
+        as_recorded = {**_AS_RECORDED[section]}
+        if change.get("unit") in SPEEDS and change["unit"] != "m/s":
+            as_recorded["unit"] = 'unit = "m/s"'
+        settled = [text for key, text in as_recorded.items() if key in change]
         otherwise = "".join(f"; {text} takes them as recorded" for text in settled)
         text = f"{what}: corrected, as {line} under [{section}] in run.toml does{otherwise}"
         self.findings.append(Finding(name, "warning", text, where=section, value=margin))

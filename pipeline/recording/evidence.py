@@ -239,16 +239,50 @@ def find_body_units(gains: Sequence[float | None], shares: Sequence[float], name
         shares: part of the motion that is explained, of both.
         name: of the signals; a unit that it names is no surprise.
     """
-    usual, costs, exact = ("m/s", "rad/s"), dict[tuple[str, str], float](), set[tuple[str, str]]()
-    for pair in product(SPEEDS, RATES):
-        # A gain is the motion in SI units over the command in its own unit.
-        factors = (SPEEDS[pair[0]], RATES[pair[1]])
+    return _find_units((SPEEDS, RATES), gains, shares, (name, name), _OWN)
+
+
+def find_car_units(
+    gains: Sequence[float | None],
+    shares: Sequence[float],
+    names: tuple[str, str],
+    units: tuple[Sequence[str], Sequence[str]] = ((*SPEEDS,), (*SPEEDS,)),
+) -> Units:
+    """Units of a car's commanded and of its measured speed, which vote with the motion.
+
+    Args:
+        gains: motion over the command, and over the measurement; None where it is not excited.
+        shares: part of the motion that is explained, of both.
+        names: of the signals.
+        units: that each may be in.
+    """
+    options = [{unit: SPEEDS[unit] for unit in some} for some in units]
+    return _find_units((options[0], options[1]), gains, shares, names, (_OWN[0], _OWN[0]))
+
+
+def _find_units(
+    options: tuple[Mapping[str, float], Mapping[str, float]],
+    gains: Sequence[float | None],
+    shares: Sequence[float],
+    names: tuple[str, str],
+    own: tuple[float, float],
+) -> Units:
+    """Units of two signals by the motion over each; ``own`` is the spread of what each has for itself."""
+    usual = (next(iter(options[0])), next(iter(options[1])))
+    costs, exact = dict[tuple[str, str], float](), set[tuple[str, str]]()
+    for pair in product(*options):
+        # A gain is the motion in SI units over the signal in its own unit.
+        factors = [some[unit] for some, unit in zip(options, pair, strict=True)]
         logs = [
             _shrink(float(np.log(abs(gain) / of)), share) if gain else None
             for gain, of, share in zip(gains, factors, shares, strict=True)
         ]
-        surprise = sum(0.0 if _is_named(unit, name) else _STRANGE.get(unit, 0.0) for unit in pair)
-        costs[pair] = surprise - _rate_gains(logs)
+        # Two signals in one strange unit are no stranger than one.
+        surprises = {
+            unit: 0.0 if _is_named(unit, name) else _STRANGE.get(unit, 0.0)
+            for unit, name in zip(pair, names, strict=True)
+        }
+        costs[pair] = sum(surprises.values()) - _rate_gains(logs, own)
         strange = [
             abs(log or 0.0) < 4.0 * _EXACT and log is not None and share > _GOOD
             for log, share, unit, one in zip(logs, shares, pair, usual, strict=True)
@@ -275,15 +309,15 @@ def _is_named(unit: str, name: str) -> bool:
     return word is not None and bool(re.search(rf"(?<![a-z])(?:{word})(?![a-z])", name.lower()))
 
 
-def _rate_gains(logs: Sequence[float | None]) -> float:
-    """Log-likelihood of the logarithms of a command's gains in the right units."""
+def _rate_gains(logs: Sequence[float | None], spreads: tuple[float, float]) -> float:
+    """Log-likelihood of the logarithms of gains in the right units."""
     known = [index for index, one in enumerate(logs) if one is not None]
     seen = np.array([logs[index] for index in known], dtype=np.float64)
     if not known:
         return 0.0
     total = 0.0
     for common in (_EXACT, _COMMON):
-        for own in product(*((_EXACT, _OWN[index]) for index in known)):
+        for own in product(*((_EXACT, spreads[index]) for index in known)):
             spread = common**2 + np.diag(np.square(own))
             quadratic = float(seen @ np.linalg.solve(spread, seen))
             total += np.exp(-0.5 * quadratic) / np.sqrt(np.linalg.det(spread)) / 2.0 ** (1 + len(known))

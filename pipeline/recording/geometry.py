@@ -15,7 +15,7 @@ from pipeline.recording.case import Candidate, Case, is_crossed
 from pipeline.recording.motion import STEP_S, Motion
 from pipeline.recording.readings import DELAYS_S, SIDES, Explained, Reading
 from pipeline.recording.score import CLEAR, FEWEST_STEPS, Steps
-from pipeline.sources import RANGES, find_alike
+from pipeline.sources import RANGES, DriveForm, find_alike
 
 LENGTHS = ("wheel_radius_m", "track_width_m", "wheelbase_m")
 _ROUGH = 2e-3
@@ -147,7 +147,7 @@ def measure_geometry(wheels: Explained) -> tuple[Length | None, Length | None]:
 
 
 def measure_car(car: Explained, *, is_measured: bool) -> Geometry:
-    """Wheelbase of a car that turns by its steering, and the radius of its wheels where they are measured."""
+    """Wheelbase of a car that turns by its steering, and the radius of wheels whose turning is measured."""
     ahead, bent = abs(float(car.ahead.gains[0])), abs(float(car.turned.gains[0]))
     of_speed, of_turn = _list_errors(car)
     if not car.sign("ahead"):
@@ -250,7 +250,8 @@ def measure_lengths(case: Case, command: Candidate | None, wheels: Candidate | N
     made = Geometry()
     car = next((one for one in (wheels, command) if one is not None and one.reading.form == "steering"), None)
     if car is not None and car.reading.explained is not None and car.sign("turned"):
-        return measure_car(car.reading.explained, is_measured=car is wheels)
+        is_turned = car is wheels and car.source.form is DriveForm.JOINTS
+        return measure_car(car.reading.explained, is_measured=is_turned)
     if wheels is None or wheels.reading.form != "sides":
         sides = command if command is not None and command.reading.form == "sides" else None
     else:

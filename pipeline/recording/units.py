@@ -10,9 +10,11 @@ import numpy as np
 from pipeline.recording.case import TAKEN_M, Candidate, Case, is_crossed
 from pipeline.recording.evidence import (
     RATES,
+    SPEEDS,
     USUAL,
     Units,
     find_body_units,
+    find_car_units,
     find_pose_unit,
     find_steering_unit,
     find_wheel_unit,
@@ -103,7 +105,10 @@ def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) 
     for role, one in (("command", command), ("wheels", wheels)):
         if one is not None and one.reading.form == "steering":
             _report_units(case, role, one, one.steering)
-    if command is not None and command.reading.form != "sides" and _is_usable(command):
+    is_car = all(one is not None and one.source.form is DriveForm.STEERING for one in (command, wheels))
+    if is_car and command is not None and wheels is not None and _is_usable(command) and _is_usable(wheels):
+        _find_speed_units(case, command, wheels)
+    elif command is not None and command.reading.form != "sides" and _is_usable(command):
         explained = command.reading.explained
         if explained is None:
             return
@@ -125,6 +130,24 @@ def find_units(case: Case, command: Candidate | None, wheels: Candidate | None) 
         _report_units(case, "command", command, units, gains)
     if wheels is not None and wheels.reading.form == "sides" and not is_crossed(wheels):
         _find_wheel_unit(case, command, wheels)
+
+
+def _find_speed_units(case: Case, command: Candidate, wheels: Candidate) -> None:
+    """Correct or tell the units of a car's speeds: commanded, measured, and by the poses."""
+    gains: list[float | None] = []
+    shares, options = [], []
+    for role, one in (("command", command), ("wheels", wheels)):
+        made = one.reading.explained
+        seen = made is not None and one.sign("ahead")
+        gains.append(abs(float(made.ahead.gains[0])) if made is not None and seen else None)
+        shares.append(0.0 if made is None else made.shares[0])
+        is_given = getattr(case.configuration, role).unit is not None or one.source.signals[0].unit
+        options.append(USUAL[:1] if is_given else (*SPEEDS,))
+    names = (str(command.source), str(wheels.source))
+    units = find_car_units(gains, shares, names, (options[0], options[1]))
+    for index, (role, one) in enumerate((("command", command), ("wheels", wheels))):
+        rival = None if units.rival is None else (units.rival[index], "")
+        _report_units(case, role, one, Units((units.likeliest[index], ""), rival), (gains[index],))
 
 
 def _report_units(

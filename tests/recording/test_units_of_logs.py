@@ -30,8 +30,10 @@ def test_a_speed_in_kilometres_per_hour(tmp_path: Path) -> None:
     assert setup.vehicle.track_width_m == pytest.approx(0.5, rel=0.02)
 
 
-def write_car(path: Path, speed: float, angle: float, wheelbase: float = 0.9) -> Path:
-    """A car that takes its commands in other units."""
+def write_car(
+    path: Path, speed: float, angle: float, wheelbase: float = 0.9, measured: float | None = None
+) -> Path:
+    """A car that takes its commands in other units, and may measure its speed, in another one, too."""
     drive = draw(42)
     asked = np.column_stack([drive.asked[:, 0], 0.35 * drive.asked[:, 1]])
     made = np.zeros_like(asked)
@@ -52,7 +54,8 @@ def write_car(path: Path, speed: float, angle: float, wheelbase: float = 0.9) ->
         yaw[rows] + noise[2],
         rows,
     )
-    return write_log(path, drive, car=asked * [speed, angle])
+    seen = None if measured is None else made * [measured, 1.0]
+    return write_log(path, drive, car=asked * [speed, angle], car_measured=seen)
 
 
 @pytest.mark.parametrize(
@@ -70,3 +73,20 @@ def test_a_car_in_other_units(speed: float, angle: float, line: str, tmp_path: P
     if line:
         settled = [one.text for one in set_up(log, line).choice.findings]
         assert not [text for text in settled if line in text]
+
+
+@pytest.mark.parametrize(
+    ("speed", "measured", "commanded_in", "measured_in"),
+    [(1.0, 1.0, None, None), (3.6, 1.0, "km/h", None), (1.0, 3.6, None, "km/h"), (3.6, 3.6, "km/h", "km/h")],
+)
+def test_three_speeds_of_a_car_vote_on_their_units(
+    speed: float, measured: float, commanded_in: str | None, measured_in: str | None, tmp_path: Path
+) -> None:
+    setup = set_up(write_car(tmp_path / "log.mcap", speed, 1.0, measured=measured))
+    assert str(setup.sources.command) == "/drive"
+    assert str(setup.sources.wheels) == "/drive_measured"
+    assert (setup.configuration.command.unit, setup.configuration.wheels.unit) == (commanded_in, measured_in)
+    told = " ".join(one.text for one in setup.choice.findings)
+    assert ('unit = "m/s" takes them as recorded' in told) == bool(commanded_in or measured_in)
+    assert "wheel radius" not in told
+    assert setup.vehicle.wheelbase_m == pytest.approx(0.9, rel=0.03)
