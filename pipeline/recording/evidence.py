@@ -33,7 +33,7 @@ _ONE_LINE = 0.9
 """Share of the motion asked for along one line, from which on it tells no direction from another."""
 
 
-def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, float]:
+def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, float, float | None]:
     """The sense and the offset of the heading with which the body moves ahead as the best reading says.
 
     Half a turn is left to `find_reversed`: it reverses signs only.
@@ -43,13 +43,14 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
         readings: readings that were fitted to it.
 
     Returns:
-        The motion in its likeliest frame, and Vuong's statistic against the recorded one; zero where that one
-        stays.
+        The motion in its likeliest frame; Vuong's statistic against the recorded one, zero where that one
+        stays; and the angle [degrees] of another frame along which the reading is followed, where it is not
+        along this one.
     """
     fitted = [one for one in readings if one.form != "gyro" and one.explained is not None]
     known = [one for one in fitted if one.explained is not None and one.explained.is_sure]
     if not known:
-        return motion, 0.0
+        return motion, 0.0, None
     best = max(known, key=lambda one: one.explained.moves if one.explained else 0.0)
     explained = best.explained
     assert explained is not None  # noqa: S101 - chosen for it
@@ -57,27 +58,30 @@ def find_frame(motion: Motion, readings: Sequence[Reading]) -> tuple[Motion, flo
     ahead, _ = best.columns(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
     aside = best.columns_aside(part.steps, explained.lag, explained.delay, crossed=explained.crossed)
     if aside.size:
-        return _find_frame_across(motion, part, join_parts(ahead, aside[:, 0]))
+        return *_find_frame_across(motion, part, join_parts(ahead, aside[:, 0])), None
     course, concentration = motion.find_course_deg()
     angles = {0.0, 90.0}
     if concentration > _CONCENTRATED and abs(course - 90.0 * round(course / 90.0)) > _USUAL_DEG:
         angles.add(course)
     scores: dict[tuple[bool, float], Floats] = {}
+    pulls: dict[tuple[bool, float], float] = {}
     for flip in (False, True):
         for angle in angles:
             turned = part.turn(flip=flip, offset_deg=angle)
             body, yaw = turned.body, turned.yaw
-            scores[flip, angle] = (
-                fit(body.real, np.column_stack([ahead, yaw]), part.steps).blocks
-                + fit(body.imag, np.column_stack([aside, yaw]), part.steps).blocks
-            )
+            along = fit(body.real, np.column_stack([ahead, yaw]), part.steps)
+            across = fit(body.imag, np.column_stack([aside, yaw]), part.steps)
+            scores[flip, angle], pulls[flip, angle] = along.blocks + across.blocks, float(along.t[0])
     usual = (False, 0.0)
     likeliest = max(scores, key=lambda key: float(scores[key].sum()))
     margin = compare(scores[likeliest], scores[usual])
     gain = float((scores[likeliest] - scores[usual]).sum()) / part.moved.size
     if likeliest == usual or margin < CLEAR or gain < LEAST_NATS:
-        return motion, 0.0
-    return motion.turn(flip=likeliest[0], offset_deg=likeliest[1]), margin
+        # Where wheels spin, the body may go along any of them.
+        pull = pulls[False, 90.0]
+        is_open = abs(pulls[usual]) < CLEAR < abs(pull)
+        return motion, 0.0, float(np.copysign(90.0, pull)) if is_open else None
+    return motion.turn(flip=likeliest[0], offset_deg=likeliest[1]), margin, None
 
 
 def _find_frame_across(motion: Motion, part: Motion, asked: Complex) -> tuple[Motion, float]:

@@ -48,7 +48,14 @@ def turn_motion(case: Case, motion: Motion, readings: Sequence[Reading]) -> Moti
     source, section = case.sources.pose, case.configuration.pose
     if source is None or source.content is not PoseContent.POSE:
         return motion
-    turned, margin = find_frame(motion, readings)
+    turned, margin, other_deg = find_frame(motion, readings)
+    if other_deg is not None and section.heading_deg is None:
+        text = (
+            f"the body does not follow what drives it along the headings of {source}, and a little across "
+            "them: their frame may be turned by 90 degrees, which too little tells; it is taken as recorded "
+            f"(heading_deg = {other_deg:.0f} under [pose] in run.toml turns it, heading_deg = 0 settles it)"
+        )
+        case.findings.append(Finding("pose_undecided", "warning", text, where="pose", value=other_deg))
     if not margin:
         return motion
     if section.heading_deg is not None:

@@ -136,13 +136,28 @@ def test_the_frame_of_the_pose_is_found(axis: int, up: str, degrees: float) -> N
     readings = [command(drive), sides(drive)]
     for one in readings:
         one.explain(motion)
-    turned, margin = find_frame(motion, readings)
+    turned, margin, _ = find_frame(motion, readings)
     assert not turned.flip
     if degrees == 0.0:
         assert (turned.offset_deg, margin) == (0.0, 0.0)
     else:
         assert turned.offset_deg == 90.0
         assert margin > 3.0
+
+
+@pytest.mark.parametrize(("degrees", "other"), [(0.0, None), (90.0, -90.0), (-90.0, 90.0)])
+def test_where_wheels_spin_another_frame_is_told(degrees: float, other: float | None) -> None:
+    """The body slides about, and goes a little where its wheels turn."""
+    drive = draw(6, 200.0)
+    slide = np.random.default_rng(7).normal(0.0, 1.0, (2, drive.time.size))
+    smooth = np.ones(100) / 10.0
+    ahead, aside = (0.2 * np.convolve(one, smooth, "same") for one in slide)
+    yaw = np.cumsum(drive.rate) * STEP
+    place = np.cumsum((0.15 * drive.speed + ahead + 1j * aside) * np.exp(1j * yaw))[drive.rows] * STEP
+    motion = measured(tabulate(replace(drive, place=place), turned=np.radians(degrees)))
+    wheels = sides(drive)
+    wheels.explain(motion)
+    assert find_frame(motion, [wheels]) == (motion, 0.0, other)
 
 
 @pytest.mark.parametrize(("left", "right"), [(-1.0, 1.0), (1.0, -1.0)])

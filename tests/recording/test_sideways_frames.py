@@ -59,7 +59,7 @@ def test_the_angle_of_the_heading_is_found(degrees: float, *, line: bool) -> Non
     command.explain(motion)
     assert command.explained is not None
     assert command.explained.is_sure
-    turned, margin = find_frame(motion, [command])
+    turned, margin, _ = find_frame(motion, [command])
     assert not turned.flip
     # Along one line, a heading that is off cannot be told from a ground on which the body slips aside.
     told = degrees if not line or degrees % 90.0 == 0.0 else 0.0
@@ -82,7 +82,7 @@ def test_the_hand_and_the_rear_of_a_frame_are_told_by_signs(
     motion = see(*change(place, yaw))
     command = read(time, asked, rate)
     command.explain(motion)
-    turned, _ = find_frame(motion, [command])
+    turned, _, _ = find_frame(motion, [command])
     assert (turned.flip, turned.offset_deg) == (flip, 0.0)
     made = command.explain(turned)
     assert made is not None
