@@ -107,8 +107,8 @@ def follow(values: Floats, lag: float) -> Floats:
     """First-order lag on the grid, without the delay of half a cell that a filter of held values has."""
     if lag <= 0.0:
         return values
-    kept = math.exp(-GRID_S / lag)
-    made = recur((1.0 - kept) * values, np.full(values.size - 1, kept))
+    share = math.exp(-GRID_S / lag)
+    made = recur((1.0 - share) * values, np.full(values.size - 1, share))
     made[1:] = 0.5 * (made[1:] + made[:-1])
     return made
 

@@ -281,10 +281,10 @@ class _Blocks:
 
     def follow(self, values: Floats) -> Floats:
         """Values after a first-order lag, shape (m, k)."""
-        kept = float(np.exp(-BLOCK_S / _SLOW_S))
+        share = float(np.exp(-BLOCK_S / _SLOW_S))
         return recur(
-            np.where(self.is_first[:, None], values, (1.0 - kept) * values),
-            np.where(self.is_first[1:], 0.0, kept),
+            np.where(self.is_first[:, None], values, (1.0 - share) * values),
+            np.where(self.is_first[1:], 0.0, share),
         )
 
     def list_columns(self, source: Floats, top: float, friction: float) -> Floats:
