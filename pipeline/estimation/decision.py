@@ -17,7 +17,7 @@ from scipy.special import stdtr
 
 from pipeline.core import NORMAL_95, Budget, format_share
 from pipeline.estimation.candidates import PRICE, Candidate, Extension, Screen
-from pipeline.estimation.fit import PartFit, fit_part
+from pipeline.estimation.fit import PartFit, approach, fit_part
 from pipeline.estimation.intervals import find_covariance
 from pipeline.estimation.noise import huber_cost
 from pipeline.estimation.parts import HORIZONS_S
@@ -61,8 +61,6 @@ _MOST_EFFECTS = 8
 """Most effects that a search adds on one path: a longer list explains nothing."""
 _SINGLES, _PAIRS = 4, 3
 """Extensions by one effect and by two that are fitted in each round."""
-_ROUGH = 3
-"""Steps of a rough fit, which shows whether a model may come near the best one."""
 _NEAR = 0.2
 """Share of what the best one explains that it may lack after them to be fitted to the end."""
 _DRAWS = 400
@@ -312,9 +310,7 @@ class Search:
         extensions: list[Extension] = [one for one in screen.list_singles() if one.net > wanted][:singles]
         extensions += [one for one in screen.list_pairs() if one.net > wanted][:pairs]
         # Some steps show which may come near the best.
-        rough = [
-            fit_part(self.part, one.add_to(base.state), noise=base.noise, most=_ROUGH) for one in extensions
-        ]
+        rough = [approach(base, one.add_to(base.state)) for one in extensions]
         judged, before = dict[tuple[str, ...], Judged](), find_cost(base)
         for start in sorted(rough, key=find_cost):
             if find_cost(start) > reached + _NEAR * max(before - reached, 0.0):
@@ -424,7 +420,7 @@ class Search:
         base, largest = self._drop(current, cases), self.conditions.largest
         starts = [base.state.add(candidate(**values)) for values in effect.list_starts(largest)]
         # Some steps show whether it may come near what its special cases explain.
-        rough = [fit_part(self.part, state, noise=base.noise, most=_ROUGH) for state in starts]
+        rough = [approach(base, state) for state in starts]
         own, explained = find_cost(current), find_cost(base) - find_cost(current)
         fits = [self.fit(one.state, one.noise) for one in rough if find_cost(one) < own + _NEAR * explained]
         fit = min(fits, key=find_cost, default=base)

@@ -31,7 +31,8 @@ _SETTLED = 1e-7
 """The same for a model that is written: it ends at the same values from every start."""
 _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""
-_MOST_STEPS = 30
+_MOST_STEPS, _FEW_STEPS = 30, 3
+"""Steps of a fit, and of one that shows whether a model may come near the best one."""
 _GRID_ROUNDS = 4
 """Rounds of a grid, each a third as wide as the one before."""
 _MOST_WALKS = 4
@@ -203,7 +204,6 @@ def fit_part(
     noise: Noise | None = None,
     per_run: Sequence[str] = (),
     exact: bool = False,
-    most: int = _MOST_STEPS,
 ) -> PartFit:
     """Fit all numbers of a state to one part of the path, with the noise of its residuals.
 
@@ -213,7 +213,6 @@ def fit_part(
         noise: of nearly the same residuals; None to learn it from those of the start.
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
-        most: steps.
     """
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
@@ -221,15 +220,29 @@ def fit_part(
     fit = PartFit(part, start, free, residual, columns, part.learn(residual, noise, exact=exact))
     if not free:
         return fit
-    fit = _descend(fit, most, exact=exact)
+    fit = _descend(fit, exact=exact)
     for _ in range(_MOST_WALKS if len(fit.smooth) < len(free) else 0):
         before = fit.score
         for number in free:
             if not number.is_smooth:
-                fit = _walk_grid(fit, number, most, exact=exact)
+                fit = _walk_grid(fit, number, exact=exact)
         if before - fit.score < _ENOUGH:
             break
     return fit
+
+
+def approach(base: PartFit, start: State) -> PartFit:
+    """Some steps of a fit from a model's extension, which show how near it may come to the best one.
+
+    Args:
+        base: the fitted model.
+        start: the extension, at a start of its new numbers.
+    """
+    part, free = base.part, base.part.list_free(start)
+    residual = part.find_residuals(start)
+    columns = part.differentiate(start, residual, free)
+    fit = PartFit(part, start, free, residual, columns, part.learn(residual, base.noise))
+    return _descend(fit, _FEW_STEPS) if free else fit
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
@@ -238,14 +251,21 @@ def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], r
     return float(huber_cost(innovations).sum()) + part.prior.cost(state, free)
 
 
-def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
-    """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way."""
+def _descend(fit: PartFit, most: int = _MOST_STEPS, *, exact: bool = False) -> PartFit:
+    """Levenberg-Marquardt steps, numbers held to their bounds; the noise is learned anew on the way.
+
+    Its derivatives are those of where it ends, or of where all further steps together were no news.
+    """
     part, free, enough = fit.part, fit.free, _SETTLED if exact else _ENOUGH
-    damping, is_fresh, fallen = _LOOSEST, True, 0.0
+    damping, gained, fallen, is_stale = _LOOSEST, 0.0, 0.0, False
+    near = 0.0 if exact else _NEWS
     # What noise learned anew would change of the likelihood after a fall f is near f^2 / 4n of its n steps.
     most_fallen = 0.0 if exact else math.sqrt(4.0 * _ENOUGH * part.spans.size)
     cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
     for _ in range(most if fit.smooth else 0):
+        if is_stale:
+            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
+            fit, gained, is_stale = replace(fit, columns=columns), 0.0, False
         moving, step, promised = _solve(fit, damping)
         fall = 0.0
         if promised >= enough:
@@ -253,23 +273,21 @@ def _descend(fit: PartFit, most: int, *, exact: bool) -> PartFit:
             residual = part.find_residuals(state)
             fall = cost - measure_cost(part, fit.noise, state, free, residual)
         if fall > 0.0:
-            fit, cost = replace(fit, state=state, residual=residual), cost - fall
-            damping, is_fresh, fallen = max(damping / 30.0, 1e-9), False, fallen + fall
-            if fall <= _NEWS and not exact:
+            fit, cost, damping = replace(fit, state=state, residual=residual), cost - fall, damping / 30.0
+            damping, gained, fallen = max(damping, 1e-9), gained + fall, fallen + fall
+            if 0.0 < fall <= near:
                 continue
-        elif is_fresh and promised >= enough and damping <= _STIFFEST:
+        elif gained <= near and promised >= enough and damping <= _STIFFEST:
             damping = max(damping * 30.0, 1e-2)
             continue
-        elif is_fresh and fallen <= most_fallen:
-            break
-        if not is_fresh:
-            columns = part.differentiate(fit.state, fit.residual, free, both_sides=exact)
-            fit, is_fresh = replace(fit, columns=columns), True
+        is_stale = gained > near
         if fallen > most_fallen and not 0.0 < fall <= _NEWS:
             fit = replace(fit, noise=part.learn(fit.residual, fit.noise, exact=exact))
             cost = measure_cost(part, fit.noise, fit.state, free, fit.residual)
             damping, fallen = _LOOSEST, 0.0
-    if not is_fresh:
+        elif not is_stale:
+            break
+    if is_stale and most == _MOST_STEPS:
         fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit
 
@@ -296,7 +314,7 @@ def _is_pushed_out(state: State, number: Free, pull: float) -> bool:
     return (value <= low and pull < 0.0) or (value >= high and pull > 0.0)
 
 
-def _walk_grid(fit: PartFit, number: Free, most: int, *, exact: bool) -> PartFit:
+def _walk_grid(fit: PartFit, number: Free, *, exact: bool) -> PartFit:
     """Search a number on a shrinking grid, the others adapted linearly; then all of them are fitted."""
     part, noise, smooth = fit.part, fit.noise, fit.smooth
     columns = pick_columns(fit.columns, smooth)
@@ -323,7 +341,7 @@ def _walk_grid(fit: PartFit, number: Free, most: int, *, exact: bool) -> PartFit
     moved = replace(
         fit, state=state, residual=residual, columns=part.differentiate(state, residual, fit.free)
     )
-    beyond = _descend(moved, most, exact=exact)
+    beyond = _descend(moved, exact=exact)
     return beyond if beyond.score < fit.score else fit
 
 

@@ -60,10 +60,10 @@ def test_the_commands_of_the_container_make_a_program_that_runs_a_batch(tmp_path
                 around[key] = str(tmp_path) if key == "HOME" else value
         elif name == "RUN":
             subprocess.run(["sh", "-ec", words], cwd=work, env=around, check=True)
-    compiled = {path.name for path in folders["/var/cache/slip"].rglob("*.o")}
+    compiled = {path.name for path in folders["/var/cache/slip"].rglob("*.nbi")}
     assert len(compiled) > 10
     simulate_case("husky_tile", out=work / "logs" / "a.mcap", duration_s=20.0)
     batch = ["slip", "batch", "logs", "--results", "results", "--settle", "0", "--json"]
     done = subprocess.run(batch, cwd=work, env=around, capture_output=True, text=True, check=True)
     assert json.loads(done.stdout)["done"] == 1
-    assert {path.name for path in folders["/var/cache/slip"].rglob("*.o")} == compiled
+    assert {path.name for path in folders["/var/cache/slip"].rglob("*.nbi")} == compiled
