@@ -12,6 +12,9 @@ import numpy as np
 from pipeline.core import Floats
 from pipeline.models import Effect, Search, Timing
 
+_LEAST_INVERSE = 1e-3
+"""Share of its inverse that a limit keeps at least in one step."""
+
 # Derivative columns of many residuals, one after the other in memory: so they are made, picked and summed.
 #
 # All arrays are of shape (n, 3, p): n windows, three channels, p numbers.
@@ -265,7 +268,12 @@ class State:
         """The state with free numbers changed by a step."""
         state, shared = self, dict[str, dict[str, float]]()
         for number, change in zip(free, step, strict=True):
-            value = self.get(number) + change
+            value = self.get(number)
+            if math.isinf(self.neutral_of(number)):
+                # A limit acts by its inverse, which is what is linear.
+                value /= max(1.0 - change / value, _LEAST_INVERSE)
+            else:
+                value += change
             if number.effect and number.run is None:
                 shared.setdefault(number.effect, {})[number.name] = number.hold(value)
             else:
