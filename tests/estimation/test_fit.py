@@ -84,3 +84,13 @@ def test_what_is_held_out_is_what_a_fit_without_it_leaves(problem: Problem) -> N
         assert np.abs(step[0]) < 4.0 * np.sqrt(fit.covariance[0, 0])
     # What a fit says of itself is too good.
     assert np.mean(held[:, 2] ** 2) > np.mean(fit.residual[:, 2] ** 2)
+
+
+def test_a_limit_that_does_little_stays_a_limit_in_one_step(problem: Problem) -> None:
+    """A step of several times its value goes to where it does a few times as much, not to nothing at all."""
+    limit = find_effect("wheel_speed_limit")(limit=18.0)
+    state = problem.start_state([limit])
+    (number,) = (one for one in problem.parts[0].list_free(state) if one.effect == limit.id)
+    assert state.move([number], [-30.0]).get(number) == pytest.approx(18.0 / (1.0 + 30.0 / 18.0))
+    assert state.move([number], [1.0]).get(number) == pytest.approx(18.0 / (1.0 - 1.0 / 18.0))
+    assert state.move([number], [60.0]).get(number) == number.bounds[1]

@@ -143,3 +143,16 @@ def test_sums_of_increments_spread_as_stated() -> None:
         poses, motion = noise.spread_after(np.array([count * STEP_S]))
         drawn = (sums[count:] - sums[:-count]).var(axis=0)
         assert (poses + motion)[0] == pytest.approx(drawn, rel=0.12)
+
+
+def test_noise_of_one_kind_alone_is_found_at_its_bound_and_left_again() -> None:
+    steps = make_steps(4000)
+    lasting = Noise(STEP_S, np.full(3, 0.4), np.ones(3), SCALE[None])
+    white = Noise(STEP_S, np.full(3, 0.4), np.zeros(3), SCALE[None])
+    draws = {1.0: draw_increments(lasting, steps, 5), 0.0: draw_increments(white, steps, 6)}
+    learned = {share: learn_noise(drawn, steps, CHANNELS) for share, drawn in draws.items()}
+    for share, noise in learned.items():
+        assert noise.share == pytest.approx(share, abs=0.03)
+        # From the other bound, where the likelihood is level, too.
+        again = learn_noise(draws[share], steps, CHANNELS, learned[1.0 - share])
+        assert again.share == pytest.approx(noise.share, abs=0.02)
