@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-from cyclopts import App, Parameter
+from cyclopts import App, CycloptsError, Parameter
 from cyclopts.types import NonNegativeFloat, NonNegativeInt, PositiveFloat, PositiveInt
 
 from pipeline.batch import (
@@ -316,6 +316,13 @@ def schedule(  # noqa: D417 - arguments document themselves
         lock: lock file (default: .slip-batch.lock in this folder).
     """
     hour, minute = parse_clock(at)
+    # A misspelt option would fail every night, where nobody looks.
+    try:
+        build_batch().parse_args(list(arguments), exit_on_error=False, print_error=False)
+    except CycloptsError as error:
+        why = str(error).strip().partition(". ")[0].rstrip(".")
+        what = f"slip batch does not take what would be run every night: {why}"
+        raise SlipError("usage", what, hint="See slip batch schedule --help") from error
     folder = Path.cwd()
     nightly = Nightly(
         program=slip_command(),

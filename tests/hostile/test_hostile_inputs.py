@@ -147,6 +147,7 @@ WORDS: list[tuple[str, str]] = [
     ("batch folder", "there is no recording in it. Recordings are files that end in .mcap"),
     ("batch run *.bag", r"\*\.bag: there is no recording in it"),
     ("batch field --quota 1GB", "--quota does nothing by itself"),
+    ("batch schedule field --for cron", "what would be run every night: Unknown option: --for"),
     ("batch field --shard 0/4", "is not a shard"),
     ("batch field --memory lots", "is not a size"),
     ("batch field --memory 1", "a worker does not start within a memory limit of '1'"),
