@@ -1,13 +1,20 @@
 """Figures of models: what they count, and what a diagnosis becomes."""
 
+from pathlib import Path
+
 import numpy as np
+import polars as pl
 import pytest
 
+from pipeline.analysis import Options
+from pipeline.analysis.analyze import analyze_log
 from pipeline.estimation import Comparison, Input, Problem, State
 from pipeline.estimation.effect_signature import autocorrelate, cross_correlate
 from pipeline.estimation.prediction import predict_at_from
 from pipeline.models import Model, Timing, find_effect
+from pipeline.report.figures.slip_figures import list_responses
 from pipeline.report.motion_view import MotionStage
+from pipeline.report.scene import RunReport, Scene
 from pipeline.run import load_run
 from pipeline.simulate import simulate_case
 from pipeline.sources import Vehicle, find_preset
@@ -45,9 +52,6 @@ def test_crosscorrelation_finds_how_late_a_residual_follows_its_input() -> None:
 
 
 def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFactory) -> None:
-    from pipeline.analysis import Options  # noqa: PLC0415
-    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415 - only this test needs a whole run
-
     folder = tmp_path_factory.mktemp("view")
     log = simulate_case("husky_tile", out=folder / "run.mcap", duration_s=40.0)
     manifest = analyze_log(log, Options(out=folder / "results", report=False)).manifest
@@ -71,3 +75,14 @@ def test_a_view_shows_what_a_prediction_says(tmp_path_factory: pytest.TempPathFa
     for axis in "xy":
         at = np.interp(starts["t"], places["t"], places[axis])
         assert np.allclose(starts[axis], at, atol=1e-6)
+
+
+def test_a_vehicle_that_follows_at_once_does_the_whole_step(tmp_path: Path) -> None:
+    """Smoothed velocities hold half of a step already where it begins."""
+    log = simulate_case("ideal_husky", out=tmp_path / "run.mcap", duration_s=90.0)
+    manifest = analyze_log(log, Options(out=tmp_path / "results", report=False, diagnosis=False)).manifest
+    rows = list_responses(Scene(RunReport({}, {"slip": manifest.read("slip")})))
+    assert rows
+    for name, response in rows.items():
+        measured = response.filter(pl.col("series") == "velocity", pl.col("t").is_between(0.5, 2.5))
+        assert measured["value"].to_numpy() == pytest.approx(1.0, abs=0.05), name

@@ -405,7 +405,10 @@ def draw_step_response(scene: Scene) -> Drawing | None:
     if not panels:
         return None
     chart = stack(*panels).properties(usermeta={"gutter": figures.GUTTER})
-    note = "Change since the step, median over commands held for three seconds; 1 is the commanded change."
+    note = (
+        "Change since half a second before the step, median over commands held for three seconds; 1 is the "
+        "commanded change."
+    )
     return Drawing(chart, rows, note, _format_step_response(rows))
 
 
@@ -428,8 +431,8 @@ def list_responses(scene: Scene) -> dict[str, pl.DataFrame]:
         frames = []
         for series, (times, values) in lines.items():
             at = np.interp((starts[:, None] + since).ravel(), times, values).reshape(starts.size, -1)
-            before = at[:, [np.searchsorted(since, -0.5 / _RATE_HZ) - 1]]
-            middle = np.median((at - before) / (high - low)[:, None], axis=0)
+            # Measured velocities are smoothed over time, and just before the step hold half of it.
+            middle = np.median((at - at[:, :1]) / (high - low)[:, None], axis=0)
             frames.append(pl.DataFrame({"t": since, "value": middle}).with_columns(series=pl.lit(series)))
         tables[f"response_{component}"] = pl.concat(frames)
     return tables
