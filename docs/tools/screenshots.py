@@ -214,7 +214,7 @@ def watch_half(work: Path) -> list[Screen]:
     )
     with watch:
         try:
-            while "slip  " not in (page.read_text(encoding="utf-8") if page.is_file() else ""):
+            while "<dt>slip</dt>" not in (page.read_text(encoding="utf-8") if page.is_file() else ""):
                 if watch.poll() is not None:
                     raise RuntimeError(f"slip watch ended with {watch.returncode}")
                 time.sleep(0.2)

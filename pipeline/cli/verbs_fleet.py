@@ -273,6 +273,8 @@ def _format_number(row: Mapping[str, object], width: int) -> str:
     return f"  {row['level'] or 'open':<{_LEVEL}}{label:<{width}}{numbers}{name}"
 
 
+_NOTES = 4
+"""Notes of a trend on the screen; the page has all."""
 _WORDS = (
     ("median_modulus", "median slip modulus", "m/s"),
     ("t_mrmse_m", "position error over 2 s", "m"),
@@ -454,4 +456,7 @@ def _format_trend(followed: Trend, page: Path) -> list[str]:
             rows.append((group, slip.points.height, f"{name_quantity(slip.quantity)} {latest}"))
     width = max((len(label) for label, _, _ in rows), default=0)
     lines += [f"{label:<{width}}{runs:>5} run{'s' * (runs != 1):<2} {text}" for label, runs, text in rows]
-    return [*lines, *(f"! {note}" for note in followed.notes), f"page    {page}"]
+    lines += [f"! {note}" for note in followed.notes[:_NOTES]]
+    others = len(followed.notes) - _NOTES
+    lines += [f"  {format_count(others, 'more note')} on the page"] if others > 0 else []
+    return [*lines, f"page    {page}"]

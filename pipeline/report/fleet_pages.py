@@ -134,14 +134,15 @@ def _name(row: Mapping[str, object]) -> str:
 
 
 def _list(row: Mapping[str, object]) -> list[str | Cell]:
-    spreads = [format_number(number_in(row, f"spread_{kind}")) for kind in ("terrain", "run")]
+    # What one run cannot tell is left empty, not dashed: on a phone each cell is words.
+    known = [number_in(row, key) for key in ("spread_terrain", "spread_run", "chi_square")]
+    spreads = ["" if value is None else format_number(value) for value in known]
     return [
         Cell(_name(row), small=_label(row), notes=[str(row["because"])] if row["level"] else ()),
         str(row["level"] or "open"),
         _format_value(row, row),
-        format_ends(row).replace(" ", "\u00a0"),
+        "" if row["low"] is None else format_ends(row).replace(" ", "\u00a0"),
         *spreads,
-        format_number(number_in(row, "chi_square")),
         f"{row['named']} of {row['runs']}",
     ]
 
@@ -416,7 +417,6 @@ def render_causes(causes: Causes) -> str:
         ],
         sentence_list=[_format_one(one, names) for one in shown],
         doubtful=[_format_one(one, names) for one in others],
-        doubt="; ".join(dict.fromkeys(one.note for one in others)),
         budgets=_tabulate_budgets(budgets, names),
         differences=_tabulate_differences(causes.differences, names),
         notes=causes.notes,

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from pipeline.core import Flags, Floats, Ints, format_count, format_share, rigid
+from pipeline.core import Flags, Floats, Ints, format_share, rigid
 from pipeline.logs import (
     TRANSFORM_TYPES,
     LogError,
@@ -289,8 +289,9 @@ def _report_stamps(t: Floats, gaps: Flags, jumps: Flags, held: Flags, topic: str
         findings.append(Finding("pose_gap", "info", text, where=topic, value=longest, count=count))
     if jumps.any():
         count = int(jumps.sum())
+        often = "once" if count == 1 else f"{count} times"
         text = (
-            f"the pose of {topic} jumped {format_count(count, 'time')} (the map was corrected, or a late "
+            f"the pose of {topic} jumped {often} (the map was corrected, or a late "
             "localization caught up): the run is split there"
         )
         where = float(t[np.flatnonzero(jumps)[0]])

@@ -40,6 +40,14 @@ export const nameEffect = (effect) => {
   return (effect.sentence || effect.about).split(CAUSE)[0];
 };
 
+const INPUTS = { v0: "ideal forward speed", s0: "ideal lateral speed", w0: "ideal yaw rate" };
+
+// What the signals of a formula are.
+const sayInputs = (effect) => {
+  const formula = effect.formula.join(" ");
+  return Object.entries(INPUTS).filter(([name]) => new RegExp(`\\b${name}\\b`).test(formula)).map(([name, words]) => `${name}: ${words}`).join("; ");
+};
+
 const lead = (text) => `${text[0].toUpperCase()}${text.slice(1)}.`;
 
 // What is to be added next, within reach of a thumb wherever a narrow page is scrolled to.
@@ -61,7 +69,7 @@ const buildCard = (pane, effect) => {
   const [turn, told] = effect.off ? ["Switch on", "switch it on again with its present values"] : ["Switch off", "switch it off without a new fit"];
   return h("li", { class: `card${effect.off ? " off" : ""}`, tabindex: "-1", data: { effect: effect.id } },
     h("b", { class: "name" }, nameEffect(effect)), h("p", { class: "quiet id" }, effect.id),
-    !effect.formula.length && h("p", { class: "quiet about" }, lead(effect.about)),
+    effect.formula.length ? h("p", { class: "quiet about" }, sayInputs(effect)) : h("p", { class: "quiet about" }, lead(effect.about)),
     cause && h("p", { class: "quiet" }, `Cause: ${cause}`),
     effect.refused && h("p", { class: "no-help", role: "note" }, `Not supported by the data: ${effect.refused}.`),
     effect.parameters.map((parameter) => buildSlider(pane, effect, parameter)),
@@ -165,7 +173,8 @@ const buildRow = (pane, row, first) => {
     const share = sayShare(row.to[key] / pane.state.session.errors[key] - 1);
     return Number.parseInt(share.replace("−", ""), 10) === 0 ? `${name} unchanged` : `${name} to ${words(row.to[key])} (${share})`;
   };
-  const about = row.named && row.formula.length ? "a formula that the diagnosis suggests for what no effect explains" : row.about;
+  const inputs = sayInputs(row);
+  const about = row.named && row.formula.length ? `a formula that the diagnosis suggests for what no effect explains${inputs && `; ${inputs}`}` : row.about;
   const marks = [row.named && h("i", { class: "mark" }, "diagnosis"),
     row.twins.length > 0 && h("i", { class: "mark twin", title: "they reduce the error of this run equally: add one of them" }, `as good: ${row.twins.join(", ")}`)].filter(Boolean);
   return h("li", { class: first ? "first" : "", data: { effect: row.id, ...(row.named && { named: "" }) }, bar: Math.min(Math.max(1 - row.to.t / row.from.t, 0), 1) },

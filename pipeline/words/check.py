@@ -294,8 +294,8 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     ranked = [name for status in STATUSES for name in check.list_status(status)]
     known = _list_known(check)
-    one = _is_one_a_side(check)
-    listed = known if one else [*check.list_status("changed"), *check.list_status("differs")]
+    different = [*check.list_status("changed"), *check.list_status("differs")]
+    listed = known if _is_one_a_side(check) else different
     shown = ranked if everything else [name for name in ranked if name in listed]
     texts = [_list_columns(check, name) for name in shown]
     # The reason why a quantity is unknown is longer than what stands in its column.
@@ -304,8 +304,7 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
     for name, row in zip(shown, texts, strict=True):
         pairs = itertools.zip_longest(row, widths, fillvalue="")
         text = "  ".join(f"{cell:<{width}}" for cell, width in pairs).rstrip()
-        alike = one and check.changes[name].status == "unchanged"
-        lines.append(("not shown" if alike else check.name_outcome(name), text))
+        lines.append((_name_outcome(check, name), text))
         if everything and name in known:
             lines += [("", f"{_INDENT}{detail}") for detail in _list_details(check, name)]
     if any(name in known for name in shown):
@@ -325,6 +324,12 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
         before, after = (" and ".join(one) for one in check.sides.terrains)
         lines.append(("terrains", f"BEFORE was driven on {before}, AFTER on {after}"))
     return lines + [("note", note) for note in check.sides.notes]
+
+
+def _name_outcome(check: Check, name: str) -> str:
+    """The outcome of a quantity; of two recordings nobody can say that nothing changed."""
+    is_unchanged = check.changes[name].status == "unchanged"
+    return "not shown" if is_unchanged and _is_one_a_side(check) else check.name_outcome(name)
 
 
 def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
@@ -424,13 +429,14 @@ def format_markdown(check: Check) -> str:
             f"| {_escape(one.name)}: {one.limit} | {one.measured} | {one.outcome} |" for one in check.limits
         ]
         rows.append("")
-    rows += ["| quantity | before -> after | difference | p | outcome |", "|---|---|---|---|---|"]
+    rows += ["| quantity | outcome | difference | before -> after | p |", "|---|---|---|---|---|"]
     for status in STATUSES:
         for name in check.list_status(status):
             change = check.changes[name]
             known = status != "unknown"
             pair, p = (_format_pair(check, name), f"{change.p:.2g}") if known else ("-", "-")
-            columns = [_name(check, name), pair, _format_difference(check, name), p, check.name_outcome(name)]
+            outcome, difference = _name_outcome(check, name), _format_difference(check, name)
+            columns = [_name(check, name), outcome, difference, pair, p]
             rows.append(f"| {' | '.join(map(_escape, columns))} |")
     rows += ["", *(f"{side}: {_escape(', '.join(runs))}  " for side, runs in _list_runs(check))]
     return "\n".join([*rows, *(f"\n> {_escape(note)}" for note in check.sides.notes)]) + "\n"
