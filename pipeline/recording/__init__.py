@@ -13,10 +13,20 @@ from typing import TYPE_CHECKING
 from pipeline.core import INPUTS, SlipError
 
 if TYPE_CHECKING:
+    from pipeline.recording.case import Given
     from pipeline.recording.drive_alone import examine_drive
     from pipeline.recording.examination import Recording, examine
 
-__all__ = ["FAULTS", "LogOptions", "Recording", "RecordingError", "examine", "examine_drive"]
+__all__ = [
+    "FAULTS",
+    "UNKNOWN_VEHICLE",
+    "Given",
+    "LogOptions",
+    "Recording",
+    "RecordingError",
+    "examine",
+    "examine_drive",
+]
 
 
 class RecordingError(SlipError):
@@ -42,6 +52,8 @@ class LogOptions:
     max_inflated: int | None = None
 
 
+UNKNOWN_VEHICLE = "unknown"
+"""Id of the vehicle that stands in where nothing identifies the log's."""
 FAULTS = (
     "signs_contradict",
     "command_reversed",

@@ -11,6 +11,7 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.logs import LogData
+from pipeline.recording import UNKNOWN_VEHICLE
 from pipeline.recording.evidence import RATES, SPEEDS, WHEELS, Axis, Units
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Bent, Explained, Held, Reading
@@ -34,6 +35,38 @@ _AS_RECORDED: Mapping[str, Mapping[str, str]] = {
     },
 }
 """Lines of run.toml that keep a correction from being made; the defaults of other keys do not."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """A log before it is examined.
+
+    Attributes:
+        data: columns of the chosen pose, the gyro and every candidate for a command and for wheels.
+        sources: the pose, and candidates by type and name, the likeliest first.
+        configuration: the user's; what it gives is not decided here.
+        vehicle: the log's, or `UNKNOWN_VEHICLE` of its kind.
+        where: the log, for error messages.
+    """
+
+    data: LogData
+    sources: Sources
+    configuration: Configuration
+    vehicle: Vehicle
+    where: str
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the vehicle's geometry is known."""
+        return self.vehicle.id != UNKNOWN_VEHICLE
+
+    @property
+    def moves_sideways(self) -> bool:
+        """Whether the vehicle may move to the side, by its kind or by what it is asked or measured to do."""
+        drives = dict.fromkeys((*self.sources.rank_drives("command"), *self.sources.rank_drives("wheels")))
+        return self.vehicle.kinematics.has_inputs("sideways") or any(
+            find_sideways_share(self.data.topics, one) for one in drives
+        )
 
 
 @dataclass
@@ -96,33 +129,21 @@ def is_crossed(drive: Candidate) -> bool:
 class Case:
     """One log: its candidates, and what was decided so far."""
 
-    def __init__(
-        self,
-        data: LogData,
-        sources: Sources,
-        configuration: Configuration,
-        vehicle: Vehicle,
-        *,
-        is_known: bool,
-        where: str,
-    ) -> None:
-        self.is_known = is_known
-        self.sources, self.configuration, self.vehicle = sources, configuration, vehicle
+    def __init__(self, given: Given) -> None:
+        self.is_known = given.is_known
+        self.sources, self.configuration, self.vehicle = given.sources, given.configuration, given.vehicle
         # Every candidate takes part in the clocks, the body command beside commanded wheels, too.
-        equal = replace(sources, others={**sources.others, "command": ()}, power=None)
+        equal = replace(self.sources, others={**self.sources.others, "command": ()}, power=None)
         self.findings: list[Finding] = []
         self.changes: dict[str, dict[str, object]] = {}
-        self.extraction = Extraction(data, equal, configuration, vehicle, where)
+        self.extraction = Extraction(given.data, equal, self.configuration, self.vehicle, given.where)
         self.ahead = _find_ahead(self)
         if self.ahead is not None:
             equal = replace(equal, command=self.ahead[0])
-            section = msgspec.structs.replace(configuration.command, time="log")
-            by_log = msgspec.structs.replace(configuration, command=section)
-            self.extraction = Extraction(data, equal, by_log, vehicle, where)
-        drives = dict.fromkeys((*sources.rank_drives("command"), *sources.rank_drives("wheels")))
-        self.moves_sideways = vehicle.kinematics.has_inputs("sideways") or any(
-            find_sideways_share(data.topics, one) for one in drives
-        )
+            section = msgspec.structs.replace(self.configuration.command, time="log")
+            by_log = msgspec.structs.replace(self.configuration, command=section)
+            self.extraction = Extraction(given.data, equal, by_log, self.vehicle, given.where)
+        self.moves_sideways = given.moves_sideways
         self.driven: Explained | None = None
 
     # Signals.

@@ -10,10 +10,10 @@ from dataclasses import replace
 import numpy as np
 
 from pipeline.core import enumerate_texts
-from pipeline.logs import LogData
-from pipeline.recording.case import Candidate, Case, is_crossed
+from pipeline.recording.case import Candidate, Case, Given, is_crossed
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.delays import settle_delay
+from pipeline.recording.encoders import report_dead
 from pipeline.recording.examination import Recording, describe
 from pipeline.recording.geometry import Geometry, Length, explain_wheels, roll_wheels
 from pipeline.recording.motion import Motion
@@ -29,41 +29,22 @@ from pipeline.sources import (
     PoseContent,
     PoseSource,
     Sources,
-    Vehicle,
 )
-from pipeline.stages import Finding, find_sideways_share
+from pipeline.stages import Finding
 
 _REASON = "no pose is recorded: the motion of the wheels stands in"
 
 
-def examine_drive(
-    data: LogData,
-    sources: Sources,
-    configuration: Configuration,
-    vehicle: Vehicle,
-    *,
-    is_known: bool,
-    where: str,
-) -> Recording | None:
+def examine_drive(given: Given) -> Recording | None:
     """Let the measured wheels of a log without poses stand in for its pose.
-
-    Args:
-        data: columns of every candidate for a command and for wheels.
-        sources: candidates by type and name, the likeliest first; no pose.
-        configuration: the user's.
-        vehicle: the log's, or any of its kind.
-        is_known: whether its geometry is known.
-        where: the log, for error messages.
 
     Returns:
         The recording; None if no candidate for wheels turns, or there is no command.
     """
-    if vehicle.kinematics.has_inputs("sideways") or any(
-        find_sideways_share(data.topics, one) for one in sources.rank_drives("command")
-    ):
+    if given.moves_sideways:
         # Of its motion to the side only the wheels of a known vehicle show anything.
-        return _take_by_name(sources, configuration) if is_known else None
-    return _stand_in(Case(data, sources, configuration, vehicle, is_known=is_known, where=where))
+        return _take_by_name(given.sources, given.configuration) if given.is_known else None
+    return _stand_in(Case(given))
 
 
 def _take_by_name(sources: Sources, configuration: Configuration) -> Recording | None:
@@ -110,7 +91,7 @@ def _stand_in(case: Case) -> Recording | None:
             for one in commands:
                 one.reading.explain(rolled)
     if wheels.reading.form == "sides":
-        _report_dead_side(case, wheels)
+        report_dead(case, wheels, "the log holds no pose in its rank")
         _find_unit(case, wheels, command)
     if not case.findings or case.findings[-1].severity != "error":
         _report_opposite(case, command, wheels)
@@ -158,16 +139,6 @@ def _read_commands(case: Case, motion: Motion, wheels: Candidate) -> list[Candid
             reading.explain(motion)
             drives.append(Candidate(source, reading, number, is_measured=False))
     return drives
-
-
-def _report_dead_side(case: Case, wheels: Candidate) -> None:
-    dead = wheels.reading.dead_side
-    if dead:
-        text = (
-            f"the {dead} wheels' encoder reads the same throughout while the other wheels turn: it is "
-            "dead, and the log holds no pose in its rank"
-        )
-        case.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
 
 
 def _report_opposite(case: Case, command: Candidate, wheels: Candidate) -> None:

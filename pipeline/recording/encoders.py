@@ -34,7 +34,7 @@ def settle_wheels(case: Case, command: Candidate | None, wheels: Candidate | Non
 
 def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels: Candidate | None) -> bool:
     """A side that is dead or counts backward; whether one was found."""
-    if wheels is not None and wheels.reading.form == "sides" and _report_dead(case, wheels):
+    if wheels is not None and wheels.reading.form == "sides" and report_dead(case, wheels):
         return True
     of_wheels = wheels is not None and wheels.is_sure and is_crossed(wheels)
     of_command = command is not None and command.is_sure and is_crossed(command)
@@ -79,14 +79,20 @@ def _report_sides(case: Case, motion: Motion, command: Candidate | None, wheels:
     return False
 
 
-def _report_dead(case: Case, wheels: Candidate) -> bool:
+def report_dead(case: Case, wheels: Candidate, without: str = "") -> bool:
+    """A side whose encoder is dead; whether one is.
+
+    Args:
+        case: the log.
+        wheels: their candidate, a speed a side.
+        without: what is missed without it; by default the log is analyzed from commands.
+    """
     dead = wheels.reading.dead_side
     if not dead:
         return False
     other = next(side for side in SIDES if side != dead)
-    text = (
-        f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: it is "
-        f"dead (take --input command, or correct [wheels] {dead})"
-    )
+    rest = without or f"take --input command, or correct [wheels] {dead}"
+    text = f"the {dead} wheels' encoder reads the same throughout while the {other} wheels turn: "
+    text += f"it is dead ({rest})"
     case.findings.append(Finding("wheel_dead", "error", text, where=f"wheels {dead}"))
     return True

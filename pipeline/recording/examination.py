@@ -6,8 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from pipeline.core import SlipError
-from pipeline.logs import LogData
-from pipeline.recording.case import Case
+from pipeline.recording.case import Case, Given
 from pipeline.recording.command_scale import measure_command
 from pipeline.recording.delays import settle_delay
 from pipeline.recording.encoders import settle_wheels
@@ -21,7 +20,7 @@ from pipeline.recording.score import FEWEST_STEPS
 from pipeline.recording.signs import report_signs, turn_motion
 from pipeline.recording.units import find_units, settle_gyro, settle_lengths
 from pipeline.run import Alignment
-from pipeline.sources import Configuration, Sources, Vehicle
+from pipeline.sources import Configuration, Sources
 from pipeline.stages import Finding
 
 
@@ -75,36 +74,20 @@ _EQUAL = 0.02
 """Deviation of both gains from one within which a signal measures the motion."""
 
 
-def examine(
-    data: LogData,
-    sources: Sources,
-    configuration: Configuration,
-    vehicle: Vehicle,
-    *,
-    is_known: bool,
-    where: str,
-) -> Recording:
-    """Decide which reading of a log's signals makes its pose move as it does.
-
-    Args:
-        data: columns of the chosen pose, the gyro and every candidate for a command and for wheels.
-        sources: the pose, and candidates by type and name, the likeliest first.
-        configuration: the user's; what it gives is not decided here.
-        vehicle: the log's, or any of its kind.
-        is_known: whether its geometry is known.
-        where: the log, for error messages.
-    """
-    if sources.pose is None:
-        return Recording(sources, configuration)
+def examine(given: Given) -> Recording:
+    """Decide which reading of a log's signals makes its pose move as it does."""
+    as_given = Recording(given.sources, given.configuration)
+    if given.sources.pose is None:
+        return as_given
     try:
-        case = Case(data, sources, configuration, vehicle, is_known=is_known, where=where)
+        case = Case(given)
         motion = measure_motion(case.extraction.poses())
         if motion is None:
-            return Recording(sources, configuration)
+            return as_given
         motion, gyro = settle_gyro(case, motion)
     except SlipError:
         # The stage `extract` raises it again.
-        return Recording(sources, configuration)
+        return as_given
     drives = read_drives(case, motion)
     gyros = [] if gyro is None else [gyro]
     readings = [*(drive.reading for drive in drives), *gyros]

@@ -31,6 +31,7 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
+from pipeline.recording import UNKNOWN_VEHICLE
 from pipeline.sources import (
     CONFIGURED,
     LOCALIZED,
@@ -134,7 +135,6 @@ def _read(index: LogIndex, wanted: list[Wanted]) -> Sequence[TopicColumns]:
         return ()
 
 
-UNKNOWN_VEHICLE = "unknown"
 _STAND_INS: Mapping[str, float] = {"wheel_radius_m": 0.1, "track_width_m": 0.5}
 _STEERED = ("ackermann_msgs/", "autoware_control_msgs/", "autoware_auto_control_msgs/", "hunter_msgs/")
 
@@ -290,17 +290,12 @@ def _lacks_pose(
 
 def _let_wheels_stand_in(chosen: Choice, index: LogIndex, configuration: Configuration) -> Choice:
     """The choice for a log without poses, see `examine_drive`; unchanged if its wheels cannot be read."""
-    from pipeline.recording import examine_drive  # noqa: PLC0415 - heavy
+    from pipeline.recording import Given, examine_drive  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
     data = read_topics(index, list_wanted(chosen.sources, index.types, drives))
     recording = examine_drive(
-        data,
-        chosen.sources,
-        configuration,
-        chosen.vehicle,
-        is_known=chosen.vehicle.id != UNKNOWN_VEHICLE,
-        where=str(index.path),
+        Given(data, chosen.sources, configuration, chosen.vehicle, where=str(index.path))
     )
     if recording is None:
         return chosen
@@ -471,7 +466,7 @@ def _compare(
     chosen: Choice, index: LogIndex, configuration: Configuration, rivals: list[PoseSource]
 ) -> Choice:
     """Choose among the poses by their content, then the other roles by the motion of the pose."""
-    from pipeline.recording import examine  # noqa: PLC0415 - heavy
+    from pipeline.recording import Given, examine  # noqa: PLC0415 - heavy
     from pipeline.stages import rate_poses, replace_pose  # noqa: PLC0415 - heavy
 
     drives = [*chosen.sources.rank_drives("command"), *chosen.sources.rank_drives("wheels")]
@@ -493,14 +488,7 @@ def _compare(
             )
             findings.append(Finding("pose_is_odometry", "error", text, where=str(ratings[0].source)))
         sources = replace_pose(sources, ratings)
-    recording = examine(
-        data,
-        sources,
-        configuration,
-        chosen.vehicle,
-        is_known=chosen.vehicle.id != UNKNOWN_VEHICLE,
-        where=str(index.path),
-    )
+    recording = examine(Given(data, sources, configuration, chosen.vehicle, where=str(index.path)))
     # Candidates are rated as recorded, without intervals, and with the wheels that were chosen by name.
     roles = recording.sources.command, recording.sources.wheels
     as_rated = (
