@@ -167,8 +167,14 @@ class Work:
     def _extract(self) -> StageOutcome:
         setup = self.setup
         data = self.data if self.data is not None else read_wanted(setup, self.sha256)
+        known = setup.choice.recording
         made = setup.choice.extracted or extract_tables(
-            data, setup.sources, setup.configuration, setup.vehicle, where=str(setup.path)
+            data,
+            setup.sources,
+            setup.configuration,
+            setup.vehicle,
+            where=str(setup.path),
+            cut=None if known is None else known.cut,
         )
         # Columns and tables are large: drop the references as early as possible.
         self.data, data = None, replace(data, topics=())

@@ -16,7 +16,8 @@ def find_scale(rest: Floats) -> float:
     squares = np.square(rest)
     power = max(1.5 * float(np.median(squares)), 1e-16)
     for _ in range(12):
-        power = max((FREEDOM + 1.0) * float(np.mean(squares / (FREEDOM + squares / power))), 1e-16)
+        total = np.add.reduce(squares / (FREEDOM + squares / power))
+        power = max((FREEDOM + 1.0) * float(total / squares.size), 1e-16)
     return math.sqrt(power)
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "FAULTS",
-    "UNKNOWN_VEHICLE",
     "Given",
     "LogOptions",
     "Recording",
@@ -52,8 +51,6 @@ class LogOptions:
     max_inflated: int | None = None
 
 
-UNKNOWN_VEHICLE = "unknown"
-"""Id of the vehicle that stands in where nothing identifies the log's."""
 FAULTS = (
     "signs_contradict",
     "command_reversed",

@@ -11,12 +11,20 @@ import polars as pl
 
 from pipeline.core import Floats, SlipError
 from pipeline.logs import LogData
-from pipeline.recording import UNKNOWN_VEHICLE
 from pipeline.recording.evidence import RATES, SPEEDS, WHEELS, Axis, Units
 from pipeline.recording.motion import Motion
 from pipeline.recording.readings import Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR
-from pipeline.sources import CONFIGURED, Configuration, DriveForm, DriveSection, DriveSource, Sources, Vehicle
+from pipeline.sources import (
+    CONFIGURED,
+    UNKNOWN_VEHICLE,
+    Configuration,
+    DriveForm,
+    DriveSection,
+    DriveSource,
+    Sources,
+    Vehicle,
+)
 from pipeline.stages import Extraction, Finding, find_sideways_share
 
 TAKEN_M = 0.1

@@ -21,7 +21,7 @@ from pipeline.recording.signs import report_signs, turn_motion
 from pipeline.recording.units import find_units, settle_gyro, settle_lengths
 from pipeline.run import Alignment
 from pipeline.sources import Configuration, Sources
-from pipeline.stages import Finding
+from pipeline.stages import Cut, Finding
 
 
 @dataclass(frozen=True)
@@ -59,6 +59,7 @@ class Recording:
         geometry: lengths by the signals.
         evidence: on every signal that was tried.
         alignment: corrections of the command; None where nothing shows them.
+        cut: the poses, cut into segments; None where they were not read.
     """
 
     sources: Sources
@@ -68,6 +69,7 @@ class Recording:
     geometry: Geometry = field(default_factory=Geometry)
     evidence: tuple[Evidence, ...] = ()
     alignment: Alignment | None = None
+    cut: Cut | None = None
 
 
 _EQUAL = 0.02
@@ -125,6 +127,7 @@ def examine(given: Given) -> Recording:
         tuple(describe(drive.reading, roles) for drive in drives)
         + tuple(describe(one, roles) for one in gyros),
         alignment,
+        case.extraction.cut,
     )
 
 

@@ -10,10 +10,17 @@ import numpy as np
 
 from pipeline.core import PAUSE_NS, Flags, Floats, Ints, SlipError
 from pipeline.logs import ChannelInfo, LogIndex, Loss, Wanted, open_log, read_topics
-from pipeline.recording import UNKNOWN_VEHICLE, LogOptions
+from pipeline.recording import LogOptions
 from pipeline.recording.log_choice import Choice, choose, make_stand_in
 from pipeline.recording.log_setup import report_unused, require_messages, require_sources
-from pipeline.sources import Configuration, Sources, Vehicle, choose_sources, load_configuration
+from pipeline.sources import (
+    UNKNOWN_VEHICLE,
+    Configuration,
+    Sources,
+    Vehicle,
+    choose_sources,
+    load_configuration,
+)
 from pipeline.stages import describe_pauses, find_pauses
 
 _GAP_PERIODS = 3.0

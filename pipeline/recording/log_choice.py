@@ -31,10 +31,10 @@ from pipeline.logs import (
     read_topics,
     wanted_transforms,
 )
-from pipeline.recording import UNKNOWN_VEHICLE
 from pipeline.sources import (
     CONFIGURED,
     LOCALIZED,
+    UNKNOWN_VEHICLE,
     Configuration,
     ConfigurationError,
     Controller,

@@ -93,8 +93,8 @@ class Held:
         """Free the integrals, one for every lag that was tried: of many long signals they fill the memory."""
         self._sums.clear()
 
-    def integrate(self, steps: Steps, lag: float, delay: float) -> Floats:
-        """Integral over each step."""
+    def integrate(self, steps: Steps, lag: float, delay: float | Floats) -> Floats:
+        """Integral over each step, shape (n,), or after each of some delays of shape (k, 1), shape (k, n)."""
         if lag not in self._sums:
             self._sums[lag] = np.append(0.0, np.cumsum(self.lagged(lag))) * GRID_S
         total = self._sums[lag]
@@ -265,12 +265,14 @@ class Reading:
         dead = [name for name, one in sides if one not in self.inputs]
         return dead[0] if len(dead) == 1 else ""
 
-    def columns(self, steps: Steps, lag: float, delay: float, *, crossed: bool) -> tuple[Floats, Floats]:
-        """Increments ahead and of the heading, in the reading's own units."""
+    def columns(
+        self, steps: Steps, lag: float, delay: float | Floats, *, crossed: bool
+    ) -> tuple[Floats, Floats]:
+        """Increments ahead and of the heading, in the reading's own units; see `Held.integrate`."""
         one, two = (
             each.integrate(steps, lag, delay)
             if each is not None and each.moves
-            else np.zeros(steps.start.size)
+            else np.zeros(np.broadcast_shapes(np.shape(delay), steps.start.shape))
             for each in (self.first, self.second)
         )
         if self.form == "sides":
@@ -376,47 +378,43 @@ class Reading:
             some = np.zeros(count, dtype=bool)
             some[np.linspace(0, count - 1, _MOST_ROWS).astype(np.int64)] = True
         part = motion.take(some)
-        limits = [float(np.quantile(values**2, 0.97)) for values in (part.body.real, part.yaw)]
+        body, yaw = part.body, part.yaw
+        limits = [float(np.quantile(values**2, 0.97)) for values in (body.real, yaw)]
         scores: dict[tuple[float, float], float] = {}
 
-        def score(lag: float, delay: float) -> float:
-            key = (round(lag, 3), round(delay, 3))
-            if key not in scores:
-                scores[key] = self._rate_delay(part, *key, limits, crossed=crossed)
-            return scores[key]
+        def score(lag: float, delays: Floats) -> None:
+            """Log-likelihoods of both channels, each with its own gain and its squares limited."""
+            lag, delays = round(lag, 3), np.round(delays, 3)
+            columns = self.columns(part.steps, lag, delays[:, None], crossed=crossed)
+            channels = list(zip((body.real, yaw), columns, limits, strict=True))
+            total, aside = np.zeros(delays.size), self.third_crossed if crossed else self.third
+            if aside is not None and aside.moves:
+                across = aside.integrate(part.steps, lag, delays[:, None])
+                total -= [
+                    yaw.size * np.log(_miss_across(body, one)) for one in join_parts(columns[0], across)
+                ]
+                del channels[0]
+            for values, column, limit in channels:
+                power = np.einsum("ij,ij->i", column, column)
+                gains = np.divide(column @ values, power, out=np.zeros_like(power), where=power > 0.0)
+                rest = values - column * gains[:, None]
+                total -= 0.5 * values.size * np.log(np.minimum(rest**2, limit).mean(axis=1) + 1e-14)
+            scores.update(zip(((lag, float(one)) for one in delays), total.tolist(), strict=True))
 
         # Beside a delay that is given a lag may be any.
-        for lag in _LAGS_S if delays.size > 1 else np.arange(0.0, 2.0, 0.05):
-            for delay in delays:
-                score(float(lag), float(delay))
+        for lag in _LAGS_S if delays.size > 1 else np.arange(0.0, 2.0, 0.1):
+            score(float(lag), delays)
         for step in (0.03, 0.01):
             lag, delay = max(scores, key=lambda key: scores[key])
+            # One that is given is as it is.
+            near = np.array([-step, 0.0, step]) if delays.size > 1 else np.zeros(1)
             for longer in (-step, 0.0, step):
-                # One that is given is as it is.
-                for later in (-step, 0.0, step) if delays.size > 1 else (0.0,):
-                    score(max(0.0, lag + longer), delay + later)
+                score(max(0.0, lag + longer), delay + near)
         return max(scores, key=lambda key: scores[key])
 
-    def _rate_delay(
-        self, part: Motion, lag: float, delay: float, limits: Sequence[float], *, crossed: bool
-    ) -> float:
-        """Log-likelihood of both channels, each with its own gain and its squares limited."""
-        columns = self.columns(part.steps, lag, delay, crossed=crossed)
-        channels = list(zip((part.body.real, part.yaw), columns, limits, strict=True))
-        total, aside = 0.0, self.columns_aside(part.steps, lag, delay, crossed=crossed)
-        if aside.size:
-            total -= part.moved.size * np.log(_miss_across(part, join_parts(columns[0], aside[:, 0])))
-            del channels[0]
-        for values, column, limit in channels:
-            power = float(column @ column)
-            rest = values - column * (float(column @ values) / power if power > 0.0 else 0.0)
-            total -= 0.5 * values.size * np.log(float(np.mean(np.minimum(rest**2, limit))) + 1e-14)
-        return total
 
-
-def _miss_across(motion: Motion, asked: Complex) -> float:
+def _miss_across(body: Complex, asked: Complex) -> float:
     """Mean square of a motion beside what is asked for, in a frame of any angle and either hand."""
-    body = motion.body
     squares = []
     for one in (asked, np.conj(asked)):
         gain = np.vdot(one, body) / max(float(np.vdot(one, one).real), 1e-30)

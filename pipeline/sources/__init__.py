@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from pipeline.sources.configuration import (
         LENGTH_UNITS,
         RANGES,
+        UNKNOWN_VEHICLE,
         Configuration,
         ConfigurationError,
         DriveSection,

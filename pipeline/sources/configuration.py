@@ -309,6 +309,10 @@ class OwnUnit(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     offset: float = 0.0
 
 
+UNKNOWN_VEHICLE: Final = "unknown"
+"""Id of the vehicle that stands in where nothing identifies the log's."""
+
+
 class Vehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A vehicle's geometry and limits; units are in the names.
 

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from pipeline.stages.findings import Finding, Severity, StageError, blame_damage, tabulate_findings
     from pipeline.stages.inputs import WINDOW_S
     from pipeline.stages.pose_choice import PoseRating, rate_poses, replace_pose
-    from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ
+    from pipeline.stages.pose_topics import POSE_FINDINGS, SLOW_HZ, Cut
     from pipeline.stages.reading import (
         FEWEST_MESSAGES,
         find_sideways_share,

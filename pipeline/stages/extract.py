@@ -41,7 +41,7 @@ from pipeline.stages.drive import (
 )
 from pipeline.stages.drive_numbers import tabulate_power
 from pipeline.stages.findings import Finding, StageError, blame_damage
-from pipeline.stages.pose_topics import read_bodies
+from pipeline.stages.pose_topics import Cut, read_bodies
 from pipeline.stages.reading import Span, find_spans_given, find_spans_of_state, is_inside, remove_absurd
 from pipeline.stages.trust import check_echo
 
@@ -80,7 +80,13 @@ class Extracted:
 
 
 def extract_tables(
-    data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, *, where: str
+    data: LogData,
+    sources: Sources,
+    configuration: Configuration,
+    vehicle: Vehicle,
+    *,
+    where: str,
+    cut: Cut | None = None,
 ) -> Extracted:
     """Make the tables of the stage.
 
@@ -90,11 +96,12 @@ def extract_tables(
         configuration: units, signs, clocks, intervals.
         vehicle: geometry for body commands and speeds in m/s.
         where: the log, for error messages.
+        cut: poses of the log that were cut before.
 
     Raises:
         StageError: a role's topic contains no usable data.
     """
-    return Extraction(data, sources, configuration, vehicle, where).run()
+    return Extraction(data, sources, configuration, vehicle, where, cut).run()
 
 
 def _make_alike(channels: Sequence[TopicColumns]) -> list[TopicColumns]:
@@ -118,7 +125,13 @@ class Extraction:
     """
 
     def __init__(
-        self, data: LogData, sources: Sources, configuration: Configuration, vehicle: Vehicle, where: str
+        self,
+        data: LogData,
+        sources: Sources,
+        configuration: Configuration,
+        vehicle: Vehicle,
+        where: str,
+        cut: Cut | None = None,
     ) -> None:
         topics, self.findings = remove_absurd(data.topics)
         self.data = replace(data, topics=topics)
@@ -127,6 +140,7 @@ class Extraction:
         self.vehicle = vehicle
         self.where = where
         self.frames = ("", "")
+        self.cut = cut
         self._orders: dict[str, Ints] = {}
         # What is recorded beside the command explains it: it takes no part in clocks and in the time base.
         beside = sources.body_beside
@@ -327,9 +341,10 @@ class Extraction:
                 "sensor that is mounted upside down): its frame was turned over about the x axis"
             )
             self.findings.append(Finding("body_upside_down", "warning", text, where=source.topic))
-        track = pose_topics.cut_track(
-            times, position, quaternion, breaks, self.configuration.velocity, source.topic
-        )
+        recorded = (times, position, quaternion, breaks, self.configuration.velocity, source.topic)
+        if self.cut is None or not self.cut.is_of(recorded):
+            self.cut = Cut(recorded, pose_topics.cut_track(*recorded))
+        track = self.cut.track
         self.findings += track.findings
         if source.wheels is not None:
             # Wheels at rest repeat their pose, and each reading is new all the same.
