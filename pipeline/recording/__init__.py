@@ -58,7 +58,6 @@ FAULTS = (
     "wheels_reversed",
     "wheel_dead",
     "pose_flipped",
-    "steering_as_yaw_rate",
 )
 """Findings each of which makes every fit meaningless."""
 

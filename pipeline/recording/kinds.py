@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from pipeline.core import enumerate_texts
 from pipeline.recording.case import Candidate, Case
 from pipeline.recording.motion import Motion
-from pipeline.recording.readings import SIDES, Bent, Reading
+from pipeline.recording.readings import SIDES, Bent, Explained, Held, Reading
 from pipeline.recording.score import CLEAR, compare
+from pipeline.run import LIVE_SHARE
 from pipeline.sources import DriveForm
 from pipeline.stages import Finding, list_steered
+
+_MOST = 0.95
+"""Quantile that is the largest of a motion: beyond it are poses that jumped."""
 
 
 def find_kind(case: Case, wheels: Candidate | None, motion: Motion) -> str:
@@ -49,7 +55,9 @@ def settle_turn(case: Case, drive: Candidate, motion: Motion) -> None:
     """Read a body command as speed and steering angle where the body turns by these, as some cars do."""
     reading, made = drive.reading, drive.reading.explained
     first, second = reading.first, reading.second
-    is_open = not (case.is_known or case.moves_sideways or drive.is_measured or reading.form != "body")
+    is_car = not case.is_known or case.vehicle.kind == "ackermann"
+    is_given = case.configuration.command.yaw_rate_topic is not None or case.moves_sideways
+    is_open = is_car and not is_given and not drive.is_measured and reading.form == "body"
     if not is_open or first is None or second is None or made is None or len(reading.inputs) < len(SIDES):
         return
     bent = Bent(first, second.times, second.values)
@@ -57,10 +65,29 @@ def settle_turn(case: Case, drive: Candidate, motion: Motion) -> None:
     other = steered.explain(motion)
     if other is None or not other.sign("turned") or made.crossed:
         return
-    one, two = ((each.turned.blocks, each.none[1]) for each in (other, made))
-    if one[0].size == two[0].size and compare(one[0] - one[1], two[0] - two[1]) > CLEAR:
+    rivals = [made, _limit_turn(reading, made).explain(motion)]
+    if all(_turns_better(other, one) for one in rivals if one is not None):
         drive.reading, drive.source = steered, replace(drive.source, form=DriveForm.STEERING)
         drive.is_angle = True
+
+
+def _limit_turn(reading: Reading, made: Explained) -> Reading:
+    """Yaw rates of a body command as far as the steering reaches: beyond it they grow with the speed, too."""
+    first, second = reading.first, reading.second
+    assert first is not None  # noqa: S101 - it has both
+    assert second is not None  # noqa: S101 - it has both
+    ahead, turned = np.abs(made.motion.body.real), np.abs(made.motion.yaw)
+    moved = ahead > LIVE_SHARE * float(np.quantile(ahead, _MOST))
+    bend = float(np.quantile(turned[moved] / ahead[moved], _MOST)) / abs(float(made.turned.gains[0]))
+    speed = np.interp(second.times, first.times, np.abs(first.values)) * abs(float(made.ahead.gains[0]))
+    limited = Held(second.times, np.clip(second.values, -bend * speed, bend * speed))
+    return Reading("body", reading.name, first, limited)
+
+
+def _turns_better(one: Explained, other: Explained) -> bool:
+    """Whether the turning is clearly likelier by the first."""
+    gains = [each.turned.blocks - each.none[1] for each in (one, other)]
+    return gains[0].size == gains[1].size and compare(gains[0], gains[1]) > CLEAR
 
 
 def report_turn(case: Case, command: Candidate | None) -> None:

@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 import polars as pl
 
-from pipeline.core import Flags, Floats, Ints, arrays, fit_robustly, format_share, robust_spread
-from pipeline.run import LIVE_SHARE, MOVING_MPS, STILL_MPS
+from pipeline.core import Flags, Floats, Ints, fit_robustly, format_share, robust_spread
+from pipeline.run import LIVE_SHARE, STILL_MPS
 from pipeline.sources import DriveForm, DriveSource, Vehicle, list_factors
 from pipeline.stages.findings import SURE, Finding
 from pipeline.stages.slip_stage import SlipResult
@@ -27,8 +27,6 @@ from pipeline.stages.trust import (
 _LIVE: Final = 0.05
 """Speed of a side [m/s] above encoder rounding and that of a creeping vehicle; above `STILL_MPS`, since here
 the sign of the poses' noise matters."""
-_USUAL: Final = 0.95
-"""Fraction of the samples that are not outliers of the localization."""
 _LEAST_SCALE: Final = 0.04
 """Smallest difference of the sides' scales that is reported: unequal tyres and motors reach 0.035."""
 
@@ -74,13 +72,6 @@ def _find_sides(velocity: Floats, track_m: float) -> Floats:
     """Speed of the left and the right side of an ideal differential drive [m/s], shape (n, 2)."""
     half = 0.5 * track_m * velocity[:, 2]
     return np.column_stack((velocity[:, 0] - half, velocity[:, 0] + half))
-
-
-def _correlate(one: Floats, other: Floats) -> float:
-    """Correlation about zero, since a steady speed is a relation too; outliers are clipped."""
-    one, other = (np.clip(v, *(np.quantile(np.abs(v), _USUAL) * np.array([-1.0, 1.0]))) for v in (one, other))
-    size = float(np.sqrt(np.sum(one**2) * np.sum(other**2)))
-    return float(np.sum(one * other)) / size if size > 0.0 else 0.0
 
 
 # Scale of the measured wheels against the motion: a wrong wheel radius, or a wrong unit.
@@ -168,58 +159,6 @@ def find_gain(driven: Floats, moved: Floats, steady: Flags) -> float | None:
     return gain if gain > 0.0 and spread <= ONE_SCALE * gain else None
 
 
-# A car that takes a Twist may take angular.z as its steering angle. Its yaw rate is then the speed times the
-# tangent of that number, over the wheelbase: at several speeds that is no multiple of the number itself.
-
-_HALF: Final = 0.5
-"""Part of the turning's power that steering angles leave, relative to that which yaw rates leave, below which
-they were commanded. On simulated cars with lags or understeer at most 0.49 where they were, and at least 1
-where not: half of it would miss some, and double would report chance."""
-_LARGEST: Final = 0.95
-"""Quantile of the driven steering angles that is the largest one: beyond it are poses that jumped."""
-
-
-def check_turn(
-    samples: Samples, commands: pl.DataFrame, vehicle: Vehicle, source: DriveSource | None
-) -> list[Finding]:
-    """Check for body commands of a car that have steering angles in place of yaw rates.
-
-    Args:
-        samples: of the run.
-        commands: table `commands`, sorted by time.
-        vehicle: as configured.
-        source: topics of the commands.
-    """
-    asked, turned = samples.command, samples.velocity[:, 2]
-    if source is None or asked is None or not samples.body_commanded or vehicle.kind != "ackermann":
-        return []
-    angles = commands["body_w"].to_numpy()[arrays.hold_indices(samples.times, commands["t"].to_numpy())]
-    speeds, wheelbase = asked[:, 0], vehicle.wheelbase_m or 1.0
-    steered = vehicle.kinematics.forward({"speed": speeds, "steering": angles}, vehicle)[2]
-    known = np.isfinite(asked).all(axis=1) & np.isfinite(turned) & np.isfinite(steered)
-    if known.sum() < FEWEST_SAMPLES:
-        return []
-    # A yaw rate beyond the largest steering comes out as that steering, and grows with the speed as well.
-    moved = known & (np.abs(samples.velocity[:, 0]) > MOVING_MPS)
-    driven = np.abs(np.arctan(wheelbase * turned[moved] / samples.velocity[moved, 0]))
-    most = float(np.quantile(driven, _LARGEST)) if driven.size else 0.0
-    limit = np.abs(speeds) * np.tan(most) / wheelbase
-    held = np.clip(asked[:, 2], -limit, limit)
-    by_rate, by_held, by_angle = (
-        _correlate(turned[known], ideal[known]) for ideal in (asked[:, 2], held, steered)
-    )
-    by_rate = max(by_rate, by_held)
-    unexplained = 1.0 - by_rate * abs(by_rate)
-    if unexplained < ONE_SCALE**2 or by_angle < 0.0 or 1.0 - by_angle**2 > _HALF * min(unexplained, 1.0):
-        return []
-    speed, turn = source.signals[:2]
-    text = (
-        f"{source} holds steering angles in place of yaw rates: the vehicle turns by the speed times their "
-        f'tangent; set speed_topic = "{speed}" and steering_topic = "{turn}" under [command] in run.toml'
-    )
-    return [Finding("steering_as_yaw_rate", "error", text, where="command", value=by_angle)]
-
-
 # Checks of a whole run: whether the vehicle moves at all, and whether encoders, command and pose agree.
 #
 # Each check is a function from the samples of a run to findings. It uses displacements over half a second,
@@ -263,8 +202,7 @@ def check_run(
     inputs = {name: ideal.leave_out(slip.suspect) for name, ideal in slip.inputs.items()}
     samples = gather_samples(velocities, inputs, slip.cut, body_commanded=body_commanded)
     samples = replace(samples, is_drive_alone=is_drive_alone)
-    findings = check_turn(samples, tables.get("commands", pl.DataFrame()), vehicle, command)
-    findings += run_checks(samples, vehicle)
+    findings = run_checks(samples, vehicle)
     if is_drive_alone or "measured" not in slip.recorded:
         return findings
     recorded = {"measured": slip.recorded["measured"].leave_out(slip.suspect)}
