@@ -106,7 +106,7 @@ STAGE = "diagnosis"
 _TABLES = ("poses", "alignments", "commands", "wheels", "imu", "slip", "findings")
 
 
-VERSION = 50
+VERSION = 51
 
 
 DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
