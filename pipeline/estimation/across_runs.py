@@ -36,7 +36,6 @@ from pipeline.models import LEAST_WAY_M, Bands
 if TYPE_CHECKING:
     from pipeline.estimation.noise import Noise
     from pipeline.estimation.parts import Part
-    from pipeline.estimation.state import Free
 
 
 _ITERATIONS = 20
@@ -72,21 +71,19 @@ def fit_part_jointly(part: Part, state: State, run_weights: Floats | None = None
         run_weights: weight of each run, shape (runs,); equal by default.
     """
     shares = np.ones(len(part.comparisons)) if run_weights is None else run_weights
-    by_ground = list_ground_labels(state)
-    free = tuple(number for number in part.list_free(state, by_ground) if number.is_smooth)
-    ties = _tie_grounds(part, free, by_ground)
+    free = tuple(number for number in part.list_free(state) if number.is_smooth)
     residual = part.find_residuals(state)
     best = PartFit(
         part, state, free, residual, part.differentiate(state, residual, free), part.learn(residual)
     )
     for _ in range(_ITERATIONS if free else 0):
         white, share = best.white, shares[part.run[best.white.rows]]
-        columns = white.columns @ ties
+        columns = white.columns
         normal, pull = (columns * share[:, None]).T @ columns, columns.T @ (share * white.residual)
         cost = _sum_costs(part, best.noise, residual, shares)
         for damping in _DAMPINGS:
             step = invert(normal + damping * np.diag(np.diag(normal))) @ pull
-            moved = best.state.move(free, (ties @ step).tolist())
+            moved = best.state.move(free, step.tolist())
             tried = part.find_residuals(moved)
             if (reached := _sum_costs(part, best.noise, tried, shares)) < cost:
                 break
@@ -110,22 +107,6 @@ def list_ground_labels(state: State) -> list[str]:
     return [label for effect in state.effects for label in effect.ground_labels]
 
 
-def _tie_grounds(part: Part, free: Sequence[Free], by_ground: Sequence[str]) -> Floats:
-    """Matrix from shared to single parameters, shape (p, q): ground parameters are equal in its runs."""
-    grounds = [comparison.run.terrain for comparison in part.comparisons]
-    keys = [
-        (
-            number.label,
-            grounds[number.run] if number.label in by_ground and number.run is not None else number.run,
-        )
-        for number in free
-    ]
-    places = {key: index for index, key in enumerate(dict.fromkeys(keys))}
-    ties = np.zeros((len(keys), len(places)))
-    ties[np.arange(len(keys)), [places[key] for key in keys]] = 1.0
-    return ties
-
-
 def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
     """Normal equations of each run of a fit, with parameters of single runs and delays eliminated.
 
@@ -139,13 +120,13 @@ def split_normals(part: Part, fit: PartFit) -> list[RunNormal]:
         common = [
             index
             for index, number in enumerate(fit.free)
-            if number.effect and (number.run is None or (number.run == run and number.label in by_ground))
+            if number.effect and (not number.runs or (run in number.runs and number.label in by_ground))
         ]
         rows = part.run[white.rows] == run
         columns = white.columns[rows]
         normal = columns.T @ columns / excess
         pull = columns.T @ white.residual[rows] / excess + normal @ values
-        own = [n for n in range(len(fit.free)) if n not in common and fit.free[n].run in {None, run}]
+        own = [n for n in range(len(fit.free)) if n not in common and fit.free[n].acts_in(run)]
         shared = normal[np.ix_(common, own)] @ np.linalg.pinv(normal[np.ix_(own, own)])
         normals.append(
             RunNormal(

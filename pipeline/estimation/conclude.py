@@ -30,7 +30,6 @@ from pipeline.estimation.estimates import (
     list_estimates,
     note_brevity,
     note_cut,
-    note_grounds,
     was_aligned,
 )
 from pipeline.estimation.ladder import Judgement, judge_model, ladder_as_json, list_order, note_fit
@@ -152,7 +151,6 @@ def summarize(
         unexplained=_find_unexplained(paths, ground, learned, region),
         findings=(
             *note_cut(body.search.budget),
-            *note_grounds(context),
             *(() if judgement is None else find_change(judgement)),
         ),
         ladder=() if judgement is None else _list_steps(judgement),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, cast
 from pipeline.core import SlipError
 from pipeline.estimation.comparison import Input
 from pipeline.estimation.problem import Problem
-from pipeline.models import Conditions, Effect, Excitation, Largest, Place, list_effects
+from pipeline.models import Conditions, Effect, Excitation, Largest, Place, is_of_one_run, list_effects
 from pipeline.run import GROUND_UNOBSERVABLE, MotionError, MotionRun
 
 if TYPE_CHECKING:
@@ -99,6 +99,8 @@ class Context:
         )
 
     def _can_show(self, effect: Effect) -> bool:
+        if len(self.runs) > 1 and is_of_one_run(effect.parameters):
+            return False
         is_long = max(run.duration_s for run in self.runs) >= _LONG_S
         return effect.can_show(self.conditions) and (is_long or Excitation.LONG not in effect.needs)
 

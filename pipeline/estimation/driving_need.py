@@ -127,7 +127,7 @@ def narrow_intervals(fitted: Fitted) -> dict[str, Curve]:
         curves |= {
             number.label: Curve(seconds, halves[:, index])
             for index, number in enumerate(fit.free)
-            if number.effect and number.run is None and number.is_smooth
+            if number.effect and not number.runs and number.is_smooth
         }
     return curves
 

@@ -129,12 +129,7 @@ def list_estimates(
     ]
     for item in (*judgement.estimates.items, *estimate_unnamed(judgement.fitted, rivals)):
         error, number = item.deviation, item.free
-        if (
-            number.effect in known
-            and number.run is None
-            and math.isfinite(item.value + error)
-            and error > 0.0
-        ):
+        if number.effect in known and not number.runs and math.isfinite(item.value + error) and error > 0.0:
             yield EstimatedNumber(
                 source.value, number.effect, number.name, number.unit, item.value, error,
                 named=number.effect in ids, at_bound=item.at_bound, in_model=number.effect in model,
@@ -181,18 +176,6 @@ def note_cut(budget: Budget) -> list[Finding]:
         f"not all alternatives were tried (--budget {2.0 * budget.seconds:g}s continues the search)"
     )
     return [Finding(SEARCH_CUT, text, "diagnosis", "warning")]
-
-
-def note_grounds(context: Context) -> list[Finding]:
-    """A finding where runs on different grounds were judged together."""
-    grounds = sorted({run.terrain for run in context.runs})
-    if len(grounds) == 1:
-        return []
-    text = (
-        f"these runs are on {', '.join(grounds)} and were fitted together: a difference between terrains may "
-        "appear as a change within a run (slip compare --causes and slip fleet fit separate terrains)"
-    )
-    return [Finding("unlike_grounds", text, "diagnosis", "warning")]
 
 
 def estimate_unnamed(fitted: Fitted, candidates: Iterable[Effect]) -> tuple[Estimate, ...]:
@@ -265,13 +248,13 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "at_bound": item.at_bound,
             "observable": item.observable,
         }
-        if item.free.run is None:
+        if not item.free.runs:
             entries[label] = entry
         else:
             entries.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
             runs = entries[label]["runs"]
             if isinstance(runs, list):
-                runs.append({"run": item.free.run, **entry})
+                runs += [{"run": run, **entry} for run in item.free.runs]
     return entries
 
 
@@ -308,7 +291,7 @@ def was_aligned(effect: Effect, context: Context) -> bool:
 def list_by_run(
     effect: Effect, context: Context, judgement: Judgement | None
 ) -> tuple[dict[str, Value], ...]:
-    """Values of an effect: by run where each run has its own clock, else once."""
+    """Values of an effect: by run where runs or grounds have their own, else once."""
     if was_aligned(effect, context):
         delays = [run.alignment.heading_delay_s for run in context.runs]
         beyond = effect.delay - float(np.mean(delays))

@@ -88,7 +88,7 @@ class Estimates:
 
     def choose_run(self, run: int) -> Estimates:
         """Estimates of the parameters that act in a run."""
-        rows = [index for index, item in enumerate(self.items) if item.free.run in {None, run}]
+        rows = [index for index, item in enumerate(self.items) if item.free.acts_in(run)]
         items = tuple(self.items[index] for index in rows)
         return Estimates(items, self.correlation[np.ix_(rows, rows)], self.blocks)
 
@@ -98,7 +98,7 @@ class Estimates:
         return {
             item.free.label: item.interval
             for item in self.items
-            if item.free.effect and item.free.run is None and math.isfinite(item.low)
+            if item.free.effect and not item.free.runs and math.isfinite(item.low)
         }
 
     def list_correlated(self) -> list[tuple[Free, Free, float]]:

@@ -300,12 +300,12 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
     }
     own = [
         {
-            "run": problem.names[item.free.run],
+            "run": problem.names[run],
             "parameter": item.free.label,
             **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
         }
         for item in estimates.items
-        if item.free.effect and item.free.run is not None
+        for run in (item.free.runs if item.free.effect else ())
     ]
     if own:
         fit["own"] = own

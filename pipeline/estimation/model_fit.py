@@ -50,9 +50,10 @@ class Fitted:
 
     @property
     def per_run(self) -> tuple[str, ...]:
-        """Labels ``effect.name`` of the parameters with one fitted value per run."""
-        own = (number.label for number in self.free if number.effect and number.run is not None)
-        return tuple(dict.fromkeys(own))
+        """Labels ``effect.name`` of the parameters with one fitted value per run, not per ground."""
+        by_ground = {label for effect in self.state.effects for label in effect.ground_labels}
+        own = (number.label for number in self.free if number.effect and number.runs)
+        return tuple(label for label in dict.fromkeys(own) if label not in by_ground)
 
 
 def fit_model(

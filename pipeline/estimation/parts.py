@@ -70,6 +70,7 @@ class Part(ABC):
         prior: of the parameters.
         dates_poses: whether its fixed clocks are those of the poses.
         clocks: ids of effects that are a clock of each single run.
+        grounds: numbers of the runs on each ground; one empty group where all are on one.
         title: name of the part.
     """
 
@@ -84,6 +85,7 @@ class Part(ABC):
         self.delays = delays
         is_dated = len(self.comparisons) == 1 or all(c.has_gyro for c in self.comparisons)
         self.clocks = () if is_dated else (find_late_effect(Late.POSES).id,)
+        self.grounds = _group_by_ground(self.comparisons)
         windows = [comparison.windows for comparison in self.comparisons]
         self.run: Ints = np.repeat(np.arange(len(windows)), [w.start.size for w in windows])
         self.times: Floats = np.concatenate([w.times for w in windows])
@@ -99,8 +101,8 @@ class Part(ABC):
         """Free numbers of a state: clocks and those of `per_run` have a value in each run."""
         return tuple(
             number
-            for number in state.list_free(self.delays, (*self.clocks, *per_run))
-            if number.effect or self.comparisons[number.run or 0].has_gyro
+            for number in state.list_free(self.delays, (*self.clocks, *per_run), self.grounds)
+            if number.effect or self.comparisons[number.runs[0]].has_gyro
         )
 
     @abstractmethod
@@ -120,9 +122,9 @@ class Part(ABC):
         increments: Floats = velocities * self.spans[self.run == run][:, None]
         return increments
 
-    def find_residuals(self, state: State) -> Floats:
-        """Measured less predicted increments of all runs, shape (n, 3)."""
-        residuals = [self.find_run_residuals(state, run) for run in range(len(self.comparisons))]
+    def find_residuals(self, state: State, runs: Sequence[int] = ()) -> Floats:
+        """Measured less predicted increments of some runs, in order, by default of all, shape (n, 3)."""
+        residuals = [self.find_run_residuals(state, run) for run in runs or range(len(self.comparisons))]
         return residuals[0] if len(residuals) == 1 else np.concatenate(residuals)
 
     @abstractmethod
@@ -185,12 +187,8 @@ class Part(ABC):
         self.look_ahead([one for states in moved for one in states])
         columns = make_columns(residual.shape[0], len(free))
         for index, (number, steps, states) in enumerate(zip(free, ends, moved, strict=True)):
-            run = number.run
-            rows = slice(None) if run is None else self.run == run
-            looks = [
-                self.find_residuals(one) if run is None else self.find_run_residuals(one, run)
-                for one in states
-            ]
+            rows = np.isin(self.run, number.runs) if number.runs else slice(None)
+            looks = [self.find_residuals(one, number.runs) for one in states]
             if len(steps) > 1:
                 columns[rows, :, index] = (looks[0] - looks[1]) / (steps[1] - steps[0])
             else:
@@ -369,6 +367,14 @@ class WheelPart(Part):
     def shift_clock(self, state: State, run: int, late_s: float) -> Floats:
         """See `Part`: the encoders are later by ``late_s`` than assumed."""
         return self._multiply(self._compare(state, run, state.timing[run].wheel_delay_s + late_s), run)
+
+
+def _group_by_ground(comparisons: Sequence[Comparison]) -> tuple[tuple[int, ...], ...]:
+    terrains = [one.run.terrain for one in comparisons]
+    groups = (
+        tuple(run for run, one in enumerate(terrains) if one == name) for name in dict.fromkeys(terrains)
+    )
+    return tuple(groups) if len(set(terrains)) > 1 else ((),)
 
 
 def tie_prior(part: Part, prior: Prior) -> Part:

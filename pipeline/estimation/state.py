@@ -68,7 +68,7 @@ class Free:
     Attributes:
         effect: id of the effect; empty for a delay of a run.
         name: of the parameter or of the delay.
-        run: number of the run it belongs to; None where all runs share it.
+        runs: numbers of the runs that share it; empty where all do.
         bounds: smallest and largest value.
         step: for numerical derivatives.
         unit: SI, `1` for a plain number.
@@ -77,7 +77,7 @@ class Free:
 
     effect: str
     name: str
-    run: int | None
+    runs: tuple[int, ...]
     bounds: tuple[float, float]
     step: float
     unit: str = "s"
@@ -89,9 +89,13 @@ class Free:
         return f"{self.effect or 'timing'}.{self.name}"
 
     @property
-    def key(self) -> tuple[str, str, int | None]:
-        """Its effect, name and run, the same at other bounds."""
-        return self.effect, self.name, self.run
+    def key(self) -> tuple[str, str, tuple[int, ...]]:
+        """Its effect, name and runs, the same at other bounds."""
+        return self.effect, self.name, self.runs
+
+    def acts_in(self, run: int) -> bool:
+        """Whether it is one of the numbers of a run."""
+        return not self.runs or run in self.runs
 
     @property
     def is_smooth(self) -> bool:
@@ -192,28 +196,33 @@ class State:
         }
         return replace(self, effects=(), own=own).add(*effects)
 
-    def list_free(self, delays: Sequence[DelayName], per_run: Sequence[str] = ()) -> tuple[Free, ...]:
+    def list_free(
+        self,
+        delays: Sequence[DelayName],
+        per_run: Sequence[str] = (),
+        grounds: Sequence[tuple[int, ...]] = ((),),
+    ) -> tuple[Free, ...]:
         """Free numbers: parameters that are not fixed and say how much, then the delays of every run.
 
         Args:
             delays: which delays of a run are free.
             per_run: labels ``effect.name``, or ids of effects, whose values belong to each run alone.
+            grounds: runs on each ground, which has its own values of `Effect.ground_labels`.
         """
-        runs = range(len(self.timing))
+        runs = [(run,) for run in range(len(self.timing))]
         free: list[Free] = []
         for effect in self.effects:
             for p in effect.parameters:
                 is_given = math.isfinite(effect.values[p.name]) and effect.is_used(p)
                 if p.name in effect.fixed or not is_given:
                     continue
-                alone = f"{effect.id}.{p.name}" in per_run or effect.id in per_run
-                free += [
-                    Free(effect.id, p.name, run, p.bounds, p.step, p.unit, p.search)
-                    for run in (runs if alone else (None,))
-                ]
+                label = f"{effect.id}.{p.name}"
+                alone = label in per_run or effect.id in per_run
+                sharing = runs if alone else grounds if label in effect.ground_labels else [()]
+                free += [Free(effect.id, p.name, one, p.bounds, p.step, p.unit, p.search) for one in sharing]
         # Encoders report nothing that has yet to happen: a body that moves after its wheels is itself late.
         bounds = (0.0, _LARGEST_DELAY)
-        free += [Free("", name, run, bounds, DELAY_STEP) for run in runs for name in delays]
+        free += [Free("", name, one, bounds, DELAY_STEP) for one in runs for name in delays]
         return tuple(free)
 
     def find_bounds(self, number: Free) -> tuple[float, float]:
@@ -224,9 +233,9 @@ class State:
     def get(self, free: Free) -> float:
         """Value of a free number; NaN where its effect is gone."""
         if not free.effect:
-            return float(getattr(self.timing[free.run or 0], free.name))
-        if free.run is not None and (free.effect, free.name) in self.own.get(free.run, {}):
-            return self.own[free.run][free.effect, free.name]
+            return float(getattr(self.timing[free.runs[0]], free.name))
+        if free.runs and (free.effect, free.name) in self.own.get(free.runs[0], {}):
+            return self.own[free.runs[0]][free.effect, free.name]
         effect = self.find(free.effect)
         return math.nan if effect is None else effect.values[free.name]
 
@@ -240,11 +249,11 @@ class State:
         value = free.hold(value)
         if not free.effect:
             timing = list(self.timing)
-            timing[free.run or 0] = replace(timing[free.run or 0], **{free.name: value})
+            timing[free.runs[0]] = replace(timing[free.runs[0]], **{free.name: value})
             return replace(self, timing=tuple(timing))
-        if free.run is not None:
-            own = {**self.own.get(free.run, {}), (free.effect, free.name): value}
-            return replace(self, own={**self.own, free.run: own})
+        if free.runs:
+            own = {run: {**self.own.get(run, {}), (free.effect, free.name): value} for run in free.runs}
+            return replace(self, own={**self.own, **own})
         changed = (
             effect.change(**{free.name: value}) if effect.id == free.effect else effect
             for effect in self.effects
@@ -274,7 +283,7 @@ class State:
                 value /= max(1.0 - change / value, _LEAST_INVERSE)
             else:
                 value += change
-            if number.effect and number.run is None:
+            if number.effect and not number.runs:
                 shared.setdefault(number.effect, {})[number.name] = number.hold(value)
             else:
                 state = state.set(number, value)
@@ -333,7 +342,7 @@ class Prior:
         return np.array(away), np.array(known)
 
     def _find(self, number: Free) -> tuple[float, float] | None:
-        return None if number.run is not None else self.numbers.get(number.label)
+        return None if number.runs else self.numbers.get(number.label)
 
 
 NO_PRIOR = Prior()

@@ -158,7 +158,7 @@ def read_values(problem: Problem, fits: Sequence[tuple[Part, PartFit]], terrain:
     for _, fit in fits:
         for number in fit.free:
             if number.effect:
-                acting = (replace(number, run=run) for run in runs)
+                acting = (replace(number, runs=(run,)) for run in runs)
                 values[number.label] = float(np.median([fit.state.get(one) for one in acting]))
     return values
 

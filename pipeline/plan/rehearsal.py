@@ -415,7 +415,7 @@ def _inform(fitted: Fitted) -> Hypothesis:
         columns = fit.white.columns[:, fit.smooth]
         normal = columns.T @ columns / fit.overdispersion
         numbers = [fit.free[index] for index in fit.smooth]
-        mine = [index for index, number in enumerate(numbers) if number.effect and number.run is None]
+        mine = [index for index, number in enumerate(numbers) if number.effect and not number.runs]
         clocks = [index for index in range(len(numbers)) if index not in mine]
         known = normal[np.ix_(mine, mine)]
         if clocks:

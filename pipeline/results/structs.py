@@ -126,8 +126,8 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
         selection_frequency: share of resampled recordings in which its gain reaches the threshold.
         moves: its change of predictions over 2 s; None where the model does not contain it.
         growth: its evidence and intervals by driving time; None where the model does not contain it.
-        by_run: its values in each of the runs that were judged together, where each has its own; those of
-            this run are `parameters`.
+        by_run: its values in each of the runs that were judged together, where runs or grounds have their
+            own; those of this run are `parameters`.
     """
 
     id: str
@@ -146,6 +146,13 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     def is_determined(self) -> bool:
         """Whether the runs determine one of its numbers; a corrected clock was measured beforehand."""
         return self.corrected or bool(self.by_run) or not self.parameters or bool(self.shown)
+
+    @property
+    def own(self) -> set[str]:
+        """Names of its values that differ between runs."""
+        return {
+            name for name, value in self.parameters.items() if any(one[name] != value for one in self.by_run)
+        }
 
     @property
     def shown(self) -> Mapping[str, Value]:

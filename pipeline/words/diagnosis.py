@@ -11,6 +11,7 @@ from pipeline.core import (
     format_part,
     format_share,
     mark_finding,
+    round_digits,
     suffix_unit,
 )
 from pipeline.models import Excitation, list_effects, name_term
@@ -46,6 +47,7 @@ from pipeline.words.effects import (
     format_numbers,
     format_value,
     format_with_range,
+    is_clock,
     name_group,
     suggest_drive,
 )
@@ -183,8 +185,10 @@ def format_short(effect: Named) -> str:
 
     The name of an effect of one number with a unit says what it is: `yaw rate limit 1.01 rad/s`.
     """
-    if effect.by_run:
+    if is_clock(effect) and effect.by_run:
         return "one offset a run"
+    if effect.own:
+        return _format_by_ground(effect)
     if not effect.shown:
         return ""
     name, value = next(iter(effect.shown.items()))
@@ -193,6 +197,19 @@ def format_short(effect: Named) -> str:
     if about and (len(effect.parameters) > 1 or value.unit == "1"):
         text += f", {about}"
     return f"{text}; {len(effect.shown) - 1} more" if len(effect.shown) > 1 else text
+
+
+def _format_by_ground(effect: Named) -> str:
+    """The range over the runs of the first value that differs between them and is known."""
+    for name in filter(effect.own.__contains__, effect.parameters):
+        known = [one[name] for one in effect.by_run if not one[name].is_undetermined]
+        if known:
+            low, *_, high = sorted([known[0], *known], key=lambda one: one.value)
+            ends = dict.fromkeys(f"{round_digits(one.value, one.digits):.3g}" for one in (low, high))
+            about = describe_number(effect.id, name)
+            text = f"{' to '.join(ends)}{suffix_unit(low.unit)} by run"
+            return f"{text}, {about}" if about else f"{name} = {text}"
+    return "by run"
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:
@@ -227,7 +244,7 @@ def _list_all(run: RunDiagnosis, findings: Sequence[Row]) -> list[Row]:
     felt, small = _split_ambiguous(run)
     falls = _list_falls(run)
     short = [effect for effect in main if len(effect.shown) <= _MOST_IN_LINE]
-    width = max((len(_format_values(effect)) for effect in short), default=0)
+    width = max((len(_format_values(effect, _list_shared(effect))) for effect in short), default=0)
     effects = [text for effect in main for text in _format_effect(effect, run, falls, width)]
     effects += [text for item in felt for text in _format_ambiguous(item, falls)]
     others = [text for one in minor for text in _format_effect(one, run, falls)]
@@ -291,9 +308,16 @@ def _format_effect(
     notes = [f"= {', '.join(effect.equivalent_to)}"] if effect.equivalent_to else []
     notes += ["corrected before the fit"] if effect.corrected else []
     parts = [falls.get(effect.id, ""), f"({'; '.join(notes)})" if notes else ""]
-    yield from _describe_numbers(effect.id, effect.shown, parts, _format_values(effect), width)
+    shared = _list_shared(effect)
+    yield from _describe_numbers(effect.id, shared, parts, _format_values(effect, shared), width)
+    where: dict[str, list[str]] = {}
     for name, numbers in zip(run.joint, effect.by_run, strict=False):
-        yield f"{_INDENT}{format_numbers(numbers)} in {name}"
+        own = {key: value for key, value in numbers.items() if key in effect.own}
+        where.setdefault(format_numbers(own), []).append(name)
+    for text, names in where.items():
+        if text:
+            others = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            yield f"{_INDENT}{text} in {names[0]}{others}"
 
 
 def _describe_numbers(
@@ -441,8 +465,13 @@ def _format_budget(run: RunDiagnosis) -> str:
     return ""
 
 
-def _format_values(effect: Named) -> str:
-    return "a clock offset of each run:" if effect.by_run else _format_all(effect.shown)
+def _list_shared(effect: Named) -> dict[str, Value]:
+    """Its known values that all runs share."""
+    return {name: value for name, value in effect.shown.items() if name not in effect.own}
+
+
+def _format_values(effect: Named, shared: Mapping[str, Value]) -> str:
+    return "a clock offset of each run:" if is_clock(effect) and effect.by_run else _format_all(shared)
 
 
 def _format_all(numbers: Mapping[str, Value]) -> str:

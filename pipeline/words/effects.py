@@ -9,6 +9,7 @@ from pipeline.models import (
     AT_BOUND,
     UNDETERMINED,
     Effect,
+    Late,
     Level,
     Parameter,
     Reading,
@@ -50,8 +51,8 @@ def describe_motion(effect: Named, run: RunDiagnosis) -> str:
 
 
 def describe_clause(effect: Named, run: RunDiagnosis) -> str:
-    """What the vehicle does by an effect, as a clause of a sentence; empty where its vehicle is not known."""
-    if run.vehicle is None or effect.id not in _list_known():
+    """What the vehicle does by an effect, as a clause; empty where its vehicle is unknown, or runs differ."""
+    if run.vehicle is None or effect.own or effect.id not in _list_known():
         return ""
     return restore_known(effect.id, effect.parameters).describe_clause(run.vehicle, _list_beside(run))
 
@@ -82,7 +83,14 @@ def list_readings(effect: Named) -> tuple[Reading, ...]:
     if effect.corrected:
         # The delay comes from the gyro, so it is that of the pose clock and not of the body.
         known = tuple(one for one in known if one.name == effect.id)
-    return tuple(one for one in known if one.level is Level.RUN) if effect.by_run else known
+    level = Level.RUN if is_clock(effect) else Level.TERRAIN
+    return tuple(one for one in known if one.level is level) if effect.by_run else known
+
+
+def is_clock(effect: Named) -> bool:
+    """Whether it is a clock, of which each run has its own."""
+    kind = _list_known().get(effect.id)
+    return kind is not None and kind.late is Late.POSES
 
 
 def describe_cause(effect: Named) -> str:

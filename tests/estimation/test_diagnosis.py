@@ -325,7 +325,7 @@ def test_another_run_is_known_less_than_this_one_and_what_begins_in_this_one_not
         (find_effect("effective_track")(k=1.8), True),
         (find_effect("terrain_change")(k_v=0.8, k_w=0.7, at_s=60.0), False),
     ):
-        free = [Free(effect.id, one.name, None, one.bounds, 0.01) for one in effect.parameters]
+        free = [Free(effect.id, one.name, (), one.bounds, 0.01) for one in effect.parameters]
         items = [Estimate(one, 0.75, 0.15, 0.07, at_bound=False, observable=True) for one in free]
         values = list_values(effect, Estimates(tuple(items), np.eye(len(items)), 9))
         assert all(value.high == 0.9 for value in values.values())

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from motion_runs import simulate, vehicle_of
@@ -94,3 +96,26 @@ def test_a_limit_that_does_little_stays_a_limit_in_one_step(problem: Problem) ->
     assert state.move([number], [-30.0]).get(number) == pytest.approx(18.0 / (1.0 + 30.0 / 18.0))
     assert state.move([number], [1.0]).get(number) == pytest.approx(18.0 / (1.0 - 1.0 / 18.0))
     assert state.move([number], [60.0]).get(number) == number.bounds[1]
+
+
+def test_each_ground_has_its_own_numbers_and_the_vehicle_one() -> None:
+    truths = [
+        ("tile", {"wheel_asymmetry": 0.04, "speed_slip": 0.06}),
+        ("snow", {"wheel_asymmetry": 0.04, "speed_slip": 0.2}),
+        ("snow", {"wheel_asymmetry": 0.04, "speed_slip": 0.2}),
+    ]
+    runs = [
+        replace(simulate(truth, seed=seed, duration_s=60.0), terrain=terrain, name=f"{terrain} {seed}")
+        for seed, (terrain, truth) in enumerate(truths)
+    ]
+    model = Model(HUSKY, (find_effect("wheel_asymmetry")(), find_effect("speed_slip")()))
+    state = fit_model(Problem(runs, HUSKY, Input.MEASURED), model).state
+    numbers = [{one.id: next(iter(one.values.values())) for one in state.effects_of(run)} for run in range(3)]
+    for found, (_, truth) in zip(numbers, truths, strict=True):
+        assert found == pytest.approx(truth, abs=0.01)
+    assert numbers[1] == numbers[2]
+    assert numbers[0]["wheel_asymmetry"] == numbers[1]["wheel_asymmetry"]
+    # On one ground they share all.
+    alike = [replace(run, terrain="tile") for run in runs]
+    shared = fit_model(Problem(alike, HUSKY, Input.MEASURED), model).state
+    assert shared.effects_of(0) == shared.effects_of(1)
