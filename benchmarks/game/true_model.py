@@ -125,9 +125,10 @@ def _judge_late(problem: Problem, fitted: Model) -> Held:
     """A model on poses that stand where they were stamped, in sample."""
     state = fit_model(problem, fitted).state
     late = -problem.runs[0].alignment.heading_delay_s
-    part, comparison = problem.whole, problem.comparisons[0]
+    comparison = problem.comparisons[0]
     reach = comparison.find_horizon_errors(state.effects, state.timing[0], late)
-    errors = measure_errors(part.shift_clock(state, 0, late), reach.position, reach.yaw)
+    residuals = comparison.find_residuals(state.effects, state.timing[0], late)
+    errors = measure_errors(residuals, reach.position, reach.yaw)
     return Held(errors.t_mrmse_m, errors.r_mrmse_rad, *errors.velocity_rms)
 
 

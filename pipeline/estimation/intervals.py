@@ -249,8 +249,9 @@ def narrow_part(fit: PartFit) -> tuple[Floats, Floats]:
     last = np.array([item.half for item in estimate_part(fit).items])
     label, count = part.block[white.rows], int(part.block.max()) + 1
     normals = np.zeros((count, len(fit.free), len(fit.free)))
-    for block in range(count):
-        columns = white.columns[label == block]
+    # Steps, and so their blocks, are in order.
+    ends = np.searchsorted(label, np.arange(1, count))
+    for block, columns in enumerate(np.split(white.columns, ends)):
         normals[block] = columns.T @ columns
     known = np.cumsum(normals, axis=0)
     errors = np.array([np.sqrt(np.diag(invert(one))) for one in known])
