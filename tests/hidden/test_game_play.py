@@ -254,6 +254,13 @@ def test_single_effects_of_several_seeds_are_named_and_as_good_as_the_true_model
     assert write_tables(read_records([path]).values()) == write_tables(records)
 
 
+def test_a_late_localization_is_judged_beside_poses_as_they_were_stamped(tmp_path: Path) -> None:
+    record = play(Job("late", 1251000), tmp_path)
+    late = record.checked.without["clock_offset"]
+    assert record.checked.true is not None
+    assert late.t_m > record.checked.true.t_m
+
+
 @pytest.mark.parametrize("kind", ["noisy", pytest.param("plain", marks=pytest.mark.long)])
 def test_in_an_empty_log_nothing_is_named_and_nothing_flagged(kind: str, tmp_path: Path) -> None:
     assert is_clean(play(Job("empty", 4, kind), tmp_path))
