@@ -46,6 +46,8 @@ _SURE = 1.96
 _OTHER = 0.02
 # Share of what was put in by which a finding's number may be off.
 _MOVED = 0.2
+# The same where the unchanged recording has a number that is too unsure to be told.
+_UNTOLD = 0.4
 _VERDICTS = ("recovered", "reported", "one of", "edge", "undecided", "cannot", "number", "missed")
 Number = tuple[float, float]
 _UNCHANGED = Injection("nothing", lambda tables, _: tables)
@@ -246,8 +248,7 @@ def _is_news(finding: str, moved: float | None, before: Answer, after: Answer) -
         return False
     old, new = before.findings.get(finding), after.findings[finding]
     if moved is not None and new:
-        # What the unchanged recording does not show may be of any size there.
-        return abs(new - old - moved) < _MOVED * abs(moved) if old else new / moved > 1.0 - _MOVED
+        return abs(new - old - moved) < _MOVED * abs(moved) if old else new / moved > 1.0 - _UNTOLD
     return finding not in before.findings or bool(old and new and abs(math.log(abs(new / old))) > _OTHER)
 
 
