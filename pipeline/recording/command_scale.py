@@ -38,8 +38,8 @@ def measure_command_scale(
     vehicle: Vehicle,
     *,
     body_commanded: bool,
+    late: tuple[float, float],
     gain: float | None = None,
-    late: tuple[float, float] | None = None,
 ) -> tuple[Alignment, tuple[Finding, ...]]:
     """Compare commanded motion with that of the measured wheels.
 
@@ -48,9 +48,9 @@ def measure_command_scale(
         wheels: table `wheels`; may be empty.
         vehicle: as configured.
         body_commanded: whether the command was a body command, which the controller converts to wheel speeds.
+        late: lag and delay of the wheels [s].
         gain: motion of the poses over a body command; if it is nearer to one than to that of the wheels, the
             wheels have another radius, and the command is right.
-        late: lag and delay of the wheels [s], if they are known.
 
     Returns:
         The corrections of the command, neutral where nothing shows them, and findings on them.
@@ -151,7 +151,7 @@ _Rates = tuple[Floats, Floats]
 
 
 def _compare_rates(
-    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, late: tuple[float, float] | None
+    commands: pl.DataFrame, wheels: pl.DataFrame, vehicle: Vehicle, late: tuple[float, float]
 ) -> tuple[_Rates, _Rates]:
     """Commanded and measured rates over steps of a tenth of a second; empty where nothing can be compared.
 
@@ -162,11 +162,6 @@ def _compare_rates(
     nothing: Floats = np.zeros(0)
     if asked is None or motion is None or not asked.inputs:
         return (nothing, nothing), (nothing, nothing)
-    if late is None:
-        made = asked.explain(motion)
-        if made is None:
-            return (nothing, nothing), (nothing, nothing)
-        late = made.lag, made.delay
     motion = motion.take(np.logical_and.reduce([one.is_there(motion.steps) for one in asked.inputs]))
     elapsed = motion.steps.end - motion.steps.start
     ahead, turned = asked.columns(motion.steps, *late, crossed=False)
@@ -249,11 +244,11 @@ def measure_command(
         return None
     is_body = command.reading.form == "body"
     alignment = Alignment(track_multiplier=vehicle.controller_track_multiplier)
-    if case.is_known or not is_body:
+    if case.driven is not None and (case.is_known or not is_body):
         gain, made_of = None, command.reading.explained
         if is_body and made_of is not None and command.sign("ahead") > 0:
             gain = float(made_of.ahead.gains[0]) / case.command_factors()[0]
-        late = None if case.driven is None else (case.driven.lag, case.driven.delay)
+        late = (case.driven.lag, case.driven.delay)
         alignment, findings = measure_command_scale(
             asked, got, vehicle, body_commanded=is_body, gain=gain, late=late
         )

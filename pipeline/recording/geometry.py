@@ -101,7 +101,8 @@ def explain_wheels(command: Reading, wheels: Reading, delays: Floats = DELAYS_S)
     Returns:
         The fit; None if the wheels do not follow the command, or one of its sides counts backward.
     """
-    motion = roll_wheels(wheels) if len(wheels.inputs) >= len(SIDES) else None
+    is_whole = len(wheels.inputs) == len(SIDES) or (wheels.inputs and wheels.form != "sides")
+    motion = roll_wheels(wheels) if is_whole else None
     if motion is None:
         return None
     made = Reading(command.form, command.name, command.first, command.second).explain(motion, delays)
