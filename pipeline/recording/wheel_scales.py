@@ -34,11 +34,21 @@ class Turning:
         gains: per metre ahead and per radian of the heading, shape (2,) [rad/m, 1].
         t: their ratios to standard errors.
         follows: whether the motion explains it.
+        path: how far it turns in all [rad].
     """
 
     gains: Floats
     t: Floats
     follows: bool
+    path: float = np.nan
+
+
+def _is_of_paths(scale: float, one: float, other: float) -> bool:
+    """Whether two paths do not contradict a scale.
+
+    Noise of the poses attenuates how much a wheel turns with the motion, in one more than in another.
+    """
+    return not abs(np.log(scale * other / one)) > np.log(_AGREE)
 
 
 def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside: Sequence[Held]) -> Turning:
@@ -61,7 +71,8 @@ def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside
     columns = np.column_stack([part.body.real, part.yaw, part.body.imag])
     made = fit(turned, columns, part.steps)
     share = measure_share(turned, columns @ made.gains)
-    return Turning(made.gains[:2], made.t[:2], share > _FOLLOWS and abs(made.t[0]) > CLEAR)
+    path = float(np.abs(turned).sum())
+    return Turning(made.gains[:2], made.t[:2], share > _FOLLOWS and abs(made.t[0]) > CLEAR, path)
 
 
 def find_odd_joints(
@@ -81,13 +92,17 @@ def find_odd_joints(
     # Two wheels that differ do not tell which one is right.
     if len(fine) < 3:  # noqa: PLR2004
         return {}, []
-    usual = float(np.median([one.gains[0] for one in fine]))
+    usual, path = (
+        float(np.median(some)) for some in ([one.gains[0] for one in fine], [one.path for one in fine])
+    )
     factors, idle = {}, []
     for name, one in joints.items():
         ratio = float(one.gains[0]) / usual if usual else 0.0
         others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
-        if one.follows and (ratio < 0.0 or abs(np.log(ratio)) > np.log(_SAME)):
-            size = snap(abs(ratio)) if abs(np.log(abs(ratio))) > np.log(_SAME) else 1.0
+        is_scaled = ratio != 0.0 and abs(np.log(abs(ratio))) > np.log(_SAME)
+        is_scaled = is_scaled and _is_of_paths(abs(ratio), one.path, path)
+        if one.follows and (ratio < 0.0 or is_scaled):
+            size = snap(abs(ratio)) if is_scaled else 1.0
             factors[name] = float(np.sign(ratio)) / size
         elif not one.follows and abs(ratio) < _IDLE and any(other.follows for other in others):
             idle.append(name)
@@ -103,6 +118,8 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     # Laps of one radius do not tell what drives from what turns.
     error = np.hypot(1.0 / left.t[0], 1.0 / right.t[0])
     if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME) + CLEAR * error:
+        return None
+    if not _is_of_paths(of_speed, left.path, right.path):
         return None
     turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
     # A body that turns by something else than its wheels shows two scales.

@@ -380,3 +380,14 @@ def test_laps_of_one_radius_tell_no_scale_of_a_side(t: float, scale: float | Non
     """What drives and what turns are one there, and neither is known."""
     left, right = (Turning(np.array([gain, 1.0]), np.array([t, 0.5]), follows=True) for gain in (5.0, 10.0))
     assert compare_sides(left, right) == scale
+
+
+@pytest.mark.parametrize(("path", "scale"), [(50.0, 0.5), (97.0, None)])
+def test_wheels_that_turn_as_far_are_on_one_scale(path: float, scale: float | None) -> None:
+    """Noise of the poses may attenuate what one wheel turns with the motion."""
+    gains = np.array([1.3, -1.3]), np.array([2.6, 2.6])
+    left, right = (
+        Turning(each, np.array([30.0, 20.0]), follows=True, path=far)
+        for each, far in zip(gains, (path, 100.0), strict=True)
+    )
+    assert compare_sides(left, right) == scale
