@@ -255,8 +255,10 @@ def _format_log(seen: Inspection) -> list[str]:
         for role in _ROLES:
             source = getattr(seen.sources, role)
             if source or role != "power":
-                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else 'none'}")
-        lines += [f"          {note}" for note in seen.sources.notes if not note.startswith("pose")]
+                none = "none: the whole log counts" if role == "interval" else "none"
+                lines.append(f"{role:<10}{f'{source}    {source.reason}' if source else none}")
+        notes = [note for note in seen.sources.notes if not note.startswith("pose")]
+        lines += [f"{'' if index else 'choice':<10}{note}" for index, note in enumerate(notes)]
     if seen.choice is not None:
         lines += _format_ratings(seen.choice.ratings)
         lines += _format_evidence(seen.choice.recording)

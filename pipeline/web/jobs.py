@@ -371,9 +371,11 @@ class Jobs:
         return job
 
     def _add(self, job: Job) -> None:
+        """Take a job; it replaces what failed before under its name, so that notices do not pile up."""
         self._jobs[job.id] = job
         for old in tuple(self._jobs.values()):
-            if len(self._jobs) > _MOST_JOBS and old.done:
+            replaced = old is not job and old.done and old.error is not None and old.name == job.name
+            if replaced or (len(self._jobs) > _MOST_JOBS and old.done):
                 self._forget(old)
 
     def _forget(self, job: Job) -> None:

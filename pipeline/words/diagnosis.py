@@ -150,9 +150,10 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     main, minor, _ = _split_effects(run)
     felt, small = _split_ambiguous(run)
     undecided = {item.in_model for item in felt}
-    shown = [effect for effect in main if effect.id not in undecided]
-    folded = len(shown[_EFFECTS_SHOWN:]) + len(minor) + len(small)
     falls = list_largest_falls(run)
+    shown = [one for one in main if one.id not in undecided and falls.get(one.id) != _UNCHANGED]
+    unseen = [one for one in main if falls.get(one.id) == _UNCHANGED and one.id not in undecided]
+    folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor) + len(small)
     rows = [
         (name_term(effect.id), falls.get(effect.id, ""), format_short(effect))
         for effect in shown[:_EFFECTS_SHOWN]

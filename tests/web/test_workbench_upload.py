@@ -71,6 +71,13 @@ def test_a_dropped_log_becomes_a_run(empty: Workbench, hidden_log: Path) -> None
     assert run["report"]
 
 
+def test_what_failed_twice_under_one_name_is_one_notice(empty: Workbench) -> None:
+    for _ in range(2):
+        assert empty.request("POST", "/api/upload?name=notes.mcap", b"no log\n")[0] == 200
+        (job,) = empty.wait_for_jobs()
+        assert "not an MCAP file" in str(job["error"])
+
+
 def test_too_large_a_log_is_refused_before_it_comes(empty: Workbench) -> None:
     status, _, body = empty.request(
         "POST", "/api/upload?name=x.mcap", b"", headers={"Content-Length": "99000000"}
