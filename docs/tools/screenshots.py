@@ -134,7 +134,7 @@ def analyze_logs(results: Path, work: Path, logs: Path | None) -> list[Path]:
     """Bring the samples, a run with its wheels in the air, and recordings into results; their reports."""
     lifted = work / f"{LIFTED}.mcap"
     run_slip("simulate", "--effect", "wheel_radius=0", "--duration", 60, "--file", lifted)
-    paths = [ROOT / "data_samples" / f"{name}.mcap" for name in SAMPLES]
+    paths = [ROOT / "data_samples" / f"{name}.mcap" for name in (*SAMPLES, "mystery_3")]
     paths += [logs / f"{name}.mcap" for name in RECORDINGS if logs and (logs / f"{name}.mcap").is_file()]
     # Each its own call: of several logs the diagnosis is joint.
     run_slip("analyze", lifted, "--vehicle", "husky_a200", "--results", results, "--quiet")

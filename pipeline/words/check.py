@@ -62,7 +62,9 @@ def format_verdict(check: Check) -> str:
     elif named:
         listed = enumerate_texts([_format_change(check, name) for name in named[:_MOST_NAMED]])
         others = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-        sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
+        opening = "Likely changed" if _is_one_a_side(check) else "Changed"
+        effect = f"{_format_unchanged(check, named)}{_format_moves(check)}"
+        sentences.append(f"{opening}: {listed}{others}{effect}")
     rest = "and no effect of the model explains it: run slip diagnose on AFTER"
     sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
     if changed and _is_one_a_side(check):
