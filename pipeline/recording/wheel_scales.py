@@ -34,21 +34,21 @@ class Turning:
         gains: per metre ahead and per radian of the heading, shape (2,) [rad/m, 1].
         t: their ratios to standard errors.
         follows: whether the motion explains it.
-        path: how far it turns in all [rad].
+        path: how far it turns over how far the motion says.
     """
 
     gains: Floats
     t: Floats
     follows: bool
-    path: float = np.nan
+    path: float = 1.0
 
 
-def _is_of_paths(scale: float, one: float, other: float) -> bool:
-    """Whether two paths do not contradict a scale.
+def _is_alike(one: float, other: float) -> bool:
+    """Whether the motion explains as much of the path of two wheels.
 
     Noise of the poses attenuates how much a wheel turns with the motion, in one more than in another.
     """
-    return not abs(np.log(scale * other / one)) > np.log(_AGREE)
+    return bool(abs(np.log(one / other)) < np.log(_AGREE))
 
 
 def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside: Sequence[Held]) -> Turning:
@@ -71,7 +71,7 @@ def measure_wheel(wheel: Held, motion: Motion, late: tuple[float, float], beside
     columns = np.column_stack([part.body.real, part.yaw, part.body.imag])
     made = fit(turned, columns, part.steps)
     share = measure_share(turned, columns @ made.gains)
-    path = float(np.abs(turned).sum())
+    path = float(np.abs(turned).sum() / max(np.abs(columns @ made.gains).sum(), 1e-9))
     return Turning(made.gains[:2], made.t[:2], share > _FOLLOWS and abs(made.t[0]) > CLEAR, path)
 
 
@@ -100,7 +100,7 @@ def find_odd_joints(
         ratio = float(one.gains[0]) / usual if usual else 0.0
         others = [other for key, other in joints.items() if key != name and sides[key] == sides[name]]
         is_scaled = ratio != 0.0 and abs(np.log(abs(ratio))) > np.log(_SAME)
-        is_scaled = is_scaled and _is_of_paths(abs(ratio), one.path, path)
+        is_scaled = is_scaled and _is_alike(one.path, path)
         if one.follows and (ratio < 0.0 or is_scaled):
             size = snap(abs(ratio)) if is_scaled else 1.0
             factors[name] = float(np.sign(ratio)) / size
@@ -119,7 +119,7 @@ def compare_sides(left: Turning, right: Turning) -> float | None:
     error = np.hypot(1.0 / left.t[0], 1.0 / right.t[0])
     if of_speed <= 0.0 or abs(np.log(of_speed)) < np.log(_SAME) + CLEAR * error:
         return None
-    if not _is_of_paths(of_speed, left.path, right.path):
+    if not _is_alike(left.path, right.path):
         return None
     turns = min(abs(left.t[1]), abs(right.t[1])) > CLEAR
     # A body that turns by something else than its wheels shows two scales.
