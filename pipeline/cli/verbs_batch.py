@@ -322,7 +322,7 @@ def schedule(  # noqa: D417 - arguments document themselves
     except CycloptsError as error:
         why = str(error).strip().partition(". ")[0].rstrip(".")
         what = f"slip batch does not take what would be run every night: {why}"
-        raise SlipError("usage", what, hint="See slip batch schedule --help") from error
+        raise SlipError("usage", what, hint="It takes the folders and options of `slip batch`.") from error
     folder = Path.cwd()
     nightly = Nightly(
         program=slip_command(),

@@ -31,7 +31,7 @@ _loops: list[_Loop] = []
 
 
 class _Loop:
-    """A loop that takes the place of its name in its file by its machine code when it is called."""
+    """A loop that is compiled when it is first called; those that it calls are so in its file."""
 
     def __init__(self, function: Callable[..., Any], signature: str | None) -> None:
         functools.update_wrapper(self, function)
@@ -47,8 +47,8 @@ class _Loop:
         if find_spec("numba") is None:
             return function
         for name in function.__code__.co_names:
-            if isinstance(names.get(name), _Loop):
-                names[name] = names[name].made
+            if isinstance(loop := names.get(name), _Loop):
+                names[name] = loop.made
         compile_it = functools.partial(importlib.import_module("numba").njit, *filter(None, [self.signature]))
         try:
             return compile_it(cache=True, **_HOW)(function)

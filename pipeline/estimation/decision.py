@@ -8,7 +8,7 @@ by anything after it. Models are compared by their likelihood less `PRICE` for e
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import combinations
 from typing import TYPE_CHECKING
 
@@ -269,7 +269,8 @@ class Search:
         """The fit from a state; made once."""
         key = _make_key(state)
         if key not in self._fits:
-            self._fits[key] = fit_part(self.part, state, noise=noise)
+            fit = fit_part(self.part, state, noise=noise)
+            self._fits[key] = replace(fit, state=fit.state.centred)
         return self._fits[key]
 
     def _drop(self, fit: PartFit, names: Collection[str]) -> PartFit:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 
@@ -237,6 +237,7 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
                 "unit": parameter.unit,
                 "fitted": False,
             }
+    own: dict[str, list[tuple[int, dict[str, object]]]] = {}
     for item in estimates.items:
         if not item.free.effect:
             continue
@@ -248,13 +249,13 @@ def parameters_as_json(model: Model, estimates: Estimates) -> dict[str, dict[str
             "at_bound": item.at_bound,
             "observable": item.observable,
         }
-        if not item.free.runs:
-            entries[label] = entry
+        if item.free.runs:
+            own.setdefault(label, []).extend((run, entry) for run in item.free.runs)
         else:
-            entries.setdefault(label, {"unit": entry["unit"], "fitted": True}).setdefault("runs", [])
-            runs = entries[label]["runs"]
-            if isinstance(runs, list):
-                runs += [{"run": run, **entry} for run in item.free.runs]
+            entries[label] = entry
+    for label, rows in own.items():
+        ordered = sorted(rows, key=lambda one: one[0])
+        entries[label] |= {"fitted": True, "runs": [{"run": run, **entry} for run, entry in ordered]}
     return entries
 
 
@@ -264,10 +265,9 @@ def list_parameters(file: ModelFile) -> dict[str, dict[str, object]]:
     for label, (low, high) in file.intervals.items():
         parameters[label] |= {"low": _round(low), "high": _round(high)}
     parameters |= {label: parameters[label] | {"doubt": text} for label, text in file.list_doubts().items()}
-    for label in file.per_run:
-        rows = [row for row in file.own_numbers if row.get("parameter") == label]
-        if rows and label in parameters:
-            parameters[label]["runs"] = rows
+    for row in file.own_numbers:
+        if (label := str(row.get("parameter"))) in parameters:
+            cast("list[object]", parameters[label].setdefault("runs", [])).append(row)
     return parameters
 
 

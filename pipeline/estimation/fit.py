@@ -242,7 +242,11 @@ def approach(base: PartFit, start: State) -> PartFit:
     residual = part.find_residuals(start)
     columns = part.differentiate(start, residual, free)
     fit = PartFit(part, start, free, residual, columns, part.learn(residual, base.noise))
-    return _descend(fit, _FEW_STEPS) if free else fit
+    fit = _descend(fit, _FEW_STEPS) if free else fit
+    for number in free:
+        if not number.is_smooth:
+            fit = _walk_grid(fit, number, exact=False)
+    return fit
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
@@ -287,7 +291,7 @@ def _descend(fit: PartFit, most: int = _MOST_STEPS, *, exact: bool = False) -> P
             damping, fallen = _LOOSEST, 0.0
         elif not is_stale:
             break
-    if is_stale and most == _MOST_STEPS:
+    if gained > near and most == _MOST_STEPS:
         fit = replace(fit, columns=part.differentiate(fit.state, fit.residual, free, both_sides=exact))
     return fit
 

@@ -304,8 +304,9 @@ def note_fit(file: ModelFile, judgement: Judgement) -> ModelFile:
             "parameter": item.free.label,
             **pick(item, "value", *(("low", "high") if math.isfinite(item.low) else ())),
         }
+        for run in range(len(problem.names))
         for item in estimates.items
-        for run in (item.free.runs if item.free.effect else ())
+        if item.free.effect and run in item.free.runs
     ]
     if own:
         fit["own"] = own

@@ -36,8 +36,9 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _MOST_ROUNDS = 0.005, 30
-"""Difference of chi-square at which the likelihood of both numbers has converged, and rounds until then."""
+_SAME, _SAME_EXACT, _MOST_ROUNDS = 0.005, 1e-6, 30
+"""Differences of chi-square at which the likelihood of both numbers, and the numbers, have converged, and
+rounds until then."""
 _FAR, _CLOSER = 2.0, 0.3
 """Longest step along an axis, in radii of the points around, and factor of the radius after a step within."""
 _LEAST_KEPT = 1e-6
@@ -45,7 +46,7 @@ _LEAST_KEPT = 1e-6
 _LOGS = 16
 """Variances whose product is taken before its logarithm."""
 _SCALE_ROUNDS = 30
-_SAME_SCALE = 1e-4
+_SAME_SCALE = 1e-6
 """Relative change of a scale at which it has converged."""
 _MEAN_SIZE = 1.2533
 """Ratio of the standard deviation of a normal distribution to its mean absolute value."""
@@ -231,12 +232,15 @@ def _maximize(
     starts, radius = np.array([(1.22, 0.35), (0.79, 1.02)]), 0.3
     if known is not None and not exact:
         starts, radius = np.arcsin(np.sqrt(np.minimum([(known[0] / most, known[1])], 1.0))), 0.06
-    best = min((_descend(rate, start, radius) for start in starts), key=lambda one: one[0])
+    same = _SAME_EXACT if exact else _SAME
+    best = min((_descend(rate, start, radius, same) for start in starts), key=lambda one: one[0])
     phi, part = read(best[1][None])
     return float(phi[0]), float(part[0])
 
 
-def _descend(rate: Callable[[Floats], Floats], center: Floats, radius: float) -> tuple[float, Floats]:
+def _descend(
+    rate: Callable[[Floats], Floats], center: Floats, radius: float, same: float
+) -> tuple[float, Floats]:
     """Least cost and where, by quadratics through the costs of a point and of seven around it."""
     least, where = math.inf, np.array(center)
     for _ in range(_MOST_ROUNDS):
@@ -253,7 +257,7 @@ def _descend(rate: Callable[[Floats], Floats], center: Floats, radius: float) ->
         away = np.where(curvature > 0.0, np.abs(along) / np.maximum(curvature, 1e-12), _FAR)
         step = axes @ -np.copysign(np.minimum(away, _FAR), along)
         terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
-        if max(least - float(terms[0]), float(np.abs(costs - terms[1:]).max())) < _SAME:
+        if max(least - float(terms[0]), float(np.abs(costs - terms[1:]).max())) < same:
             break
         center = np.asarray(center + radius * step) if is_lower else where
         radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER

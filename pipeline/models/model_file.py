@@ -101,7 +101,8 @@ class ModelFile:
             return ""
         if stands_at_bound(value, parameter.bounds):
             return "at its bound: a limit of the search, not a measurement"
-        own = label in self.per_run or effect.id in self.per_run
+        alone = {*self.per_run, *(row.get("parameter") for row in self.list_fitted("own"))}
+        own = label in alone or effect.id in alone
         if self.list_fitted("runs") and label not in self.intervals and not own:
             return "undetermined: the runs of the fit leave it open"
         if parameter.is_one_sided(*self.intervals.get(label, (math.nan, math.nan))):

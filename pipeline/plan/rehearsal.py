@@ -406,8 +406,8 @@ def _assume(effects: tuple[Effect, ...], prior: Mapping[str, tuple[float, float]
 
 
 def _inform(fitted: Fitted) -> Hypothesis:
-    """Hypothesis of a fitted model; the clocks of its runs are marginalized."""
-    effects = fitted.state.effects
+    """Hypothesis of a fitted model on the ground of the first run; what others have is marginalized."""
+    effects = fitted.state.effects_of(0)
     free = tuple(number for number in start_state(effects).list_free(()) if number.is_smooth)
     index_of = {number.label: index for index, number in enumerate(free)}
     total = np.diag(_expect(effects, free, fitted.problem.parts[0].prior.numbers))
@@ -415,12 +415,14 @@ def _inform(fitted: Fitted) -> Hypothesis:
         columns = fit.white.columns[:, fit.smooth]
         normal = columns.T @ columns / fit.overdispersion
         numbers = [fit.free[index] for index in fit.smooth]
-        mine = [index for index, number in enumerate(numbers) if number.effect and not number.runs]
-        clocks = [index for index in range(len(numbers)) if index not in mine]
+        is_clock = [not number.effect or number.effect in fit.part.clocks for number in numbers]
+        mine = [index for index, number in enumerate(numbers) if not is_clock[index] and number.acts_in(0)]
+        others = [index for index in range(len(numbers)) if index not in mine]
         known = normal[np.ix_(mine, mine)]
-        if clocks:
-            cross, own = normal[np.ix_(mine, clocks)], normal[np.ix_(clocks, clocks)]
-            known = known - cross @ np.linalg.solve(own + np.eye(len(clocks)) / CLOCK_S**2, cross.T)
+        if others:
+            cross, own = normal[np.ix_(mine, others)], normal[np.ix_(others, others)]
+            spread = [CLOCK_S if is_clock[index] else numbers[index].step for index in others]
+            known = known - cross @ np.linalg.solve(own + np.diag(np.array(spread) ** -2.0), cross.T)
         at = [index_of[numbers[index].label] for index in mine]
         total[np.ix_(at, at)] += known
     return Hypothesis(effects, free, total)

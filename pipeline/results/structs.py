@@ -145,7 +145,8 @@ class Named(msgspec.Struct, frozen=True, rename={"path": "found_on"}):
     @property
     def is_determined(self) -> bool:
         """Whether the runs determine one of its numbers; a corrected clock was measured beforehand."""
-        return self.corrected or bool(self.by_run) or not self.parameters or bool(self.shown)
+        known = any(split_determined(one)[0] for one in (self.parameters, *self.by_run))
+        return self.corrected or not self.parameters or known
 
     @property
     def own(self) -> set[str]:

@@ -45,7 +45,6 @@ from pipeline.words.effects import (
     describe_number,
     describe_separation,
     format_numbers,
-    format_value,
     format_with_range,
     is_clock,
     name_group,
@@ -146,7 +145,7 @@ def list_lines(
 
 
 def _list_main(run: RunDiagnosis) -> list[str]:
-    """A line for each of the main effects: its term, the error that it lowers most, and its value."""
+    """A line for each of the main effects: its term, the error that it lowers most, its id and value."""
     main, minor, _ = _split_effects(run)
     felt, small = _split_ambiguous(run)
     undecided = {item.in_model for item in felt}
@@ -155,7 +154,7 @@ def _list_main(run: RunDiagnosis) -> list[str]:
     unseen = [one for one in main if falls.get(one.id) == _UNCHANGED and one.id not in undecided]
     folded = len(shown[_EFFECTS_SHOWN:]) + len(unseen) + len(minor) + len(small)
     rows = [
-        (name_term(effect.id), falls.get(effect.id, ""), format_short(effect))
+        (name_term(effect.id), falls.get(effect.id, ""), f"{effect.id}: {format_short(effect)}")
         for effect in shown[:_EFFECTS_SHOWN]
     ]
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -184,7 +183,7 @@ def list_largest_falls(run: RunDiagnosis) -> dict[str, str]:
 def format_short(effect: Named) -> str:
     """The first value of an effect with what it is, and how many more it has.
 
-    The name of an effect of one number with a unit says what it is: `yaw rate limit 1.01 rad/s`.
+    The name of an effect of one number with a unit says what it is: `yaw rate limit: limit = 1.01 rad/s`.
     """
     if is_clock(effect) and effect.by_run:
         return "one offset a run"
@@ -194,23 +193,24 @@ def format_short(effect: Named) -> str:
         return ""
     name, value = next(iter(effect.shown.items()))
     about = describe_number(effect.id, name)
-    text = format_value(value) if about else format_numbers({name: value})
+    text = format_numbers({name: value})
     if about and (len(effect.parameters) > 1 or value.unit == "1"):
         text += f", {about}"
     return f"{text}; {len(effect.shown) - 1} more" if len(effect.shown) > 1 else text
 
 
 def _format_by_ground(effect: Named) -> str:
-    """The range over the runs of the first value that differs between them and is known."""
+    """The range over the terrains of the first value that differs between them and is known."""
     for name in filter(effect.own.__contains__, effect.parameters):
         known = [one[name] for one in effect.by_run if not one[name].is_undetermined]
         if known:
             low, *_, high = sorted([known[0], *known], key=lambda one: one.value)
             ends = dict.fromkeys(f"{round_digits(one.value, one.digits):.3g}" for one in (low, high))
             about = describe_number(effect.id, name)
-            text = f"{' to '.join(ends)}{suffix_unit(low.unit)} by run"
-            return f"{text}, {about}" if about else f"{name} = {text}"
-    return "by run"
+            elsewhere = " where it is known" if len(known) < len(effect.by_run) else ""
+            text = f"{name} = {' to '.join(ends)}{suffix_unit(low.unit)} by terrain{elsewhere}"
+            return f"{text}, {about}" if about else text
+    return "open on every terrain"
 
 
 def _format_largest_fall(before: Step, after: Step) -> str:
@@ -290,9 +290,15 @@ def _format_unknown(run: RunDiagnosis) -> str:
     texts = [
         f"{effect.id} {', '.join(unknown)}"
         for effect in run.effects
-        if not (effect.corrected or effect.by_run) and (unknown := split_determined(effect.parameters)[1])
+        if not effect.corrected and (unknown := _list_unknown(effect))
     ]
     return f"not determined by this log: {'; '.join(texts)}" if texts else ""
+
+
+def _list_unknown(effect: Named) -> list[str]:
+    """Names of its values that no run determines."""
+    known = {name for one in (effect.parameters, *effect.by_run) for name in split_determined(one)[0]}
+    return [name for name in effect.parameters if name not in known]
 
 
 def _split_ambiguous(run: RunDiagnosis) -> tuple[list[Undecided], list[Undecided]]:

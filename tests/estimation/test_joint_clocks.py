@@ -94,12 +94,12 @@ def test_the_clock_of_each_run_is_told_and_no_effect_stands_for_it(
     file = read_model(path)
     assert file.per_run == ("clock_offset.d",)
     judged = judge_model(Problem(runs, vehicle, Input.COMMAND), file.model, per_run=file.per_run)
-    own = {item.free.run: item for item in judged.estimates.items if item.free.effect == "clock_offset"}
+    own = {item.free.runs: item for item in judged.estimates.items if item.free.effect == "clock_offset"}
     for number, run in enumerate(diagnosis.runs):
         (told_d,) = next(e.parameters.values() for e in run.effects if e.id == "clock_offset")
         (written,) = (e.values["d"] for e in file.find_effects(run.run) if e.id == "clock_offset")
         assert written == pytest.approx(told_d.value, abs=1e-5)
-        assert own[number].value == pytest.approx(told_d.value, abs=2e-4)
+        assert own[number,].value == pytest.approx(told_d.value, abs=2e-4)
     for item in carry_over(file.model, runs, Input.COMMAND, per_run=file.per_run):
         assert item.ratio < 1.05
 

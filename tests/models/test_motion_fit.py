@@ -85,7 +85,7 @@ def test_runs_share_a_parameter_or_have_their_own() -> None:
     fitted = fit_model(problem, model_of("effective_track", "icr_offset"), per_run=["effective_track.k"])
     estimates = estimate_intervals(fitted)
     own = [item for item in estimates.items if item.free.label == "effective_track.k"]
-    assert [item.free.run for item in own] == [0, 1]
+    assert [item.free.runs for item in own] == [(0,), (1,)]
     assert [item.value for item in own] == pytest.approx([1.5, 1.9], abs=0.03)
     assert estimates.find("icr_offset.x_icr").value == pytest.approx(0.1, abs=0.01)
     held_out = hold_out(problem, fitted)

@@ -50,12 +50,12 @@ def test_a_screen_has_a_line_an_effect_and_three_findings() -> None:
 @pytest.mark.parametrize(
     ("name", "units", "text"),
     [
-        ("effective_track", {"k": "1"}, "2.00 [1.90, 2.10], effective over nominal track"),
-        ("body_turn_limit", {"limit": "rad/s"}, "2.00 rad/s [1.90, 2.10]"),
+        ("effective_track", {"k": "1"}, "k = 2.00 [1.90, 2.10], effective over nominal track"),
+        ("body_turn_limit", {"limit": "rad/s"}, "limit = 2.00 rad/s [1.90, 2.10]"),
         (
             "turn_lag",
             {"tau_mean": "s", "tau_diff": "s"},
-            "2.00 s [1.90, 2.10], time constant of the mean; 1 more",
+            "tau_mean = 2.00 s [1.90, 2.10], time constant of the mean; 1 more",
         ),
         ("my_term", {"k_1": "s/m"}, "k_1 = 2.00 s/m [1.90, 2.10]"),
     ],
