@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _ENOUGH = 0.05
 """Fall of chi-square below which a step is not worth taking."""
-_SETTLED = 1e-7
+_SETTLED = 1e-8
 """The same for a model that is written: it ends at the same values from every start."""
 _NEWS = 1.0
 """Fall above which derivatives, and the noise, are computed anew."""

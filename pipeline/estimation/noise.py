@@ -36,7 +36,7 @@ _JUMP = 100.0
 """Residual [rough standard deviations] to which a larger one, as of a pose that jumps, is held."""
 _LEAST = 1e-9
 """Spread [m, rad] below which residuals are rounding."""
-_SAME, _SAME_EXACT, _MOST_ROUNDS = 0.005, 1e-6, 30
+_SAME, _SAME_EXACT, _MOST_ROUNDS = 0.005, 1e-8, 30
 """Differences of chi-square at which the likelihood of both numbers, and the numbers, have converged, and
 rounds until then."""
 _FAR, _CLOSER = 2.0, 0.3
@@ -258,7 +258,8 @@ def _descend(
         step = axes @ -np.copysign(np.minimum(away, _FAR), along)
         terms = _list_terms(np.vstack((step, _AROUND))) @ (level, *slope, xx, xy, yy)
         if max(least - float(terms[0]), float(np.abs(costs - terms[1:]).max())) < same:
-            break
+            # Not the best of eight points: which one that is depends on rounding.
+            return least, np.asarray(center + radius * step)
         center = np.asarray(center + radius * step) if is_lower else where
         radius *= 1.0 if is_lower and math.hypot(*step) >= 1.0 else _CLOSER
     return least, where
