@@ -214,20 +214,33 @@ def fit_part(
         per_run: labels with one value per run.
         exact: whether numbers must converge, not only the likelihood.
     """
+    fit = _begin(part, start, noise, per_run, exact=exact)
+    if not fit.free:
+        return fit
+    fit = _descend(fit, exact=exact)
+    for _ in range(_MOST_WALKS if len(fit.smooth) < len(fit.free) else 0):
+        before = fit.score
+        fit = _walk_grids(fit, exact=exact)
+        if before - fit.score < _ENOUGH:
+            break
+    return fit
+
+
+def _begin(
+    part: Part, start: State, noise: Noise | None, per_run: Sequence[str] = (), *, exact: bool = False
+) -> PartFit:
+    """A fit before its first step; see `fit_part`."""
     free = part.list_free(start, per_run)
     residual = part.find_residuals(start)
     columns = part.differentiate(start, residual, free, both_sides=exact)
-    fit = PartFit(part, start, free, residual, columns, part.learn(residual, noise, exact=exact))
-    if not free:
-        return fit
-    fit = _descend(fit, exact=exact)
-    for _ in range(_MOST_WALKS if len(fit.smooth) < len(free) else 0):
-        before = fit.score
-        for number in free:
-            if not number.is_smooth:
-                fit = _walk_grid(fit, number, exact=exact)
-        if before - fit.score < _ENOUGH:
-            break
+    return PartFit(part, start, free, residual, columns, part.learn(residual, noise, exact=exact))
+
+
+def _walk_grids(fit: PartFit, *, exact: bool = False) -> PartFit:
+    """Search each number without derivatives once; see `_walk_grid`."""
+    for number in fit.free:
+        if not number.is_smooth:
+            fit = _walk_grid(fit, number, exact=exact)
     return fit
 
 
@@ -238,15 +251,8 @@ def approach(base: PartFit, start: State) -> PartFit:
         base: the fitted model.
         start: the extension, at a start of its new numbers.
     """
-    part, free = base.part, base.part.list_free(start)
-    residual = part.find_residuals(start)
-    columns = part.differentiate(start, residual, free)
-    fit = PartFit(part, start, free, residual, columns, part.learn(residual, base.noise))
-    fit = _descend(fit, _FEW_STEPS) if free else fit
-    for number in free:
-        if not number.is_smooth:
-            fit = _walk_grid(fit, number, exact=False)
-    return fit
+    fit = _begin(base.part, start, base.noise)
+    return _walk_grids(_descend(fit, _FEW_STEPS)) if fit.free else fit
 
 
 def measure_cost(part: Part, noise: Noise, state: State, free: Sequence[Free], residual: Floats) -> float:
