@@ -23,9 +23,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "fixtures"))
 from motion_runs import make_scenario, tables_of, vehicle_of
 
 from pipeline.core import SlipError
-from pipeline.datasets.confidence import Interval
 from pipeline.datasets.forecast import RUNS_SHARE, decide_level, fit_fleet, forecast_vehicle
 from pipeline.datasets.levels import draw_run, split_levels
+from pipeline.datasets.rank_tests import Interval
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.simulate import find_vehicle, simulate_run
 
@@ -192,7 +192,7 @@ class Score:
             for number in forecast_vehicle(others, vehicle, terrain, "measured").numbers:
                 secret = fleet.secrets[vehicle].get((number.effect, number.parameter))
                 if secret is not None:
-                    self._hold("another run", Interval(*number.ends, 0.95), secret.runs[name])
+                    self._hold("another run", Interval(*number.ends), secret.runs[name])
 
     def _hold(self, what: str, interval: Interval | None, truth: float) -> None:
         if interval is not None:

@@ -48,7 +48,6 @@ if TYPE_CHECKING:
         FOLDS,
         JSON_DIGITS,
         NORMAL_95,
-        TIMES_PER_BLOCK,
         finite_or_none,
         pick,
         pick_finite,

@@ -19,11 +19,6 @@ FOLDS = 5
 """Number of folds of a cross-validation: each is fitted to four fifths of the run."""
 
 
-TIMES_PER_BLOCK = 5.0
-"""Length of a block in integrated autocorrelation times: ten time constants of an exponential correlation, so
-that the correlation of neighbouring blocks is small."""
-
-
 JSON_DIGITS = 6
 """Significant digits of estimates in JSON, more than any estimate has."""
 

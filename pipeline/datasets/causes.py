@@ -27,9 +27,10 @@ from pipeline.datasets.compared_runs import (
     keep_runs,
     note_untested,
 )
-from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, RUNS
+from pipeline.datasets.pairs import ABOUT_BLOCKS, BLOCKS, NO_SPREAD, RUNS
+from pipeline.datasets.pooled_tests import compare_means, pool_spread
 from pipeline.datasets.prediction import fit_results
-from pipeline.datasets.rank_tests import LEVEL, adjust_holm, bound_permuted, permute_means, runs_needed
+from pipeline.datasets.rank_tests import adjust_holm
 from pipeline.estimation.apportion import jackknife_ratio
 from pipeline.models import list_effects, name_effect
 from pipeline.results import CAUSE_NAMES
@@ -250,28 +251,30 @@ def _scale(a: _Group, b: _Group) -> float:
 def _compare(a: _Group, b: _Group) -> Difference:
     total, scale = math.sqrt(b.mean_square) - math.sqrt(a.mean_square), _scale(a, b)
     single = a.table.shape[0] == b.table.shape[0] == 1
-    differences, smallest = [], 0.0
-    for cause, difference in _subtract(a, b).items():
+    squares = _subtract(a, b)
+    tests: list[tuple[float, float, float]] = []
+    for cause, difference in squares.items():
         (first, half_first), (second, half_second) = a.take(cause), b.take(cause)
+        low = high = p = math.nan
         if single:
-            half, p = float(np.hypot(half_first[0], half_second[0])), math.nan
-            ends = (difference - half, difference + half)
-        else:
-            test = permute_means(first, second)
-            ends = bound_permuted(first, second) or (math.nan, math.nan)
-            p, smallest = test.p, test.smallest_p
-        differences.append((cause, difference, ends, p))
-    adjusted = [math.nan] * len(differences) if single else adjust_holm([p for *_, p in differences]).tolist()
-    parts = []
-    for ((name, kind), difference, (low, high), p), q in zip(differences, adjusted, strict=True):
-        parts.append(CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q))
-    parts.sort(key=lambda part: -abs(part.difference))
-    note = ABOUT_BLOCKS if single else ""
-    if not single and smallest * len(parts) > LEVEL:
-        note = (
-            f"no cause can be significant with {a.table.shape[0]} and {b.table.shape[0]} runs; "
-            f"{runs_needed(len(parts))} per side are needed"
+            half = float(np.hypot(half_first[0], half_second[0]))
+            low, high = difference - half, difference + half
+        elif pool_spread([first, second])[1]:
+            (found,) = compare_means([first, second], [(0, 1)], tests=len(squares)).differences
+            p, ends = found.p, found.interval
+            low, high = (low, high) if ends is None else (ends.low, ends.high)
+        tests.append((low, high, p))
+    ps = [p for *_, p in tests]
+    is_tested = not math.isnan(ps[0])
+    adjusted = adjust_holm(ps).tolist() if is_tested else ps
+    parts = [
+        CauseDifference(name, kind, scale * difference, scale * low, scale * high, p, q)
+        for ((name, kind), difference), (low, high, p), q in zip(
+            squares.items(), tests, adjusted, strict=True
         )
+    ]
+    parts.sort(key=lambda part: -abs(part.difference))
+    note = ABOUT_BLOCKS if single else "" if is_tested else NO_SPREAD
     return Difference(a.name, b.name, total, tuple(parts), BLOCKS if single else RUNS, note)
 
 

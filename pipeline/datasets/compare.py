@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import polars as pl
 
-from pipeline.core import FEWEST_OF_SPREAD, Ints, format_count
+from pipeline.core import FEWEST_OF_SPREAD, format_count
 from pipeline.datasets.causes import find_carriers, find_level_names, name_causes, read_budgets
 from pipeline.datasets.compared_runs import (
     ComparedRuns,
@@ -20,7 +20,6 @@ from pipeline.datasets.compared_runs import (
     measure_runs,
     note_untested,
 )
-from pipeline.datasets.confidence import Interval
 from pipeline.datasets.equal_driving import Overlap, find_overlap, level_runs, measure_bins
 from pipeline.datasets.pairs import (
     ABOUT_UNIT,
@@ -40,11 +39,13 @@ from pipeline.datasets.pairs import (
 from pipeline.datasets.pooled_tests import bound_levels
 from pipeline.datasets.pooling import OVER_RUNS, THIS_RUN, pool_runs, spread_windows
 from pipeline.datasets.published_chain import follow_published, read_limits
-from pipeline.datasets.rank_tests import connect_groups
-from pipeline.stages import WINDOW_S
+from pipeline.datasets.rank_tests import Interval, connect_groups
 from pipeline.store import ANALYZE_FIRST, Store, lack_runs
 
 _FEWEST = 2
+
+_NORMS = ("windows", "t_start", "window_norm")
+"""Table and columns of the 2 s window norms."""
 
 Bounds = dict[tuple[str, str], Interval]
 """Intervals by run and input."""
@@ -52,40 +53,35 @@ Overlaps = Mapping[frozenset[str], Overlap]
 """Driving in common by the datasets of a pair."""
 
 
-def read_moduli(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
-    """Slip moduli of every run on one input, without suspect samples.
+def read_samples(
+    compared: ComparedRuns, input_name: str, table: str = "slip", time: str = "t", value: str = "modulus"
+) -> dict[str, Samples]:
+    """Samples of every run on one input, without suspect, null and non-finite ones: slip moduli by default.
 
     Args:
         compared: the runs.
         input_name: `command` or `measured`.
+        table: table to read.
+        time: its column of times [s].
+        value: its column of values.
     """
-    parts = _split_by_run(compared, "slip", input_name, time="t", value="modulus")
-    return {run: _take_samples(part) for run, part in parts.items()}
-
-
-def read_norms(compared: ComparedRuns, input_name: str) -> dict[str, Samples]:
-    """2 s window norms of every run on one input, without suspect windows.
-
-    Args:
-        compared: the runs.
-        input_name: `command` or `measured`.
-    """
-    parts = _split_by_run(compared, "windows", input_name, time="t_start", value="window_norm")
-    return {run: _take_windows(part) for run, part in parts.items()}
-
-
-def _split_by_run(
-    compared: ComparedRuns, table: str, input_name: str, *, time: str, value: str
-) -> dict[str, pl.DataFrame]:
-    """Rows of a table on one input by run, without suspect, null and non-finite values."""
     frame = (
         compared.scan(table)
         .filter(pl.col("input") == input_name, ~pl.col("suspect"), pl.col(value).is_finite())
-        .select("run", time, "segment", "step", value)
+        .select("run", time, value)
         .collect()
     )
     parts = frame.partition_by("run", as_dict=True, maintain_order=True)
-    return {str(run): part for (run,), part in parts.items() if part.height >= _FEWEST}
+    return {
+        str(run): _take_samples(part[time], part[value])
+        for (run,), part in parts.items()
+        if part.height >= _FEWEST
+    }
+
+
+def _take_samples(times: pl.Series, values: pl.Series) -> Samples:
+    order = times.arg_sort()
+    return Samples(values[order].to_numpy(), float(np.ptp(times.to_numpy())))
 
 
 def follow_published_runs(
@@ -108,7 +104,7 @@ def follow_published_runs(
         )
         if followed is None:
             continue
-        samples[run] = _take_windows(followed.norms)
+        samples[run] = _take_samples(followed.norms["t_start"], followed.norms["window_norm"])
         scaled = f", command scaled by {followed.scale[0]:.2f} forward and {followed.scale[1]:.2f} in yaw" * (
             followed.scale != (1.0, 1.0)
         )
@@ -118,33 +114,6 @@ def follow_published_runs(
         schema={"run": pl.String, "published_norm": pl.Float64},
     ).with_columns(pl.lit("command").cast(runs.schema["input"]).alias("input"))
     return samples, runs.update(medians, on=["run", "input"]), notes
-
-
-def _take_samples(part: pl.DataFrame) -> Samples:
-    times = part["t"].to_numpy()
-    period = float(np.median(np.diff(times)))
-    ticks = np.round((times - times[0]) / max(period, 1e-6)).astype(np.int64)
-    return _as_samples(part, "modulus", ticks)
-
-
-def _take_windows(norms: pl.DataFrame) -> Samples:
-    """Windows as samples; windows that start within the same 2 s grid step get consecutive ticks."""
-    order = norms.sort("t_start")
-    times = order["t_start"].to_numpy()
-    ticks = np.maximum.accumulate(np.round((times - times[0]) / WINDOW_S).astype(np.int64))
-    # Windows start at steps, so two may round to the same tick: increment the later one.
-    ticks = np.maximum.accumulate(ticks - np.arange(ticks.size)) + np.arange(ticks.size)
-    return _as_samples(order, "window_norm", ticks)
-
-
-def _as_samples(rows: pl.DataFrame, value: str, ticks: Ints) -> Samples:
-    sizes = np.unique(rows["step"].to_numpy(), return_counts=True)[1]
-    return Samples(
-        values=rows[value].to_numpy(),
-        ticks=ticks,
-        pieces=rows["segment"].to_numpy().astype(np.int64),
-        step=float(np.median(sizes)),
-    )
 
 
 _WINDOW_COLUMNS = {
@@ -203,10 +172,10 @@ class _Material:
         within: Bounds = {}
         norms_within: Bounds = {}
         for name in inputs:
-            moduli = read_moduli(self.compared, name)
+            moduli = read_samples(self.compared, name)
             tables[name, AS_DRIVEN] = self._compare(self._group(moduli, name, AS_DRIVEN), name, AS_DRIVEN)
             within |= self._bound_single(moduli, name)
-            norms_within |= self._bound_single(read_norms(self.compared, name), name)
+            norms_within |= self._bound_single(read_samples(self.compared, name, *_NORMS), name)
         labels = self.compared.labels.select("run", "group")
         bins = measure_bins(self.compared.scan("slip")).join(labels, on="run", maintain_order="left")
         driven = self._level_driving(bins, inputs)
@@ -229,8 +198,8 @@ class _Material:
         datasets = pool_runs(
             self.runs,
             self.question.by,
-            within=self._bound_single(read_moduli(self.compared, name), name),
-            norms_within=self._bound_single(read_norms(self.compared, name), name),
+            within=self._bound_single(read_samples(self.compared, name), name),
+            norms_within=self._bound_single(read_samples(self.compared, name, *_NORMS), name),
         )
         view = View(name, AS_PUBLISHED, _bound_published(groups, self.families), table)
         return self._answer(datasets, [view], _tabulate_windows(samples, name), pl.DataFrame())
@@ -253,7 +222,8 @@ class _Material:
     def _bound_single(self, samples: Mapping[str, Samples], name: str) -> Bounds:
         """Intervals of runs that are alone in their dataset."""
         alone = self.compared.labels.filter(pl.len().over("group") == 1)["run"]
-        return {(run, name): bound_run(samples[run]) for run in alone if run in samples}
+        ends = {run: bound_run(samples[run]) for run in alone if run in samples}
+        return {(run, name): one for run, one in ends.items() if one is not None}
 
     def _level_driving(self, bins: pl.DataFrame, inputs: Sequence[str]) -> dict[str, pl.DataFrame]:
         """Give runs their levels at equal driving; the bins that count, by input."""
@@ -419,7 +389,7 @@ def _sum_up(pairs: Sequence[Pair], groups: Sequence[Group], of: str) -> list[str
         return ["there is one dataset only: nothing to compare it with"] if groups else []
     silent: dict[str, list[str]] = {}
     for pair in pairs:
-        if pair.p is None or "cannot be significant" in pair.note:
+        if pair.p is None:
             silent.setdefault(pair.note, []).append(f"{pair.a.name} and {pair.b.name}")
     sentences = []
     for note, (first, *others) in sorted(silent.items()):

@@ -19,8 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Flags, Floats, Ints, student_quantile
-from pipeline.datasets.confidence import Interval
-from pipeline.datasets.rank_tests import StatisticsError, check_values
+from pipeline.datasets.rank_tests import Interval, StatisticsError, check_values
 
 _NORMAL = 1e6
 """Degrees of freedom of a known variance: Student's t is then normal."""
@@ -268,7 +267,7 @@ def _bound_mean(sample: Sample, between: float, run: float) -> Interval | None:
         scatter = float(slopes[there] @ np.linalg.solve(information, slopes[there]))
         freedom = min(max(2.0 * variance**2 / scatter, 1.0), _NORMAL)
     half = student_quantile(CONFIDENCE, freedom) * math.sqrt(variance)
-    return Interval(mean - half, mean + half, CONFIDENCE)
+    return Interval(mean - half, mean + half)
 
 
 def _inform(sample: Sample, between: float, run: float) -> Floats:
@@ -296,7 +295,7 @@ def _list_group_means(sample: Sample, names: Sequence[str], run: float, freedom:
         interval = None
         if count >= FEWEST_OF_SPREAD:
             half = student_quantile(CONFIDENCE, freedom) / math.sqrt(weight)
-            interval = Interval(mean - half, mean + half, CONFIDENCE)
+            interval = Interval(mean - half, mean + half)
         means_by_name[name] = GroupMean(mean, interval, count)
     return means_by_name
 

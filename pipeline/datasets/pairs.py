@@ -10,27 +10,21 @@ import numpy as np
 import polars as pl
 import polars.selectors as cs
 
-from pipeline.core import CONFIDENCE, Floats, Ints, number_in, pick
-from pipeline.datasets.confidence import (
-    Blocks,
-    Comparison,
-    Interval,
-    bootstrap_median,
-    compare_blocks,
-    cut_blocks,
-    spread_ratio,
-)
+from pipeline.core import STRETCH_S, Floats, number_in, pick
 from pipeline.datasets.equal_driving import Overlap
-from pipeline.datasets.pooled_tests import compare_means, exponentiate, pool_spread, take_logarithms
+from pipeline.datasets.pooled_tests import (
+    bound_levels,
+    compare_means,
+    exponentiate,
+    pool_spread,
+    take_logarithms,
+)
 from pipeline.datasets.pooling import MEASURES
 from pipeline.datasets.rank_tests import (
-    DRAWS,
-    FEWER_DRAWS,
     LEVEL,
-    adjust_holm,
+    Interval,
     cliffs_delta,
     connect_groups,
-    find_testable,
     kendall_p,
     kendall_tau,
     mann_whitney,
@@ -41,11 +35,13 @@ from schemas import contract_of
 
 RUNS = "runs"
 BLOCKS = "blocks"
-_MANY_PAIRS = 200
-"""Number of pairs of single runs above which each takes `FEWER_DRAWS`, to limit the time."""
+PARTS = 8
+"""Parts of a single run: medians of eight equal parts of 2 to 10 minutes are called different in 4 to 7 % of
+equal runs whose slip remembers 0.5 to 2.5 s; all labellings of eight and eight can be counted."""
 ABOUT_BLOCKS = "a difference between two runs, not between terrains"
 NOT_SHARED = "no driving in common, no number"
 NO_SPREAD = "too few runs to know how much runs differ: no test"
+TOO_SHORT = f"{ABOUT_BLOCKS}; too short for a test, which takes two stretches of {STRETCH_S:g} s of each"
 
 
 @dataclass(frozen=True)
@@ -54,20 +50,22 @@ class Samples:
 
     Attributes:
         values: the compared quantity, ascending in time, shape (n,).
-        ticks: number of each sample on its uniform grid, shape (n,).
-        pieces: segment number of each sample, shape (n,).
-        step: usual length of a command step [grid steps].
+        duration_s: time from the first to the last [s].
     """
 
     values: Floats
-    ticks: Ints
-    pieces: Ints
-    step: float
+    duration_s: float
 
     @property
     def median(self) -> float:
         """Median of the run."""
         return float(np.median(self.values))
+
+    @property
+    def parts(self) -> Floats:
+        """Medians of equal parts of the run, none shorter than a stretch that is treated as independent."""
+        most = min(PARTS, self.values.size, int(self.duration_s // STRETCH_S))
+        return np.array([np.median(part) for part in np.array_split(self.values, max(most, 1))])
 
 
 @dataclass(frozen=True)
@@ -91,8 +89,23 @@ class Group:
 
 
 @dataclass(frozen=True)
+class Comparison:
+    """Size of the difference of two sides.
+
+    Attributes:
+        shift: Hodges-Lehmann shift b - a, in the unit of the values.
+        interval: the differences that the test does not reject; None where it can reject none.
+        delta: Cliff's delta of the units, above zero if b is larger.
+    """
+
+    shift: float
+    interval: Interval | None
+    delta: float
+
+
+@dataclass(frozen=True)
 class Ratio:
-    """Geometric mean of the runs of b over that of a, with its 95 % interval if the spread is known."""
+    """Geometric mean of the units of b over that of a, with its 95 % interval if the spread is known."""
 
     value: float
     low: float | None
@@ -149,10 +162,9 @@ def compare_groups(
 ) -> list[Pair]:
     """Compare pairs of groups.
 
-    Groups that tested pairs connect are one family. Where its groups have several runs, `compare_means`
-    tests its pairs with the spread between runs of all of them. Where every group is one run, pairs are
-    compared block by block: the result applies to these two runs only, and p is corrected after Holm over the
-    pairs that can be significant (Tarone).
+    Groups that tested pairs connect are one family. Where its groups have several runs, its units are the
+    runs. Where every group is one run, they are the parts of each, and the result applies to these runs only.
+    `compare_means` tests the pairs of a family with the spread between its units.
 
     Args:
         groups: groups of at least one run each.
@@ -168,64 +180,67 @@ def compare_groups(
     for family in connect_groups(numbered):
         own = [groups[i] for i in family]
         pairs = [(family.index(i), family.index(j)) for i, j in numbered if i in family]
-        several = any(group.values.size > 1 for group in own)
-        if several or not all(group.runs for group in own):
-            compared += _compare_family(own, pairs, overlaps)
-        else:
-            compared += _compare_blocks(own, pairs)
+        by_runs = any(group.values.size > 1 for group in own) or not all(group.runs for group in own)
+        units = [group.values if by_runs else group.runs[0].parts for group in own]
+        compared += _compare_family(own, units, pairs, overlaps, RUNS if by_runs else BLOCKS)
     return sorted(compared, key=lambda pair: (pair.a.name, pair.b.name))
 
 
-def bound_run(run: Samples) -> Interval:
-    """Interval of one run's median from its blocks; it applies to this run, not to its terrain."""
-    return bootstrap_median(run.values, cut_run(run).numbers)
-
-
-def cut_run(run: Samples) -> Blocks:
-    """Cut the run into blocks."""
-    return cut_blocks(run.values, run.ticks, run.pieces, step=run.step)
+def bound_run(run: Samples) -> Interval | None:
+    """Interval of one run's median from its parts; it applies to this run, not to its terrain."""
+    return bound_levels([run.parts])[0]
 
 
 def _compare_family(
     groups: Sequence[Group],
+    values: Sequence[Floats],
     pairs: Sequence[tuple[int, int]],
     overlaps: Mapping[frozenset[str], Overlap] | None,
+    unit: str,
 ) -> list[Pair]:
-    """Pairs by runs; without any spread between runs only ratios."""
-    units, positive = take_logarithms([group.values for group in groups])
+    """Pairs by units; without any spread between units only ratios."""
+    units, positive = take_logarithms(values)
     known = [
         (i, j)
         for i, j in pairs
         if overlaps is None or overlaps[frozenset((groups[i].name, groups[j].name))].bins
     ]
-    test = compare_means(units, known) if known and pool_spread(units)[1] else None
+    test = compare_means(units, known, unit=unit) if known and pool_spread(units)[1] else None
     differences = dict(zip(known, test.differences, strict=True)) if test else {}
     compared = []
     for i, j in pairs:
         a, b = groups[i], groups[j]
-        pair = Pair(a, b, overlap=None if overlaps is None else overlaps[frozenset((a.name, b.name))])
+        overlap = None if overlaps is None else overlaps[frozenset((a.name, b.name))]
+        pair = Pair(a, b, unit=unit, overlap=overlap)
         if (i, j) not in known:
             compared.append(replace(pair, note=NOT_SHARED))
             continue
         difference = differences.get((i, j))
-        centre = float(units[j].mean() - units[i].mean())
-        ends: tuple[float, float] | tuple[None, None] = (None, None)
-        if difference and difference.interval:
-            ends = (difference.interval.low, difference.interval.high)
-        pair = replace(pair, comparison=_measure_shift(a, b, units[i], units[j], ends, positive=positive))
-        if positive:
-            low, high = (None if end is None else exponentiate(end) for end in ends)
-            pair = replace(pair, ratio=Ratio(exponentiate(centre), low, high))
-        if a.runs and b.runs:
-            pair = replace(pair, p_uncorrected=_ask_published(a, b))
+        interval = difference.interval if difference else None
+        log_ends = None if interval is None else (interval.low, interval.high)
+        low, high = (None, None) if log_ends is None else map(exponentiate, log_ends)
+        pair = replace(
+            pair,
+            comparison=_measure_shift(
+                (values[i], values[j]), (units[i], units[j]), interval, positive=positive
+            ),
+            ratio=Ratio(exponentiate(float(units[j].mean() - units[i].mean())), low, high)
+            if positive
+            else None,
+            p_uncorrected=_ask_published(a, b) if a.runs and b.runs else None,
+        )
         if test is None or difference is None:
-            compared.append(replace(pair, note=NO_SPREAD))
+            compared.append(replace(pair, note=NO_SPREAD if unit == RUNS else TOO_SHORT))
             continue
-        note = "; ".join(_note_scatter(a.values, b.values))
-        pair = replace(pair, method=test.method, spread=test.spread, freedom=test.freedom, note=note)
+        notes = [*([ABOUT_BLOCKS] * (unit == BLOCKS)), *_note_scatter(values[i], values[j])]
+        spread = (test.spread, test.freedom) if unit == RUNS else (None, None)
         compared.append(
             replace(
                 pair,
+                method=test.method,
+                spread=spread[0],
+                freedom=spread[1],
+                note="; ".join(notes),
                 p=difference.p,
                 p_adjusted=difference.p_adjusted,
                 smallest_p=difference.smallest_p,
@@ -235,74 +250,24 @@ def _compare_family(
 
 
 def _measure_shift(
-    a: Group,
-    b: Group,
-    first: Floats,
-    second: Floats,
-    ends: tuple[float | None, float | None],
-    *,
-    positive: bool,
+    values: tuple[Floats, Floats], units: tuple[Floats, Floats], ends: Interval | None, *, positive: bool
 ) -> Comparison:
-    """Shift and effect size of two groups; the ends of the interval are those of the mean of logarithms."""
-    low, high = ends
-    interval = None
-    if low is not None and high is not None:
-        low, high = (spread_ratio(first, second, end) if positive else end for end in (low, high))
-        interval = Interval(low, high, CONFIDENCE)
-    return Comparison(
-        shift=shift_between(a.values, b.values), interval=interval, delta=cliffs_delta(a.values, b.values)
-    )
+    """Shift and effect size of two groups; the interval is one of the mean of logarithms if positive."""
+    interval = ends
+    if ends is not None and positive:
+        interval = Interval(*(_spread_ratio(*units, end) for end in (ends.low, ends.high)))
+    return Comparison(shift_between(*values), interval, cliffs_delta(*values))
 
 
-def _compare_blocks(groups: Sequence[Group], pairs: Sequence[tuple[int, int]]) -> list[Pair]:
-    needed = {i for pair in pairs for i in pair}
-    blocks = {i: cut_run(groups[i].runs[0]) for i in needed}
-    draws = DRAWS if len(pairs) <= _MANY_PAIRS else FEWER_DRAWS
-    compared = [compare_blocks(blocks[i].medians, blocks[j].medians, draws=draws) for i, j in pairs]
-    smallest = np.array([test.smallest_p for _, test in compared])
-    counted, family = find_testable(smallest)
-    own = np.array([test.p for _, test in compared])
-    corrected = np.minimum(own * family, 1.0)
-    corrected[counted] = adjust_holm(own[counted])
-    correction = f", Holm over {counted.sum()} pairs" * bool(counted.sum() > 1)
-    return [
-        Pair(
-            a=groups[i],
-            b=groups[j],
-            comparison=comparison,
-            ratio=_divide(groups[i], groups[j]),
-            p=test.p,
-            p_adjusted=p,
-            smallest_p=min(least * family, 1.0),
-            unit=BLOCKS,
-            method=f"permutation of {blocks[i].medians.size} and {blocks[j].medians.size} blocks"
-            f"{correction * counts}",
-            p_uncorrected=_ask_published(groups[i], groups[j]),
-            note=_note_blocks(groups[i], groups[j], least, family, len(pairs)),
-        )
-        for (i, j), (comparison, test), p, least, counts in zip(
-            pairs, compared, corrected.tolist(), smallest.tolist(), counted.tolist(), strict=True
-        )
-    ]
-
-
-def _divide(a: Group, b: Group) -> Ratio | None:
-    first, second = float(a.values[0]), float(b.values[0])
-    return Ratio(second / first, None, None) if first > 0.0 and second > 0.0 else None
+def _spread_ratio(a: Floats, b: Floats, difference: float) -> float:
+    """Difference of the medians of two sides, from that of their logarithms and the mean of these."""
+    mean, share = float(np.concatenate((a, b)).mean()), b.size / (a.size + b.size)
+    return float(np.exp(mean + (1.0 - share) * difference) - np.exp(mean - share * difference))
 
 
 def _ask_published(a: Group, b: Group) -> float:
     """Test used in published work, over all samples."""
     return mann_whitney(*(np.concatenate([run.values for run in group.runs]) for group in (a, b)))
-
-
-def _note_blocks(a: Group, b: Group, smallest: float, family: int, pairs: int) -> str:
-    notes = [ABOUT_BLOCKS, *_note_scatter(a.runs[0].values, b.runs[0].values)]
-    if smallest > LEVEL:
-        notes.append("cannot be significant: too short for enough independent blocks")
-    elif smallest * family > LEVEL:
-        notes.append(f"cannot be significant among {pairs} pairs; compare fewer")
-    return "; ".join(notes)
 
 
 def _note_scatter(a: Floats, b: Floats) -> list[str]:

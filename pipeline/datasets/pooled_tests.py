@@ -12,23 +12,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from pipeline.core import CONFIDENCE, FEWEST_OF_SPREAD, Floats, student_quantile
-from pipeline.datasets.confidence import Interval
 from pipeline.datasets.rank_tests import (
-    DRAWS,
-    FEWER_DRAWS,
-    LARGEST_EXACT,
     LEVEL,
-    MOST_GROUPS,
-    adjust_max_t,
+    MOST_LABELLINGS,
+    Interval,
+    adjust_holm,
     bound_permuted,
     check_values,
     permute_means,
     smallest_p,
 )
-
-_FEW_GROUPS = 6
-"""Largest number of groups for which max-T takes `DRAWS`, above it `FEWER_DRAWS`: its time grows with the
-pairs times the draws."""
 
 
 @dataclass(frozen=True)
@@ -92,21 +85,27 @@ def do_spreads_differ(groups: Sequence[Floats]) -> bool:
         return False
     from scipy.stats import levene  # noqa: PLC0415 - heavy
 
-    p = float(levene(*groups, center="median").pvalue)
-    return p <= LEVEL
+    # Without any scatter it is undefined: spreads are then equal.
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return bool(levene(*groups, center="median").pvalue <= LEVEL)
 
 
-def compare_means(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) -> MeansTest:
+def compare_means(
+    groups: Sequence[Floats], pairs: Sequence[tuple[int, int]], *, tests: int = 0, unit: str = "runs"
+) -> MeansTest:
     """Compare the means of groups pair by pair, with a familywise error of 5 %.
 
-    One method serves all pairs. Where spreads between runs differ it is Games-Howell; where every pair has
-    enough runs, exact permutation of whole runs; else Tukey-Kramer. Sources: Kramer, Biometrics 12 (1956);
-    Games and Howell, Journal of Educational Statistics 1 (1976); for permutation see `adjust_max_t`.
+    One method serves all pairs. Where spreads between units differ it is Games-Howell; where every pair has
+    enough units to be significant beside the others, exact permutation of whole units with Holm's correction;
+    else Tukey-Kramer. Sources: Kramer, Biometrics 12 (1956); Games and Howell, Journal of Educational
+    Statistics 1 (1976); for permutation see `bound_permuted`.
 
     Args:
         groups: values of each group (usually logarithms of run medians), each shape (n,), enough
             for `pool_spread`.
         pairs: indices of the groups of each pair, the lower first.
+        tests: number of tests that a permutation must be significant beside; of the pairs by default.
+        unit: what a value stands for, in the method's words.
 
     Raises:
         StatisticsError: a value is not finite, or a group is empty.
@@ -115,13 +114,13 @@ def compare_means(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) ->
     spread, freedom = pool_spread(values)
     over = f" over {len(pairs)} pairs" if len(pairs) > 1 else ""
     if do_spreads_differ(values):
-        method = f"Games-Howell{over}, spreads between runs differ"
+        method = f"Games-Howell{over}, spreads between {unit} differ"
         differences = _compare_games_howell(values, pairs)
-    elif len(values) <= MOST_GROUPS and all(_can_permute(values[i].size, values[j].size) for i, j in pairs):
-        method = "exact permutation of whole runs" + f", max-T{over}" * bool(over)
+    elif all(_can_permute(values[i].size, values[j].size, max(tests, len(pairs))) for i, j in pairs):
+        method = f"exact permutation of whole {unit}" + f", Holm{over}" * bool(over)
         differences = _compare_permuted(values, pairs)
     else:
-        method = f"Tukey-Kramer{over}, spread between runs pooled"
+        method = f"Tukey-Kramer{over}, spread between {unit} pooled"
         errors = [spread * math.sqrt(1.0 / values[i].size + 1.0 / values[j].size) for i, j in pairs]
         differences = [
             _studentize(float(values[j].mean() - values[i].mean()), error, len(values), freedom)
@@ -147,10 +146,10 @@ def _studentize(value: float, error: float, groups: int, freedom: float) -> Diff
     """A difference with its standard error among the differences of so many groups."""
     if error == 0.0:
         p = 1.0 if value == 0.0 else 0.0
-        return Difference(value, Interval(value, value, CONFIDENCE), p, p, 0.0)
+        return Difference(value, Interval(value, value), p, p, 0.0)
     score = abs(value) / error
     half = error * _find_limit(groups, freedom)
-    interval = Interval(value - half, value + half, CONFIDENCE)
+    interval = Interval(value - half, value + half)
     return Difference(value, interval, _find_p(score, 2, freedom), _find_p(score, groups, freedom), 0.0)
 
 
@@ -177,27 +176,20 @@ def _find_limit(groups: int, freedom: float) -> float:
     return float(studentized_range.isf(LEVEL, groups, freedom)) / math.sqrt(2.0)
 
 
-def _can_permute(first: int, second: int) -> bool:
-    """Whether a permutation of so many runs can be significant, and all of its labellings be counted."""
-    return smallest_p(first, second) <= LEVEL and math.comb(first + second, first) <= LARGEST_EXACT
+def _can_permute(first: int, second: int, tests: int) -> bool:
+    """Whether a permutation of so many units can be significant, and all of its labellings be counted."""
+    is_countable = math.comb(first + second, first) <= MOST_LABELLINGS
+    return smallest_p(first, second) * tests <= LEVEL and is_countable
 
 
 def _compare_permuted(groups: Sequence[Floats], pairs: Sequence[tuple[int, int]]) -> list[Difference]:
-    draws = DRAWS if len(groups) <= _FEW_GROUPS else FEWER_DRAWS
-    matrix = adjust_max_t(groups, pairs, draws=draws)
+    own = [permute_means(groups[i], groups[j]) for i, j in pairs]
     differences = []
-    for i, j in pairs:
-        test = permute_means(groups[i], groups[j])
-        ends = bound_permuted(groups[i], groups[j], level=LEVEL)
-        differences.append(
-            Difference(
-                float(groups[j].mean() - groups[i].mean()),
-                None if ends is None else Interval(*ends, CONFIDENCE),
-                test.p,
-                max(float(matrix[i, j]), test.p),
-                test.smallest_p,
-            )
-        )
+    for (i, j), p, adjusted in zip(pairs, own, adjust_holm(own).tolist(), strict=True):
+        ends = bound_permuted(groups[i], groups[j])
+        value = float(groups[j].mean() - groups[i].mean())
+        least = smallest_p(groups[i].size, groups[j].size)
+        differences.append(Difference(value, None if ends is None else Interval(*ends), p, adjusted, least))
     return differences
 
 
@@ -229,7 +221,7 @@ def bound_levels(groups: Sequence[Floats]) -> list[Interval | None]:
         half = student_quantile(CONFIDENCE, freedom) * spread / math.sqrt(group.size)
         centre = float(group.mean())
         low, high = (exponentiate(end) if positive else end for end in (centre - half, centre + half))
-        intervals.append(Interval(low, high, CONFIDENCE))
+        intervals.append(Interval(low, high))
     return intervals
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import FOLDS, STRETCH_S, Floats, SlipError
-from pipeline.datasets.confidence import Interval
+from pipeline.datasets.rank_tests import Interval
 from pipeline.run import MOVING_MPS
 from pipeline.stages import find_fastest
 

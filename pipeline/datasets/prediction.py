@@ -12,7 +12,6 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import (
-    CONFIDENCE,
     FEWEST_OF_SPREAD,
     STRETCH_S,
     Complex,
@@ -27,10 +26,10 @@ from pipeline.core import (
     read_bounded,
 )
 from pipeline.datasets.compared_runs import ComparedRuns, find_material, read_digest
-from pipeline.datasets.confidence import Interval
 from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
 from pipeline.datasets.levels import draw_run
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
+from pipeline.datasets.rank_tests import Interval
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.prediction import predict_at_from, predict_from
 from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
@@ -375,7 +374,7 @@ def weigh_runs(there: Flags) -> Floats:
 
 def _bound(draws: Floats) -> Expected:
     low, middle, high = np.quantile(draws, _ENDS).tolist()
-    return Expected(middle, Interval(low, high, CONFIDENCE))
+    return Expected(middle, Interval(low, high))
 
 
 def _predict(run: _Driven, effects: Sequence[Effect]) -> Complex:

@@ -17,7 +17,10 @@ from pipeline.datasets.levels import (
     maximize_likelihood,
     rate_spreads,
 )
-from pipeline.datasets.rank_tests import FEWER_DRAWS, LEVEL, TIE, check_values
+from pipeline.datasets.rank_tests import LEVEL, TIE, check_values
+
+_FEWEST_DRAWS = 1_999
+"""Random orders: p = 0.05 is then known to a standard error of 0.005."""
 
 # Permutations relative to the reciprocal of the level, so that p can be below it.
 _PER_LEVEL = 4.0
@@ -86,7 +89,7 @@ def _split(
     if piece.size < 2 * fewest or float(np.ptp(piece)) == 0.0:
         return []
     observed = _weigh_splits(piece[None, :], fewest)[0]
-    draws = max(FEWER_DRAWS, round(_PER_LEVEL / level))
+    draws = max(_FEWEST_DRAWS, round(_PER_LEVEL / level))
     least = float(observed.max()) * (1.0 - TIE)
     as_large = 1
     for done in range(0, draws, _CHUNK):

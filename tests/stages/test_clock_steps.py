@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from stage_logs import FIELD, Taken, TakeThrough, keep_good_rows, record
 
 from pipeline.analysis.work import as_recorded
-from pipeline.datasets.confidence import integrated_time
 from pipeline.estimation import Recording, diagnose_runs
 from pipeline.run import Alignment, read_drive
 from pipeline.simulate import Clock, Scenario
@@ -143,17 +142,6 @@ def test_no_array_is_sized_by_a_hole(drive: TakeThrough) -> None:
     assert found == effects
     for name, peak in peaks.items():
         assert needed[name] < 1.3 * peak
-
-
-def test_the_memory_of_samples_with_a_hole_is_that_of_the_samples() -> None:
-    values = np.sin(np.arange(2000) / 7.0) + np.random.default_rng(1).normal(0.0, 0.1, 2000)
-    ticks = np.arange(2000)
-    plain = integrated_time(values, np.where(ticks < 1000, ticks, ticks + 11_000))
-    tracemalloc.start()
-    assert integrated_time(values, np.where(ticks < 1000, ticks, ticks + 10**13)) == pytest.approx(plain)
-    peak = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert peak < 10e6
 
 
 @pytest.mark.long

@@ -8,7 +8,7 @@ import pytest
 from scipy import stats
 
 from pipeline.datasets.pooled_tests import bound_levels, compare_means, do_spreads_differ
-from pipeline.datasets.rank_tests import StatisticsError, adjust_max_t
+from pipeline.datasets.rank_tests import StatisticsError, adjust_holm, bound_permuted, permute_means
 
 PAIRS = list(combinations(range(3), 2))
 
@@ -61,18 +61,29 @@ def test_where_spreads_differ_games_howell_is_scipys_welch_for_one_pair() -> Non
 
 
 def test_where_every_pair_has_enough_runs_whole_runs_are_permuted() -> None:
-    groups = draw(4, 4, 5)
+    groups = draw(5, 5, 6)
     found = compare_means(groups, PAIRS)
-    assert found.method == "exact permutation of whole runs, max-T over 3 pairs"
-    matrix = adjust_max_t(groups)
-    for (i, j), one in zip(PAIRS, found.differences, strict=True):
-        assert one.p_adjusted == pytest.approx(matrix[i, j])
+    assert found.method == "exact permutation of whole runs, Holm over 3 pairs"
+    own = [permute_means(groups[i], groups[j]) for i, j in PAIRS]
+    assert [one.p for one in found.differences] == own
+    assert [one.p_adjusted for one in found.differences] == pytest.approx(adjust_holm(own))
+    ends = found.differences[0].interval
+    assert ends is not None
+    assert (ends.low, ends.high) == bound_permuted(groups[0], groups[1])
+
+
+def test_runs_that_are_enough_for_one_pair_are_not_permuted_beside_others() -> None:
+    groups = draw(4, 4, 4)
+    assert compare_means(groups[:2], [(0, 1)]).method.startswith("exact permutation")
+    assert compare_means(groups, PAIRS).method.startswith("Tukey-Kramer")
+    assert compare_means(groups[:2], [(0, 1)], tests=3).method.startswith("Tukey-Kramer")
 
 
 def test_runs_without_any_scatter_have_no_doubt() -> None:
     equal, other = compare_means([np.ones(2), np.ones(2)], [(0, 1)]), [np.ones(3), 2.0 * np.ones(1)]
     assert equal.differences[0].p == 1.0
     assert compare_means(other, [(0, 1)]).differences[0].p == 0.0
+    assert not do_spreads_differ([np.ones(4), 2.0 * np.ones(4)])
 
 
 def test_intervals_of_levels_pool_the_spread_and_are_scipys_for_one_group() -> None:
