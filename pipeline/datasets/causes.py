@@ -260,8 +260,8 @@ def _compare(a: _Group, b: _Group) -> Difference:
             half = float(np.hypot(half_first[0], half_second[0]))
             low, high = difference - half, difference + half
         elif pool_spread([first, second])[1]:
-            (found,) = compare_means([first, second], [(0, 1)], tests=len(squares)).differences
-            p, ends = found.p, found.interval
+            (outcome,) = compare_means([first, second], [(0, 1)], tests=len(squares)).differences
+            p, ends = outcome.p, outcome.interval
             low, high = (low, high) if ends is None else (ends.low, ends.high)
         tests.append((low, high, p))
     ps = [p for *_, p in tests]
