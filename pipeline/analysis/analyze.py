@@ -28,7 +28,7 @@ from pipeline.core import (
 from pipeline.estimation.stored_diagnosis import has_diagnosis, key_diagnosis
 from pipeline.logs import LogData, LogError, hash_log, list_files, locate_recorded, spell_location
 from pipeline.recording.log_setup import LogSetup, set_up_log
-from pipeline.results import RunDiagnosis
+from pipeline.results import RunDiagnosis, find_refusal, read_findings
 from pipeline.store import (
     DIAGNOSIS,
     JSON,
@@ -76,8 +76,6 @@ class Outcome:
     @property
     def refusal(self) -> str:
         """Reason why slip is not observable in the log; empty if it is."""
-        from pipeline.results import find_refusal, read_findings  # noqa: PLC0415 - heavy
-
         return find_refusal(read_findings(self.summary))
 
 
@@ -250,8 +248,6 @@ def _write_outputs(
 
 
 def _write_figures(report: RunReport, kind: FigureFormat, generation: Generation) -> None:
-    import tempfile  # noqa: PLC0415 - only where figures are asked for
-
     from pipeline.report.page import write_figures  # noqa: PLC0415 - heavy
 
     with tempfile.TemporaryDirectory() as folder:

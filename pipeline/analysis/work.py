@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.analysis import STAGES, Options
 from pipeline.core import naming_os_errors, pick, read_bounded, return_freed_memory
 from pipeline.estimation.stored_diagnosis import add_model
-from pipeline.logs import LogData, Loss, read_topics
+from pipeline.logs import OVER_BUDGET, LogData, Loss, read_topics
 from pipeline.recording.log_setup import LogSetup
 from pipeline.run import Alignment, MotionError, read_alignment, read_drive
 from pipeline.sources import Vehicle, describe_types
@@ -393,8 +393,6 @@ def key_stages(
 ) -> dict[str, str]:
     """Key of every stage of a run, in order; ``model`` is the hash of the model for the residual slip."""
     # The contracts import a table library that help and usage errors do not need.
-    from pipeline.logs import OVER_BUDGET  # noqa: PLC0415
-    from schemas import contract_of  # noqa: PLC0415
 
     plain = msgspec.to_builtins(setup.configuration)
     pose_limits = {name: plain["velocity"][name] for name in ("jump_m", "jump_rad", "gap_s")}

@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 
 from pipeline.analysis import Options
+from pipeline.analysis.analyze import update_datasets
 from pipeline.analysis.work import VERSIONS
 from pipeline.batch import BatchError, Pruning, Request
 from pipeline.batch.batch_work import WITH_RESULTS, Entry, Ledger
@@ -29,6 +30,7 @@ from pipeline.store import (
     path_unread,
     see_log,
 )
+from schemas import contract_of, list_contracts
 
 # Fingerprint of a log: a hash of everything that its results depend on except the log itself.
 #
@@ -72,7 +74,6 @@ class Fingerprinter:
 @cache
 def _fingerprint_program() -> object:
     # The contracts import a table library, which a batch needs anyway.
-    from schemas import list_contracts  # noqa: PLC0415
 
     return [
         {**VERSIONS, STAGE: VERSION},
@@ -404,7 +405,6 @@ def _hash_runs(store: Store) -> str:
     """Hash of what the pools depend on: versions, runs, and logs without one."""
     # The contracts import a table library, which help and usage errors do not need.
     from pipeline.report import list_failed  # noqa: PLC0415
-    from schemas import contract_of  # noqa: PLC0415
 
     runs = [[manifest.run, manifest.key, manifest.folder.name] for manifest in store.survey().manifests]
     return hash_json([_VERSION, contract_of("datasets").version, runs, list_failed(store)])
@@ -412,7 +412,6 @@ def _hash_runs(store: Store) -> str:
 
 def _write_pools(store: Store) -> None:
     # A batch without work needs none of these imports.
-    from pipeline.analysis.analyze import update_datasets  # noqa: PLC0415
     from pipeline.report.fleet_pages import update_fleet  # noqa: PLC0415
     from pipeline.report.trend_page import update_trend  # noqa: PLC0415
 

@@ -20,10 +20,10 @@ from typing import Protocol
 import msgspec
 
 from pipeline.analysis import Options
-from pipeline.analysis.analyze import Outcome
-from pipeline.core import SlipError, end_with, silence_warnings
+from pipeline.analysis.analyze import Outcome, analyze_log
+from pipeline.core import SlipError, end_with, objects_in, silence_warnings
 from pipeline.logs import FETCHED
-from pipeline.store import JSON, LOG_NOTES, LogSighting, Mirror, Store, StoreError
+from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Mirror, Store, StoreError, stored_contexts
 
 # Ledger: the last outcome of each log, so that an unchanged log is not even opened.
 #
@@ -207,8 +207,6 @@ def work_on(task: Task) -> Report:
 
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
     # Workers without any work need no table library.
-    from pipeline.analysis.analyze import analyze_log  # noqa: PLC0415
-    from pipeline.store import REPORT  # noqa: PLC0415
 
     if mirror is not None:
         mirror.pull_run(entry.run)
@@ -235,9 +233,6 @@ def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bo
 
 
 def _format_losses(outcome: Outcome) -> str:
-    from pipeline.core import objects_in  # noqa: PLC0415 - heavy
-    from pipeline.store import stored_contexts  # noqa: PLC0415 - heavy
-
     losses = objects_in(stored_contexts(outcome.manifest).get("extract", {}), "losses")
     return "; ".join(str(loss.get("text")) for loss in losses)
 

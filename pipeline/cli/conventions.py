@@ -18,7 +18,7 @@ from cyclopts import Parameter
 from cyclopts.types import PositiveFloat
 
 from pipeline.analysis import STAGE_WORDS, Options
-from pipeline.core import INPUTS, SlipError, measure_memory
+from pipeline.core import INPUTS, SlipError, limit_memory, measure_memory
 
 if TYPE_CHECKING:
     from pipeline.analysis.analyze import OpenedRun
@@ -193,8 +193,6 @@ def limited_memory(
     Raises:
         BatchError: ``bad_size``.
     """
-    from pipeline.core import limit_memory  # noqa: PLC0415 - heavy
-
     limit = int(_SHARE * measure_memory()) if size is None else _parse_size(size)
 
     def give_up(held: int) -> None:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 from cyclopts import Parameter
 
+from pipeline.analysis import Options
 from pipeline.cli.conventions import (
     CLEAN,
     Results,
@@ -196,7 +197,6 @@ def gather_runs(
     Raises:
         SlipError: a log cannot be read, there is no such run, or its vehicle contradicts the model's.
     """
-    from pipeline.analysis import Options  # noqa: PLC0415
     from pipeline.datasets import read_runs  # noqa: PLC0415 - heavy
 
     if not names:

@@ -24,7 +24,7 @@ from pipeline.core import (
 )
 from pipeline.report import count_serious, format_distance, format_split
 from pipeline.report.scene import RunReport
-from pipeline.results import RunDiagnosis, read_result
+from pipeline.results import RunDiagnosis, has_no_pose, read_findings, read_result
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -223,7 +223,6 @@ def _format_gaps(gaps: Mapping[str, object]) -> str:
 
 def _format_slip(summary: Summary, *, everything: bool) -> list[str]:
     by_input = mapping_in(summary, "by_input")
-    from pipeline.results import has_no_pose, read_findings  # noqa: PLC0415 - heavy
 
     named = f"median slip modulus (L = {_number(summary, 'length_scale_m')} m)"
     if has_no_pose(read_findings(summary)):
@@ -283,7 +282,6 @@ def _format_topics(summary: Summary) -> list[str]:
 
 def _format_findings(summary: Summary, verdict: str, *, everything: bool) -> list[str]:
     """Findings of the run and of its diagnosis that need attention, except those in the verdict."""
-    from pipeline.results import read_findings  # noqa: PLC0415 - heavy
     from pipeline.words import list_findings  # noqa: PLC0415 - heavy
 
     findings = read_findings(summary)

@@ -6,6 +6,7 @@ import math
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, cast
 
@@ -164,8 +165,6 @@ def _open_runs(
     names: str, options: Options, stack: ExitStack, *, diagnosed: bool, quiet: bool
 ) -> list[Manifest]:
     """Runs of a comma-separated list of names, each once; a folder means all logs in it."""
-    from dataclasses import replace  # noqa: PLC0415
-
     from pipeline.batch.recordings import list_named  # noqa: PLC0415 - heavy
 
     manifests: dict[str, Manifest] = {}

@@ -99,7 +99,6 @@ def serve(  # noqa: D417 - the results folder documents itself
 
 def _open_browser(address: str) -> None:
     """Open a secret address, which must not be a command-line argument: all users can read these."""
-    import tempfile  # noqa: PLC0415 - only where asked
     import webbrowser  # noqa: PLC0415 - likewise
 
     with tempfile.NamedTemporaryFile("w", prefix="slip-", suffix=".html", delete=False) as file:

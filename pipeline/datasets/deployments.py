@@ -11,7 +11,7 @@ import polars as pl
 from pipeline.core import format_csv, naming_os_errors, read_bounded_text, unquote_formulas
 from pipeline.datasets.compared_runs import choose_input, find_material, measure_runs, read_digest
 from pipeline.datasets.pooling import MEASURES, ComparisonError, Measure, pool_runs
-from pipeline.store import Store
+from pipeline.store import Store, replace_file
 from schemas import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.
@@ -273,8 +273,6 @@ def write_deployments(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``, the file cannot be written.
     """
-    from pipeline.store import replace_file  # noqa: PLC0415 - heavy
-
     plain = frame.with_columns(pl.col(pl.Float64).round_sig_figs(_DIGITS))
     what, hint = "the table cannot be written", "Choose another file"
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):

@@ -8,12 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import polars as pl
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from pipeline.core import make_plain, naming_os_errors, read_version
 from pipeline.datasets.compared_runs import find_material, measure_runs, read_digest
 from pipeline.datasets.pooling import ComparisonError
-from pipeline.store import ANALYZE_FIRST, Store, lack_runs
+from pipeline.store import ANALYZE_FIRST, Store, encode_parquet, lack_runs, list_complaints, replace_file
 from schemas import Features, contract_of
 
 _HASH = 64
@@ -64,8 +65,6 @@ def write_features(frame: pl.DataFrame, path: Path) -> None:
     Raises:
         ComparisonError: ``not_written``.
     """
-    from pipeline.store import encode_parquet, replace_file  # noqa: PLC0415 - heavy
-
     what, hint = "the file cannot be written", "Choose another file."
     with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
         replace_file(path, encode_parquet(contract_of("features"), frame, compression="none"))
@@ -90,9 +89,6 @@ def read_features(path: Path) -> pl.DataFrame:
     Raises:
         ComparisonError: ``bad_features``: the reason for the rejection.
     """
-    import pyarrow as pa  # noqa: PLC0415 - heavy
-    import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
-
     # Opening a pipe could block forever.
     if not path.is_file():
         raise _refuse(str(path), "there is no such file")
@@ -112,8 +108,6 @@ def read_features(path: Path) -> pl.DataFrame:
 
 def _check_schema(file: pq.ParquetFile, where: str) -> list[str]:
     """Return the names of the columns if the end of the file is that of features of this version."""
-    from pipeline.store import list_complaints  # noqa: PLC0415 - heavy
-
     about, contract = file.metadata.metadata or {}, contract_of("features")
     if about.get(b"contract") != b"features":
         raise _refuse(where, "it is not a table of features")

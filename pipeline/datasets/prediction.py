@@ -26,16 +26,17 @@ from pipeline.core import (
     read_bounded,
 )
 from pipeline.datasets.compared_runs import ComparedRuns, find_material, read_digest
-from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, make_effects
+from pipeline.datasets.forecast import DRAWS, FleetModel, FleetNumber, Forecast, fit_fleet, make_effects
 from pipeline.datasets.levels import draw_run
 from pipeline.datasets.pooling import UNKNOWN, ComparisonError
 from pipeline.datasets.rank_tests import Interval
 from pipeline.estimation.comparison import Comparison, Input
 from pipeline.estimation.prediction import predict_at_from, predict_from
-from pipeline.models import Effect, Model, ModelFile, Timing, find_effect
+from pipeline.models import Effect, Model, ModelFile, Timing, cut_interval, find_effect
 from pipeline.run import TABLE_COLUMNS, MotionError, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
 from pipeline.store import Manifest, Store, lack_runs, no_results, read_day, read_length_scale
+from schemas import contract_of
 
 FLEET = "fleet.json"
 _TABLES = ("estimates",)
@@ -52,8 +53,6 @@ def fit_results(store: Store) -> tuple[FleetModel, tuple[str, ...]]:
     Raises:
         ComparisonError: ``nothing_to_fit``: no run has estimates, or none is on a known terrain.
     """
-    from pipeline.datasets.forecast import fit_fleet  # noqa: PLC0415 - heavy
-
     compared = _find_runs(store)
     if not compared.manifests:
         raise _lack_estimates(compared)
@@ -201,8 +200,6 @@ def _summarize_number(number: FleetNumber) -> dict[str, object]:
 
 def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
     """The table `fleet`."""
-    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
-
     rows: list[Mapping[str, object]] = []
     for number in model.numbers:
         summary = _summarize_number(number)
@@ -215,8 +212,6 @@ def tabulate_fleet(model: FleetModel, keys: tuple[str, ...]) -> pl.DataFrame:
 
 def _bounds(number: FleetNumber, interval: Interval | None) -> dict[str, float | None]:
     """Ends of an interval, cut to the bounds of the parameter."""
-    from pipeline.models import cut_interval, find_effect  # noqa: PLC0415 - heavy
-
     if interval is None:
         return {"low": None, "high": None}
     bounds = find_effect(number.effect)().parameter(number.parameter).bounds

@@ -32,6 +32,7 @@ from pipeline.store import (
     stored_contexts,
     stored_keys,
 )
+from schemas import contract_of
 
 if TYPE_CHECKING:
     from pipeline.estimation.recordings import Recording
@@ -114,8 +115,6 @@ DIAGNOSED = ("ladder", "parameters", "budget", "estimates")
 
 def key_diagnosis(keys: Mapping[str, str]) -> str:
     """Key of the diagnosis of a run whose stages have these keys."""
-    from schemas import contract_of  # noqa: PLC0415 - brings a table library along
-
     # An effect is searched for by being there.
     effects = sorted(path.name for path in (Path(__file__).parents[1] / "models" / "effects").glob("*.py"))
     contracts = [contract_of(table).version for table in DIAGNOSED]

@@ -14,7 +14,7 @@ from pipeline.estimation.decision import EQUAL, Search, SearchResult, find_cost
 from pipeline.estimation.errors import errors_as_json
 from pipeline.estimation.ladder import judge_whole, lowers_errors
 from pipeline.estimation.terms import CHANNELS, is_term, join_formula, list_terms
-from pipeline.models import format_effect
+from pipeline.models import Timing, format_effect
 from pipeline.results import Disturbance, Errors, Unexplained, read_result
 from pipeline.run import MotionError
 
@@ -162,8 +162,6 @@ def find_lasting(fit: PartFit, path: str) -> Unexplained | None:
 
 def measure_asked(comparisons: Sequence[Comparison]) -> Floats:
     """Motion that was asked for, rms of x, y, w; sideways it is measured by the way forward."""
-    from pipeline.models import Timing  # noqa: PLC0415 - only here
-
     velocities = [comparison.predict_velocity((), Timing()) for comparison in comparisons]
     x, y, w = (
         math.sqrt(float(np.mean(np.concatenate([getattr(one, name) for one in velocities]) ** 2)))

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from typing import Final, TypeAlias
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.records import Schema
 
 from pipeline.core import Flags, Ints
 from pipeline.logs.cdr import DIALECTS, MAX_TEXT, OTHER_ENCAPSULATIONS, ROS1, Cursor, Dialect
@@ -358,8 +360,6 @@ def protobuf_decoder(schema: bytes, type_name: str, *, where: str) -> Callable[[
         from google.protobuf.message import (  # type: ignore[import-untyped]  # noqa: PLC0415 - an extra
             DecodeError,
         )
-        from mcap.exceptions import McapError  # noqa: PLC0415 - an extra
-        from mcap.records import Schema  # noqa: PLC0415 - an extra
         from mcap_protobuf.decoder import DecoderFactory  # noqa: PLC0415 - an extra
     except ImportError:
         what = "protobuf messages need another package"

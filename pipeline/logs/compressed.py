@@ -10,6 +10,8 @@ import weakref
 from pathlib import Path
 from typing import IO, Final
 
+import zstandard
+
 from pipeline.core import Newest, format_size
 from pipeline.logs.catalog import limit_inflated
 from pipeline.logs.records import LogError
@@ -59,8 +61,6 @@ def open_inflated(path: Path, descriptor: int) -> int:
 
 
 def _inflate(path: Path, size: int, source: IO[bytes], target: IO[bytes]) -> None:
-    import zstandard  # noqa: PLC0415 - few logs need it
-
     most, total = limit_inflated(size, None), 0
     frame: zstandard.ZstdDecompressionObj | None = None
     rest = b""

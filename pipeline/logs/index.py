@@ -13,6 +13,7 @@ from pipeline.core import PAUSE_NS, PathError, format_size, resolve_inside, usab
 from pipeline.logs import records as rec
 from pipeline.logs.catalog import Catalog
 from pipeline.logs.compressed import COMPRESSED, uncompressed_name
+from pipeline.logs.other_formats import list_tables
 from pipeline.logs.part import (
     catalog_file,
     count_fetched,
@@ -324,7 +325,6 @@ def list_files(folder: Path) -> list[Path]:
     named = (file for end in SUFFIXES for file in sorted(folder.glob(f"*{end}"), key=split_number))
     if files := [file for file in named if not file.is_dir()]:
         return files
-    from pipeline.logs.other_formats import list_tables  # noqa: PLC0415 - few logs need it
 
     return list_tables(folder)
 

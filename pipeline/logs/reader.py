@@ -31,7 +31,7 @@ from pipeline.logs.columns import (
     share_times,
 )
 from pipeline.logs.index import ChannelInfo, LogIndex, Part, open_log
-from pipeline.logs.other_formats import BagMessages
+from pipeline.logs.other_formats import BagMessages, read_other
 from pipeline.logs.part import count_fetched, hash_sources, open_source
 from pipeline.logs.records import ByteSource, LogError, Loss
 from pipeline.logs.schema import short_name
@@ -365,8 +365,6 @@ def _read_part(
 ) -> Iterator[_Gathered]:
     own = {number for number, merged in part.numbers.items() if merged in wanted}
     if container := part.catalog.container:
-        from pipeline.logs.other_formats import read_other  # noqa: PLC0415 - few logs need it
-
         most = limit_inflated(part.size_bytes, part.catalog.most_inflated)
         return (_gather_bag(part, held) for held in read_other(source, part.path, container, own, most))
 

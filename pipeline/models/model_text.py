@@ -8,6 +8,7 @@ import msgspec
 import tomlkit
 
 from pipeline.core import naming_os_errors, round_digits
+from pipeline.logs.index import SUFFIXES, stem_of
 from pipeline.models.effect import (
     Effect,
     Parameter,
@@ -41,8 +42,6 @@ def check_target(path: Path) -> None:
     Raises:
         MotionError: ``model_misplaced``, the path is a configuration of logs.
     """
-    from pipeline.logs.index import SUFFIXES, stem_of  # noqa: PLC0415 - heavy
-
     if not path.is_file() or is_model(path):
         return
     for log in path.parent.glob("*"):

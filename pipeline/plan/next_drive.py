@@ -28,16 +28,17 @@ from pipeline.estimation.decision import find_cost
 from pipeline.estimation.fit import PartFit
 from pipeline.estimation.parts import Part
 from pipeline.estimation.problem import Problem
-from pipeline.models import Effect, Late, Model
-from pipeline.plan.manoeuvres import Area, Limits, is_steered
-from pipeline.plan.plan import Plan
+from pipeline.logs import LogError, locate_recorded, open_log
+from pipeline.models import Effect, Late, Model, list_effects
+from pipeline.plan.manoeuvres import Area, Limits, Reached, choose_limits, is_steered
+from pipeline.plan.plan import Plan, Request, find_largest, make_plan
 from pipeline.plan.plan_files import WHEELS, list_types
-from pipeline.plan.questions import Question
-from pipeline.plan.rehearsal import Knowledge
-from pipeline.results import RunDiagnosis
+from pipeline.plan.questions import Question, ask_apart, ask_numbers, ask_presence, ask_undecided, list_names
+from pipeline.plan.rehearsal import Knowledge, assume, learn, measure_reached
+from pipeline.results import RunDiagnosis, find_refusal, read_suggestion
 from pipeline.run import MotionRun, load_motion_run
 from pipeline.sources import Vehicle, load_vehicle
-from pipeline.store import Manifest, Store
+from pipeline.store import Manifest, Store, read_choices
 
 MOST_JOINED = 24
 """Largest number of jointly fitted runs, those on the terrain first: more take longer for the same result."""
@@ -223,10 +224,6 @@ def plan_drive(
     Raises:
         SlipError: an effect is unknown, the vehicle's largest speed is unknown, or no drive fits.
     """
-    from pipeline.plan.manoeuvres import Reached, choose_limits  # noqa: PLC0415 - heavy
-    from pipeline.plan.plan import Request, make_plan  # noqa: PLC0415 - heavy
-    from pipeline.plan.rehearsal import measure_reached  # noqa: PLC0415 - heavy
-
     knowledge, diagnosis = studied.knowledge, studied.diagnosis
     reached = Reached() if knowledge.problem is None else measure_reached(knowledge.problem)
     limits = choose_limits(
@@ -273,9 +270,6 @@ def study(
         SlipError: nothing can be estimated, or a run has no commands.
     """
     from pipeline.estimation import diagnose_runs, load_recording  # noqa: PLC0415 - heavy
-    from pipeline.models import list_effects  # noqa: PLC0415 - heavy
-    from pipeline.plan.rehearsal import assume, learn  # noqa: PLC0415 - heavy
-    from pipeline.results import find_refusal, read_suggestion  # noqa: PLC0415 - heavy
 
     joint = diagnose_runs(recordings, vehicle, notify=notify)
     diagnosis = joint.runs[0]
@@ -308,8 +302,6 @@ def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
     Raises:
         SlipError: the results contain nothing about the vehicle.
     """
-    from pipeline.plan.rehearsal import assume  # noqa: PLC0415 - heavy
-
     if terrain is None:
         return Studied(None, assume(vehicle))
     forecast = _forecast(known, vehicle, terrain)
@@ -317,8 +309,6 @@ def expect(vehicle: Vehicle, terrain: str | None, known: Path) -> Studied:
 
 
 def _forecast(known: Path, vehicle: Vehicle, terrain: str, without: Sequence[str] = ()) -> Forecast:
-    from pipeline.store import Store  # noqa: PLC0415 - heavy
-
     return forecast_deployment(Store(known), vehicle.id, terrain, without=without)
 
 
@@ -340,9 +330,6 @@ def ask(
     Raises:
         SlipError: an effect is unknown or does not exist on the vehicle.
     """
-    from pipeline.plan.plan import find_largest  # noqa: PLC0415
-    from pipeline.plan.questions import ask_apart, ask_numbers, ask_presence, ask_undecided, list_names  # noqa: PLC0415
-
     groups = [] if diagnosis is None else [group.candidates for group in diagnosis.undecided]
     open_ones = {name for group in groups for name in group}
     stated = {}
@@ -366,8 +353,6 @@ def ask(
 
 def read_command(manifest: Manifest) -> dict[str, object]:
     """Choice of a stored run's command: ``choices``, and the configuration as ``command_source``."""
-    from pipeline.store import read_choices  # noqa: PLC0415 - heavy
-
     configuration = manifest.details.get("configuration")
     source = configuration.get("command") if isinstance(configuration, dict) else None
     return {**read_choices(manifest), "command_source": source}
@@ -399,8 +384,6 @@ def choose_topic(vehicle: Vehicle, choices: Mapping[str, object], log: str) -> t
 
 def _read_types(log: str) -> Mapping[str, str]:
     """Message types by topic of a stored run's log; empty if the log is missing or not accessible."""
-    from pipeline.logs import LogError, locate_recorded, open_log  # noqa: PLC0415 - heavy
-
     try:
         location = locate_recorded(log)
     except LogError:

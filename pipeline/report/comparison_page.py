@@ -38,6 +38,7 @@ from pipeline.report import (
     format_number,
     label_names,
     theme,
+    write_page,
 )
 from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
@@ -529,9 +530,6 @@ def write_answer(store: Store, answer: Answer, figures: FigureFormat | None = No
     Raises:
         SlipError: figures were asked for, and what draws them is not installed.
     """
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.comparison_page import list_pictures, render_comparison  # noqa: PLC0415 - heavy
-
     store.write_results_table("datasets", answer.datasets)
     comparisons = pl.concat([view.comparisons for view in answer.views])
     store.write_results_table("comparisons", comparisons)

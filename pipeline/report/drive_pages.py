@@ -213,7 +213,6 @@ def write_drive(plan: Plan, folder: Path, results: Path) -> tuple[Path, ...]:
         PlanError: as `write_plan`.
     """
     from pipeline.plan import write_plan  # noqa: PLC0415 - heavy
-    from pipeline.report.drive_pages import render_plan  # noqa: PLC0415 - heavy
 
     return write_plan(plan, folder, render_plan(plan, lead_to(results, folder))) if plan.manoeuvres else ()
 
@@ -233,7 +232,6 @@ def leave_plan(store: Store, manifest: Manifest, plan: Plan) -> Path | None:
         SlipError: the results cannot be written.
     """
     from pipeline.plan import FILES  # noqa: PLC0415 - heavy
-    from pipeline.report.drive_pages import preview_plan, show_planned  # noqa: PLC0415 - heavy
 
     run, results = manifest.run, store.root
     known = store.manifest(run)

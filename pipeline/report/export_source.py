@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import polars as pl
+import pyarrow.parquet as pq
 
 from pipeline.core import Floats, Ints
 from pipeline.estimation import Comparison, Prediction, choose_input, predict_at_from, predict_from
@@ -16,7 +17,7 @@ from pipeline.models import Effect, Model, Timing
 from pipeline.report import theme
 from pipeline.report.scene import CAP_QUANTILE, INPUTS
 from pipeline.run import TABLE_COLUMNS, MotionError, MotionRun, make_motion_run
-from pipeline.store import Manifest, name_damage
+from pipeline.store import Manifest, check_rows, name_damage
 
 
 class Feed:
@@ -84,11 +85,8 @@ class ExportSource:
 
     def batches(self, table: str, columns: Sequence[str] | None = None) -> Iterator[pl.DataFrame]:
         """Read a table in batches; yields nothing if the run has no such table."""
-        import pyarrow.parquet as pq  # noqa: PLC0415 - heavy
-
         if table not in self.manifest.tables:
             return
-        from pipeline.store import check_rows  # noqa: PLC0415 - heavy
 
         path = self.manifest.path(table)
         check_rows(path, self.manifest.count_rows(table))

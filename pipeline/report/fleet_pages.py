@@ -53,6 +53,7 @@ from pipeline.report import (
     label_names,
     set_squares,
     theme,
+    write_page,
 )
 from pipeline.report.comparison_page import write_tables
 from pipeline.report.page import add_figures, render_figures
@@ -539,9 +540,6 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
         causes: result of `find_causes`.
         figures: also write the figure to `figures/` in this format.
     """
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import draw_causes, render_causes  # noqa: PLC0415 - heavy
-
     written: dict[str, Path] = {}
     for name, frame in (
         ("causes", tabulate_budgets(causes)),
@@ -557,9 +555,6 @@ def write_causes(store: Store, causes: Causes, figures: FigureFormat | None = No
 
 def write_fleet(store: Store, model: FleetModel, keys: tuple[str, ...]) -> Path:
     """Write `fleet.json`, the table `fleet` and the page; return the path of the first."""
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import render_fleet  # noqa: PLC0415 - heavy
-
     store.write_results_table("fleet", tabulate_fleet(model, keys))
     content = {**summarize_fleet(model), "keys": list(keys)}
     write_page(store, "fleet.html", render_fleet(content))
@@ -578,9 +573,6 @@ def update_fleet(store: Store) -> None:
 
 def write_terrain(store: Store, drawn: TerrainMap) -> dict[str, Path]:
     """Write `cells.parquet`, `terrain.html` and, if georeferenced, `terrain.geojson`; the files by name."""
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.fleet_pages import render_terrain  # noqa: PLC0415 - heavy
-
     keys = " ".join(drawn.keys)
     names = drawn.cell_table.with_columns(pl.lit("*").alias("run"), pl.lit(keys).alias("keys"))
     store.write_results_table("cells", names.drop("i", "j"))

@@ -12,7 +12,7 @@ import polars as pl
 
 from pipeline.core import INPUT_WORDS, FigureFormat
 from pipeline.datasets import ZONES, DeploymentMap, Measure
-from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme
+from pipeline.report import Cell, Column, Picture, Table, bracket_unit, format_number, theme, write_page
 from pipeline.report.page import add_figures, render_figures
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis
 from pipeline.store import Store
@@ -445,9 +445,6 @@ def _tabulate_literature(deployments: pl.DataFrame, points: pl.DataFrame) -> Tab
 
 def write_map(store: Store, drawn: DeploymentMap, figures: FigureFormat | None = None) -> Path:
     """Write `map.html`, and the figure if a format is given; return the path of the page."""
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
-    from pipeline.report.map_page import picture_map, render_map  # noqa: PLC0415 - heavy
-
     path = write_page(store, "map.html", render_map(drawn))
     add_figures(store, lambda: [picture_map(drawn)], figures)
     return path

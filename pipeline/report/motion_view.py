@@ -10,8 +10,8 @@ import polars as pl
 from pipeline.core import Floats
 from pipeline.estimation import Fitted, Problem, State, choose_input, fit_model, predict_from
 from pipeline.estimation.comparison import HorizonErrors
-from pipeline.estimation.effect_signature import Signature
-from pipeline.models import Timing
+from pipeline.estimation.effect_signature import Signature, find_signatures, measure_variables
+from pipeline.models import Model, Timing
 from pipeline.results import Errors, RunDiagnosis, Step, read_model
 from pipeline.run import MotionError, load_run
 from pipeline.sources import Vehicle
@@ -78,8 +78,6 @@ class MotionStage:
     @cached_property
     def ideal(self) -> Fitted:
         """The ideal model with the recording's delays."""
-        from pipeline.models import Model  # noqa: PLC0415 - only here
-
         return fit_model(self.problem, Model(self.problem.vehicle))
 
     @cached_property
@@ -92,8 +90,6 @@ class MotionStage:
 
     @cached_property
     def _signals(self) -> dict[str, Floats]:
-        from pipeline.estimation.effect_signature import measure_variables  # noqa: PLC0415 - for pages alone
-
         measured = measure_variables(self._comparison)
         return {name: measured[name] for name in SIGNALS}
 
@@ -105,8 +101,6 @@ class MotionStage:
             ladder: its steps.
             floor: noise floor; None if unknown.
         """
-        from pipeline.estimation.effect_signature import find_signatures  # noqa: PLC0415 - for pages alone
-
         comparison = self._comparison
         rows = self.problem.whole.run == 0
         ideal, model = self.ideal.residuals[rows], self.problem.find_run_residuals(state, 0)

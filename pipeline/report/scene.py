@@ -12,7 +12,7 @@ from pipeline.core import mapping_in, number_in, objects_in
 from pipeline.report import format_number
 from pipeline.report.motion_view import MotionView
 from pipeline.report.theme import round_up, usual_ends
-from pipeline.results import Named, RunDiagnosis
+from pipeline.results import Named, RunDiagnosis, find_refusal, is_small, read_findings, split_main
 from pipeline.run import HORIZON_S
 
 INPUTS = ("command", "measured")
@@ -79,16 +79,12 @@ class RunReport:
     @property
     def effects(self) -> tuple[list[Named], list[Named]]:
         """Effects that remove at least a tenth of the error with corrected clocks, and the smaller ones."""
-        from pipeline.results import split_main  # noqa: PLC0415 - heavy
-
         diagnosis = self.diagnosis
         return split_main(diagnosis.effects, diagnosis.ladder, lambda one: (one.id, one.corrected))
 
     @property
     def refusal(self) -> str:
         """Finding that makes every fit to the run meaningless; empty without one."""
-        from pipeline.results import find_refusal, read_findings  # noqa: PLC0415 - heavy
-
         return find_refusal(read_findings(self.summary))
 
     @property
@@ -106,8 +102,6 @@ class RunReport:
     @property
     def small_groups(self) -> int:
         """Number of undecided groups that count as one smaller effect each."""
-        from pipeline.results import is_small  # noqa: PLC0415 - heavy
-
         return sum(is_small(group.in_model, self.diagnosis.ladder) for group in self.diagnosis.undecided)
 
     @property

@@ -19,6 +19,7 @@ import numpy as np
 import polars as pl
 
 from pipeline.core import python_command, require_package
+from pipeline.store import replace_file
 
 SCHEMA = "https://vega.github.io/schema/vega-lite/v6.4.1.json"
 """Schema of the specifications."""
@@ -442,8 +443,6 @@ def _read_checked(path: Path) -> str | None:
 
 
 def _write_checked(path: Path, script: str) -> None:
-    from pipeline.store import replace_file  # noqa: PLC0415 - only where it is not cached yet
-
     body = script.encode()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)

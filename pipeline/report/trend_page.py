@@ -26,7 +26,7 @@ from pipeline.datasets import (
     summarize_trend,
 )
 from pipeline.models import name_parameter
-from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme
+from pipeline.report import Picture, begin_large, bracket_unit, set_squares, theme, write_page
 from pipeline.report.page import render_figures
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer
 from pipeline.store import NoRunsError, Store
@@ -242,7 +242,6 @@ def write_trend(store: Store, trend: Trend) -> Path:
     """Write `trend.html` and `trend.json`; return the path of the page."""
     content = {**summarize_trend(trend), "asked": trend.asked}
     store.write_results_text(TREND, json.dumps(content, indent=1, allow_nan=False) + "\n")
-    from pipeline.report import write_page  # noqa: PLC0415 - heavy
 
     return write_page(store, "trend.html", render_trend(trend))
 

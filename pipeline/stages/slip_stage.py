@@ -14,6 +14,7 @@ from pipeline.stages.inputs import WINDOW_S, Ideal, Steps, cut_steps, keep_known
 from pipeline.stages.motion_events import MotionEvents, find_events
 from pipeline.stages.spans import find_spans
 from pipeline.store import JSON
+from schemas import tabulate
 
 PUBLISHED_SAMPLES = 40
 """Samples of a published window, whose norm is not a mean: 40 at 20 Hz."""
@@ -260,7 +261,6 @@ def aggregate_run(
                     "length_scale": length,
                 }
             )
-    from schemas import tabulate  # noqa: PLC0415 - `slip inspect` needs no contract
 
     return set_residuals(tabulate("aggregates", rows), slip)
 

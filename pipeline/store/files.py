@@ -494,8 +494,6 @@ def read_parquet(path: Path) -> pl.DataFrame:
     Raises:
         StoreError: ``file_missing`` or ``table_damaged``.
     """
-    import polars as pl  # noqa: PLC0415 - heavy, and `slip --help` imports this room
-
     with name_damage(path):
         return pl.read_parquet(path, glob=False)
 

@@ -33,7 +33,7 @@ from pipeline.store.names import (
     join_inside,
     name_disk_errors,
 )
-from pipeline.store.parquet_tables import CheckedTable
+from pipeline.store.parquet_tables import CheckedTable, check_table, read_facts
 
 LATEST = "latest"
 
@@ -139,8 +139,6 @@ class Generation:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``written_twice``, or the disk refuses.
         """
-        from pipeline.store.parquet_tables import check_table  # noqa: PLC0415 - heavy
-
         return self.write_checked(check_table(name, frame, facts))
 
     def replace_table(self, name: str, frame: pl.DataFrame) -> None:
@@ -153,8 +151,6 @@ class Generation:
         Raises:
             StoreError: ``no_such_table``, ``wrong_columns``, ``broken_rows``, or the disk refuses.
         """
-        from pipeline.store.parquet_tables import check_table, read_facts  # noqa: PLC0415 - heavy
-
         self._require_open()
         before = self._require_table(name)
         path = self._folder / before.file

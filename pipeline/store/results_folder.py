@@ -32,7 +32,8 @@ from pipeline.store.names import (
     name_clash,
     name_disk_errors,
 )
-from pipeline.store.verification import Examination
+from pipeline.store.parquet_tables import check_table
+from pipeline.store.verification import DiskFiles, Examination, examine_files
 
 LOCK = ".lock"
 RUNS = "runs"
@@ -206,8 +207,6 @@ class Store:
 
     def examine(self, sample: Sample | None = None) -> Examination:
         """Read everything again, or a sample; what is not what was written, and what cannot be judged."""
-        from pipeline.store.verification import DiskFiles, examine_files  # noqa: PLC0415 - rarely needed
-
         return examine_files(DiskFiles(self.root), sample=sample)
 
     def ask_again(self, manifest: Manifest) -> None:
@@ -254,8 +253,6 @@ class Store:
         Raises:
             StoreError: ``wrong_columns``, ``no_such_table``, ``locked``, or the disk refuses.
         """
-        from pipeline.store.parquet_tables import check_table  # noqa: PLC0415 - heavy
-
         checked = check_table(name, frame)
         valid, broken = checked.encode()
         quarantine = self.root / f"{QUARANTINE}{name}.parquet"

@@ -14,6 +14,7 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.analysis import STAGE_WORDS, STAGES, Options
+from pipeline.analysis.analyze import analyze_log, update_datasets
 from pipeline.batch.batch_work import Entry, Report, Settings, Task
 from pipeline.batch.executors import LocalExecutor
 from pipeline.core import SlipError
@@ -150,8 +151,6 @@ def _note(task: Task, stage: str) -> None:
 
 
 def _analyze(task: Task, entry: Entry) -> Entry:
-    from pipeline.analysis.analyze import analyze_log, update_datasets  # noqa: PLC0415 - only in workers
-
     outcome = analyze_log(task.path, task.options, partial(_note, task))
     update_datasets(Store(task.options.out))
     return replace(entry, state="lossy" if outcome.lossy else "done", run=outcome.manifest.run)

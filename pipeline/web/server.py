@@ -42,6 +42,7 @@ from pipeline.web import (
     is_loopback,
     make_handlers,
     make_token,
+    raise_open_files,
     read_ask,
 )
 from pipeline.web.jobs import Jobs
@@ -458,8 +459,6 @@ def serve(
     Raises:
         WorkbenchError: ``no_such_port``; ``port_taken``, the port cannot be opened.
     """
-    from pipeline.web import raise_open_files  # noqa: PLC0415 - heavy
-
     # Child processes must not import code from their working folder.
     os.environ["PYTHONSAFEPATH"] = "1"
     if host == "localhost":

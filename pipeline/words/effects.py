@@ -59,8 +59,6 @@ def describe_clause(effect: Named, run: RunDiagnosis) -> str:
 
 @lru_cache(maxsize=8)
 def _read_effects(model: str) -> tuple[Effect, ...]:
-    from pipeline.results import RunDiagnosis  # noqa: PLC0415 - only for its model
-
     file = read_model(RunDiagnosis(model=model))
     return () if file is None else file.model.effects
 
