@@ -76,8 +76,8 @@ class Change:
     """Comparison of one quantity on both sides.
 
     Attributes:
-        status: `changed` exceeds the variation between runs; `differs` exceeds chance within these runs, but
-            not the variation between runs; `unknown` if a side has no estimate.
+        status: `changed` exceeds the variation between runs that these runs show; `differs` exceeds chance
+            within these runs, but not that variation, or no runs show it; `unknown`: no estimate of a side.
         before, after: means of the sides; NaN if a side has no estimate.
         low, high: 95 % interval of the difference, for future runs.
         p: probability of a difference as large in any of all quantities without a change.
@@ -255,7 +255,8 @@ def compare_sides(
 
     Args:
         runs: runs of both sides, at least one of each.
-        usual: scale of the half-normal prior of each quantity's spread between runs, positive, shape (p,).
+        usual: scale of the half-normal prior of each quantity's spread between runs, shape (p,); zero for
+            one that runs share without a change.
         alike: whether runs of a side are assumed alike, so that only the errors of these recordings count.
         others: further runs of the vehicle by group, such as a terrain: they tell the spread between runs.
     """
@@ -282,7 +283,9 @@ def compare_sides(
             alone = within.ask(index, [index])
             half = alone.find_quantile(_TAIL / len(within.family))
             ends = (scale * (alone.difference - half), scale * (alone.difference + half))
-            change = replace(change, within=ends)
+            # What correlated errors leave open is no difference of this quantity.
+            is_open = change.status == "differs" and ends[0] <= 0.0 <= ends[1]
+            change = replace(change, within=ends, status="unchanged" if is_open else change.status)
         changes.append(change)
     return changes
 
@@ -293,12 +296,12 @@ def _find_sizes(runs: Sequence[RunNumbers], usual: Floats) -> Floats:
     known = np.isfinite(errors).any(axis=0)
     size = np.array(usual)
     size[known] = np.nanmedian(errors[:, known], axis=0)
-    return np.where(size > 0.0, size, usual)
+    return np.where(size > 0.0, size, np.where(usual > 0.0, usual, 1.0))
 
 
 def _learn_spread(runs: Sequence[tuple[str, RunNumbers]], index: int, usual: float) -> _Spread:
     known = [(group, run) for group, run in runs if run.known[index]]
-    if not known:
+    if not known or usual == 0.0:
         return _Spread(np.array([usual]), np.ones(1), usual)
     values = [float(run.values[index]) for _, run in known]
     errors = [max(math.sqrt(run.covariance[index, index]), _LEAST_ERROR) for _, run in known]
@@ -392,7 +395,11 @@ def _make_change(
     alone = judged.ask(index, [index])
     half = alone.find_quantile(_TAIL)
     p, p_within = significant[index], seen[index]
-    status: Status = "changed" if p <= CHANCE else "differs" if p_within <= CHANCE else "unchanged"
+    spread = judged.spreads[index]
+    is_known = spread.freedom > 0 or spread.usual == 0.0
+    status: Status = (
+        "changed" if p <= CHANCE and is_known else "differs" if min(p, p_within) <= CHANCE else "unchanged"
+    )
     goal = abs(alone.difference) if status == "differs" else 0.5 * smallest
     return Change(
         status,

@@ -34,6 +34,7 @@ from pipeline.datasets.check_readings import (
     USUAL_LOG_RATIO,
     USUAL_LOGARITHMS,
     RunReading,
+    widen,
 )
 from pipeline.datasets.check_sides import Baseline, Sides, format_baseline, read_sides
 from pipeline.datasets.pooling import ComparisonError
@@ -396,7 +397,34 @@ def find_usual_spread(parameter: Parameter) -> float:
 
 
 def compare(sides: Sides, limits: Limits | None = None, *, simulated: bool = False) -> Check:
-    """Compare two sides that were fitted with one model."""
+    """Compare two sides that were fitted with one model.
+
+    What differs is looked at again with errors by the likelihood at the other side's value (`widen`).
+    """
+    asked: dict[str, Change] = {}
+    while True:
+        check = _compare_once(sides, limits, simulated=simulated)
+        names = {label.name for label in sides.labels}
+        fresh = {
+            name: check.changes[name]
+            for status in ("changed", "differs")
+            for name in check.list_status(status)
+            if name in names and name not in asked
+        }
+        if not fresh:
+            return check
+        asked |= fresh
+        before, after = (
+            {name: getattr(one, side) for name, one in fresh.items()} for side in (BEFORE, AFTER)
+        )
+        sides = replace(
+            sides,
+            before=tuple(widen(one, sides.labels, after) for one in sides.before),
+            after=tuple(widen(one, sides.labels, before) for one in sides.after),
+        )
+
+
+def _compare_once(sides: Sides, limits: Limits | None, *, simulated: bool) -> Check:
     spreads = [find_usual_spread(label.parameter) for label in sides.labels]
     usual = np.array([*spreads, *(USUAL_LOGARITHMS[name] for name in LOGARITHMS)])
     names = [name for name in sides.names if name not in COMMANDED]

@@ -1,8 +1,8 @@
 """Estimates of one run with the model of a check, and the logarithms that are compared beside them."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import polars as pl
@@ -20,6 +20,7 @@ from pipeline.core import (
 from pipeline.datasets.changes import RunNumbers, Side
 from pipeline.estimation.commanded import measure_commanded_turn
 from pipeline.estimation.comparison import Input
+from pipeline.estimation.fit import fit_part
 from pipeline.estimation.intervals import Estimate, estimate_part
 from pipeline.estimation.model_fit import Fitted, fit_model
 from pipeline.estimation.problem import Problem
@@ -63,16 +64,16 @@ USUAL_LOG_SHARE = 0.18
 
 MULTIPLIER_ERROR = 0.01
 """Standard deviation of the logarithm of a multiplier that is measured by the wheels: that of simulated runs
-of one controller. It is a setting: from run to run it differs by no more."""
+of one controller."""
 
 
 USUAL_LOGARITHMS = {
     POSITION_ERROR: USUAL_LOG_RATIO,
     HEADING_ERROR: USUAL_LOG_RATIO,
     COMMANDED_TURN: USUAL_LOG_SHARE,
-    MULTIPLIER: MULTIPLIER_ERROR,
+    MULTIPLIER: 0.0,
 }
-"""Root mean square of the prior of each spread between runs."""
+"""Root mean square of the prior of each spread between runs; a setting has none."""
 
 
 _LEAST_SQUARE = 1e-12
@@ -81,6 +82,10 @@ _LEAST_SQUARE = 1e-12
 
 _LEAST_SLIP = 1e-6
 """Lower bound of a slip modulus [m/s], to keep its logarithm finite."""
+
+
+_LEAST_RISE = 0.01
+"""Smallest rise of chi-square between two values, to keep an error finite: less is the end of a fit."""
 
 
 _RESAMPLES = 200
@@ -190,6 +195,35 @@ def read_run(run: MotionRun, model: Model, source: Input, labels: Sequence[Label
     covariance[np.isnan(covariance) & ~np.eye(count, dtype=bool)] = 0.0
     numbers = RunNumbers(run.name, side, values, covariance)
     return RunReading(numbers, run.sha256, run.terrain, pace, fitted=fitted)
+
+
+def widen(reading: RunReading, labels: Sequence[Label], others: Mapping[str, float]) -> RunReading:
+    """The reading with the errors of some numbers by the likelihood at the values that another side has.
+
+    The error of a fit is that of small changes. Another value far from it may fit the run as well once the
+    other numbers follow: the error is then the one at which both values have their likelihoods.
+
+    Args:
+        reading: estimates of a run, returned unchanged without its fit.
+        labels: parameters of the reading, in its order.
+        others: value of another side, by name of the parameter.
+    """
+    fitted, numbers = reading.fitted, reading.numbers
+    factors = np.ones(numbers.values.size)
+    for index, label in enumerate(labels):
+        if fitted is None or label.name not in others or not numbers.known[index]:
+            continue
+        error, away = math.sqrt(numbers.covariance[index, index]), others[label.name] - numbers.values[index]
+        for fit in fitted.fits:
+            effect = fit.state.find(label.effect.id)
+            if effect is not None and label.name in {free.label for free in fit.free}:
+                name = label.parameter.name
+                moved = effect.change(**{name: others[label.name]}).fix(name)
+                risen = fit_part(fit.part, fit.state.add(moved), noise=fit.noise).score - fit.score
+                deviations = math.sqrt(max(risen / fit.overdispersion, _LEAST_RISE))
+                factors[index] = max(abs(away) / deviations / error, 1.0)
+    covariance = numbers.covariance * np.outer(factors, factors)
+    return replace(reading, numbers=replace(numbers, covariance=covariance))
 
 
 def _is_known(item: Estimate) -> bool:

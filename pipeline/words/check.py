@@ -32,6 +32,8 @@ Line = tuple[str, str]
 _MOST_NAMED = 3
 """Largest number of quantities in a sentence; the lines list all."""
 STATUSES = ("changed", "differs", "unchanged", "unknown")
+_MOST_ROWS = 6
+"""Rows of quantities of two single recordings, so that a screen of 24 lines holds the check."""
 _INDENT = "    "
 _NONE = 0.1
 """Largest effect of a simulation, as a fraction of the robot's, at which the simulation lacks the effect."""
@@ -41,7 +43,6 @@ _LEAST_SHARE = 0.01
 """Smallest share of cases that is printed as a number."""
 _LEAST_P = 1e-4
 """Smallest p value that is printed."""
-_ONE_A_SIDE = "One run a side: differences between runs of this robot without a change are not known"
 _WITH_SPREAD = "AFTER - BEFORE [95 % interval, with the differences between runs]"
 _WITHIN = "AFTER - BEFORE [95 % interval over all rows, of these recordings alone]"
 """What stands in the third column."""
@@ -62,17 +63,14 @@ def format_verdict(check: Check) -> str:
     elif named:
         listed = enumerate_texts([_format_change(check, name) for name in named[:_MOST_NAMED]])
         others = f" and {len(named) - _MOST_NAMED} more" if len(named) > _MOST_NAMED else ""
-        opening = "Likely changed" if _is_one_a_side(check) else "Changed"
-        effect = f"{_format_unchanged(check, named)}{_format_moves(check)}"
-        sentences.append(f"{opening}: {listed}{others}{effect}")
+        sentences.append(f"Changed: {listed}{others}{_format_unchanged(check, named)}{_format_moves(check)}")
     rest = "and no effect of the model explains it: run slip diagnose on AFTER"
     sentences += [f"{_format_change(check, name)}, {rest}" for name in changed if name in ERRORS]
-    if changed and _is_one_a_side(check):
-        sentences.append(f"{_ONE_A_SIDE}; usual ones were assumed")
-    elif not changed and differs:
+    if not changed and differs:
         sentences += _list_doubts(check, differs)
-    elif not changed and _is_one_a_side(check) and len(check.changes) > len(check.list_status("unknown")):
-        sentences += [_ONE_A_SIDE, "No quantity differs by more than the errors of these two recordings"]
+    elif not changed and _is_one_run(check) and len(check.changes) > len(check.list_status("unknown")):
+        errors = "the errors of these two recordings" if check.sides.kind == "runs" else "its errors"
+        sentences += [_format_one_run(check), f"No quantity differs by more than {errors}"]
     elif not changed:
         known = len(check.changes) - len(check.list_status("unknown"))
         nothing = "No conclusion: no quantity is known on both sides"
@@ -109,10 +107,14 @@ def _format_shares(change: Change) -> str:
     return f"{before.removesuffix(' %')} -> {after}"
 
 
-def _is_one_a_side(check: Check) -> bool:
-    """Whether a recording is compared with a recording, and nothing tells how much such runs differ."""
-    counts = (len(check.sides.before), len(check.sides.after))
-    return check.sides.kind == "runs" and counts == (1, 1) and not check.is_spread_known
+def _is_one_run(check: Check) -> bool:
+    """Whether one recording is compared with one, or with a model, and nothing tells how much runs differ."""
+    return not check.is_spread_known and len(check.sides.before) == len(check.sides.after) == 1
+
+
+def _format_one_run(check: Check) -> str:
+    what = "One run a side" if check.sides.kind == "runs" else f"One run beside a {check.sides.kind}"
+    return f"{what}: differences between runs of this robot without a change are not known"
 
 
 def _list_doubts(check: Check, differs: Sequence[str]) -> list[str]:
@@ -124,11 +126,13 @@ def _list_doubts(check: Check, differs: Sequence[str]) -> list[str]:
     likely = min(change.p for change in changes) <= LIKELY
     others = [f"{len(differs) - _MOST_NAMED} more"] if len(differs) > _MOST_NAMED else []
     chance = f"runs without a change differ by as much in {rate} of cases"
-    if _is_one_a_side(check):
+    if _is_one_run(check):
         texts = [f"{_name(check, name)} by {_format_difference(check, name)}" for name in differs]
         listed = enumerate_texts([*texts[:_MOST_NAMED], *others])
         guess = "A change is likely" if likely else "This may be chance"
-        return [_ONE_A_SIDE, f"These two differ in {listed}", f"{guess}: {chance}"]
+        both = "These two differ" if check.sides.kind == "runs" else "It differs"
+        usual = f"runs of other robots differ by as much without a change in {rate} of cases"
+        return [_format_one_run(check), f"{both} in {listed}", f"{guess}: {usual}"]
     listed = enumerate_texts(
         [
             f"{_name(check, name)} {_format_pair(check, name)} ({_format_p(change.p_within, 1)})"
@@ -248,11 +252,12 @@ def _format_power(check: Check) -> list[str]:
     ]
     if not asked or check.list_status("changed"):
         return []
-    if _is_one_a_side(check):
+    if _is_one_run(check):
         missing = check.changes[(check.list_status("differs") or asked)[0]].count_missing()
         needed = "a few more runs" if missing is None else f"{missing} more run{'s' * (missing != 1)}"
+        side = " a side" if check.sides.kind == "runs" else ""
         return [
-            f"{needed} a side would {'decide' if check.list_status('differs') else 'show smaller changes'}"
+            f"{needed}{side} would {'decide' if check.list_status('differs') else 'show smaller changes'}"
         ]
     asked.sort(key=lambda name: _share(check, name))
     text = enumerate_texts([_format_smallest(check, name) for name in asked[:_MOST_NAMED]])
@@ -290,15 +295,16 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
     Args:
         check: the check.
         everything: a row with its id and resolution for every quantity; else what did not change is a list
-            of names, but where one run is compared with one: the differences are then the answer.
+            of names, but for the first ones where one run is compared with one.
     """
     lines = [("verdict", format_verdict(check))]
     lines += [(one.outcome, f"{one.name}: {one.measured} ({one.limit})") for one in check.limits]
     ranked = [name for status in STATUSES for name in check.list_status(status)]
     known = _list_known(check)
     different = [*check.list_status("changed"), *check.list_status("differs")]
-    listed = known if _is_one_a_side(check) else different
-    shown = ranked if everything else [name for name in ranked if name in listed]
+    # Of two recordings the differences are the answer, as many as a screen holds.
+    listed = [name for name in ranked if name in known][:_MOST_ROWS] if _is_one_run(check) else []
+    shown = ranked if everything else [name for name in ranked if name in {*different, *listed}]
     texts = [_list_columns(check, name) for name in shown]
     # The reason why a quantity is unknown is longer than what stands in its column.
     columns = [row if name in known else row[:1] for name, row in zip(shown, texts, strict=True)]
@@ -331,17 +337,19 @@ def list_lines(check: Check, *, everything: bool = True) -> list[Line]:
 def _name_outcome(check: Check, name: str) -> str:
     """The outcome of a quantity; of two recordings nobody can say that nothing changed."""
     is_unchanged = check.changes[name].status == "unchanged"
-    return "not shown" if is_unchanged and _is_one_a_side(check) else check.name_outcome(name)
+    return "not shown" if is_unchanged and _is_one_run(check) else check.name_outcome(name)
 
 
 def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
     """Names of the quantities of which no change is shown, a line for each outcome."""
     groups: dict[str, list[str]] = {}
     for name in names:
-        groups.setdefault(check.name_outcome(name), []).append(name)
+        groups.setdefault(_name_outcome(check, name), []).append(name)
     outcomes: dict[str, set[str]] = {}
     for name in check.changes:
-        outcomes.setdefault(name.partition(".")[0], set()).add(check.name_outcome(name))
+        outcomes.setdefault(name.partition(".")[0], set()).add(
+            _name_outcome(check, name) if name in names else ""
+        )
     lines = []
     for outcome, alike in groups.items():
         # An effect of several parameters is one name where all of them share an outcome.
@@ -351,7 +359,7 @@ def _list_names(check: Check, names: Sequence[str]) -> list[Line]:
             else _name(check, name)
             for name in alike
         ]
-        few = "; too few runs to tell" if outcome == "not shown" else ""
+        few = "; too few runs to tell" if outcome == "not shown" and not _is_one_run(check) else ""
         lines.append((outcome, enumerate_texts(list(dict.fromkeys(texts))) + few))
     return [*lines, ("", "all numbers, and the changes that could be detected: --all")] if lines else []
 

@@ -34,7 +34,7 @@ def list_changed(found: list[Change]) -> list[int]:
     return [place for place, change in enumerate(found) if change.status == "changed"]
 
 
-@pytest.mark.parametrize("runs", [1, pytest.param(3, marks=pytest.mark.long)])
+@pytest.mark.parametrize("runs", [2, pytest.param(3, marks=pytest.mark.long)])
 def test_runs_that_differ_as_is_usual_raise_few_alarms(runs: int) -> None:
     draw = np.random.default_rng(7)
     usual = 0.3
@@ -78,6 +78,26 @@ def test_single_runs_do_not_show_what_several_do() -> None:
     assert several.status == "changed"
     assert not several.is_default
     assert several.low < 0.6 < several.high
+
+
+def test_single_runs_show_no_change_however_far_they_are_apart() -> None:
+    draw = np.random.default_rng(10)
+    far = np.array([30.0, 0.0, 0.0, 0.0])
+
+    single = compare_sides(draw_runs(draw, 1, shift=far), USUAL)
+    settings = compare_sides(draw_runs(draw, 1, shift=far), np.array([0.0, 0.3, 0.3, 0.3]))
+
+    assert single[0].p < 0.02
+    assert single[0].status == "differs"
+    # A setting is the same in all runs without a change.
+    assert settings[0].status == "changed"
+
+
+def test_a_difference_whose_interval_holds_zero_is_none() -> None:
+    draw = np.random.default_rng(11)
+    for _ in range(50):
+        found = compare_sides(draw_runs(draw, 1, shift=np.array([0.3, 0.25, 0.3, 0.3]), shared=0.95), USUAL)
+        assert all(one.within[0] * one.within[1] > 0.0 for one in found if one.status == "differs")
 
 
 def test_the_runs_that_are_asked_for_show_the_difference() -> None:

@@ -1,6 +1,7 @@
 """A check of simulated runs: what changed is named, limits are judged, a baseline stands for its runs."""
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as ET
@@ -20,7 +21,7 @@ from pipeline.datasets.check import (
     keep_baseline,
     read_limits,
 )
-from pipeline.datasets.check_readings import POSITION_ERROR
+from pipeline.datasets.check_readings import POSITION_ERROR, widen
 from pipeline.datasets.check_sides import Sides, read_baseline, read_under, unite_effects
 from pipeline.models.catalogue import find_effect
 from pipeline.models.effect import Effect
@@ -321,6 +322,25 @@ def test_every_format_says_the_same_and_markup_in_a_name_stays_text(late: Sides)
     assert "| lag of the drive | changed | +0.1" in markdown
     assert "<b>" not in markdown
     assert "\x1b" not in markdown
+
+
+def test_an_error_towards_a_far_value_is_that_of_the_likelihood_there() -> None:
+    # A drive whose force falls with speed, and one of less force at every speed, turn much alike.
+    servo = {"tau": 0.15, "reset": 0.35, "drag": 0.07, "bound": 1.29, "no_load": 1.5, "scrub": 1.4}
+    run = simulate({"wheel_servo": servo}, seed=3, duration_s=60.0)
+    file = ModelFile(Model(vehicle_of("husky_a200"), (make("wheel_servo", **servo),)))
+    sides = read_under(file, {BEFORE: [run], AFTER: [run]})
+    name, (reading,) = "wheel_servo.no_load", sides.before
+    index = [label.name for label in sides.labels].index(name)
+    value, error = reading.numbers.values[index], math.sqrt(reading.numbers.covariance[index, index])
+
+    def count_deviations(other: float) -> float:
+        wide = widen(reading, sides.labels, {name: other}).numbers.covariance[index, index]
+        return float(abs(other - value) / math.sqrt(wide))
+
+    assert count_deviations(value + error) == pytest.approx(1.0, abs=0.3)
+    # By the error of small changes it would be thousands.
+    assert 3.0 < count_deviations(26.5) < 50.0 < (26.5 - value) / error
 
 
 def test_models_of_both_sides_are_united() -> None:
