@@ -83,6 +83,11 @@ def test_new_runs_are_checked_against_a_model_of_their_vehicle(field: Path, orig
     slow.write("husky.toml")
     (slip.Model("warthog") + "drive_lag").write("warthog.toml")
     asked = ("--check", "husky.toml", "--check", "warthog.toml", "--notify", TELL)
+    # A single run does not tell how much runs of the robot differ.
+    single = ask_verb("batch", "field", *INLINE, *asked, "--results", "single")
+    assert "A change is likely" in single["after"][0]["text"]
+    assert single["alerts"] == []
+    shutil.copy(originals / "b.mcap", field)
     told = ask_verb("batch", "field", *INLINE, *asked, code=4)
     husky, warthog = told["after"]
     assert husky["text"].startswith("Changed: lag of the drive 1.2 -> 0.")
@@ -91,9 +96,9 @@ def test_new_runs_are_checked_against_a_model_of_their_vehicle(field: Path, orig
     # Nothing new, nothing to check.
     again = ask_verb("batch", "field", *INLINE, *asked)
     assert again["after"][0]["text"] == "no new run of Clearpath Husky A200"
-    shutil.copy(originals / "b.mcap", field)
     (field / "check.toml").write_text('[parameter]\n"drive_lag.tau" = {max = 5}\n')
-    kept = ask_verb("batch", "field", *INLINE, *asked, "--limits", field / "check.toml")
+    limits = ("--limits", field / "check.toml", "--results", "limited")
+    kept = ask_verb("batch", "field", *INLINE, *asked, *limits)
     assert kept["alerts"] == []
 
 

@@ -1,5 +1,6 @@
 """`slip check`: exit codes, files, and a baseline that is kept and used, as a user calls it."""
 
+import html
 import json
 from pathlib import Path
 
@@ -11,14 +12,16 @@ from pipeline.simulate import simulate_case
 
 HOLD = {"drive_lag": {"tau": 0.3}}
 LATE = {"drive_lag": {"tau": 1.2}}
+LATE_RUNS = "logs/late.mcap,more/late.mcap"
 
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two drives of a Husky, a late one, and a model of the first: `a.mcap`, `b.mcap`, `late.mcap`."""
+    """Two drives of a Husky, two late ones, and a model of the first: `a`, `b` and `late`, `more/late`."""
     folder = tmp_path_factory.mktemp("check")
-    for number, (name, effects) in enumerate({"a": HOLD, "b": HOLD, "late": LATE}.items(), start=1):
-        out = folder / "logs" / f"{name}.mcap"
+    drives = {"logs/a": HOLD, "logs/b": HOLD, "logs/late": LATE, "more/late": LATE}
+    for number, (name, effects) in enumerate(drives.items(), start=1):
+        out = folder / f"{name}.mcap"
         simulate_case("ideal_husky", effects, out=out, duration_s=60.0, seed=number)
     run("model", "new", "husky.toml", "--vehicle", "husky_a200", "--effects", "drive_lag", cwd=folder)
     run("model", "fit", "husky.toml", "--on", "logs/a.mcap", cwd=folder)
@@ -38,29 +41,33 @@ def check(place: Path, *arguments: object, code: int) -> str:
 
 
 def test_the_verdict_comes_first_and_the_exit_code_says_it(place: Path) -> None:
-    same = check(place, "husky.toml", "logs/b.mcap", code=0)
-    late = check(place, "husky.toml", "logs/late.mcap", code=4)
+    same = check(place, "husky.toml", "logs/a.mcap,logs/b.mcap", code=0)
+    late = check(place, "husky.toml", LATE_RUNS, code=4)
+    single = " ".join(check(place, "husky.toml", "logs/late.mcap", "--results", "alone", code=3).split())
 
     assert same.startswith("No change shown in 1 quantity.")
     assert late.startswith("Changed: lag of the drive 0.3")
-    assert "-> 1.19 s" in late
-    rows = check(place, "husky.toml", "logs/late.mcap", "--all", code=4).splitlines()[1:]
+    assert "-> 1.2 s" in late
+    assert single.startswith("One run beside a model: differences between runs of this robot")
+    assert "It differs in lag of the drive by +" in single
+    assert "A change is likely: " in single
+    rows = check(place, "husky.toml", LATE_RUNS, "--all", code=4).splitlines()[1:]
     assert max(map(len, [*late.splitlines()[1:], *rows])) <= 80
     assert "; spread between runs" in rows[2]
 
 
 def test_screen_json_and_python_say_the_same(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(place)
-    screen = check(place, "husky.toml", "logs/late.mcap", code=4)
-    content = json.loads(check(place, "husky.toml", "logs/late.mcap", "--json", code=4))
-    found = slip.check("husky.toml", "logs/late.mcap")
+    screen = check(place, "husky.toml", LATE_RUNS, code=4)
+    content = json.loads(check(place, "husky.toml", LATE_RUNS, "--json", code=4))
+    found = slip.check("husky.toml", ["logs/late.mcap", "more/late.mcap"])
 
     assert content == {**found.to_json(), "errors": []}
     assert f"{found!r}\n" == screen
     assert found.code == content["exit_code"] == 4
     row = found.numbers.row(by_predicate=slip_number("drive_lag.tau"), named=True)
     assert row["status"] == "changed"
-    assert found.verdict in found._repr_html_().replace("&gt;", ">")
+    assert found.verdict in html.unescape(found._repr_html_())
 
 
 def slip_number(name: str) -> object:
@@ -80,7 +87,7 @@ def test_limits_gate_a_build_and_the_report_is_a_file(place: Path) -> None:
 
     assert 'failures="0"' in kept
     assert 'failures="1"' in broken
-    markdown = check(place, "husky.toml", "logs/late.mcap", "--to", "markdown", code=4)
+    markdown = check(place, "husky.toml", LATE_RUNS, "--to", "markdown", code=4)
     assert markdown.startswith("**Changed: lag of the drive")
 
 
