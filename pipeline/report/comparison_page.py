@@ -44,7 +44,7 @@ from pipeline.report.page import add_figures, render_figures
 from pipeline.report.scene import format_ends
 from pipeline.report.theme import Channel, Chart, Drawing, encode_column, layer, make_axis, stack
 from pipeline.store import Store
-from pipeline.words import Line, list_pairs, list_shown_notes, title_line
+from pipeline.words import Line, PairLine, list_pairs, list_shown_notes, title_line
 from pipeline.words.comparison import list_lines
 
 _ROW_HEIGHT = 34
@@ -321,15 +321,23 @@ def render_comparison(answer: Answer, notes: Sequence[str]) -> str:
     facts = [f"{shown.height} datasets", f"{shown['runs'].sum()} runs", answer.measure]
     pictures = list_pictures(answer)
     published, driving = ([one for one in pictures if one.id == name] for name in (_PUBLISHED, _DRIVING))
+    answers = _list_answers(answer)
+    inputs = [
+        {
+            "words": INPUT_WORDS[name],
+            "answers": [one for one in answers if one["input"] == name],
+            "pictures": [one for one in pictures if one.id.endswith(f"_{name}") and one.id != _PUBLISHED],
+            "pairs": _tabulate_ratios(answer, name),
+        }
+        for name in answer.inputs
+    ]
     return render_figures(
         "report/templates/comparison.html",
         pictures,
         title="Deployments compared",
         facts=facts,
-        answers=_list_answers(answer),
-        main_pictures=[picture for picture in pictures if picture.id not in {_PUBLISHED, _DRIVING}],
+        inputs=inputs,
         driving=driving,
-        ratios=[table for name in answer.inputs if (table := _tabulate_ratios(answer, name))],
         published=published,
         unit=ABOUT_UNIT,
         datasets=_tabulate_datasets(shown, answer.input),
@@ -348,7 +356,7 @@ def _list_answers(answer: Answer) -> list[dict[str, object]]:
     answers: dict[str, list[Line]] = {}
     for line in list_lines(answer):
         answers.setdefault(title_line(line), []).append(line)
-    return [{"title": title, "lines": lines} for title, lines in answers.items()]
+    return [{"title": title, "input": lines[0].input, "lines": lines} for title, lines in answers.items()]
 
 
 _PUBLISHED = "window_norms_by_dataset"
@@ -386,8 +394,23 @@ def list_pictures(answer: Answer) -> list[Picture]:
     return pictures
 
 
-def _tabulate_ratios(answer: Answer, input_name: str) -> Table | None:
-    """One line a pair: ratios as driven and at equal driving."""
+def _tabulate_ratios(answer: Answer, input_name: str) -> list[Table]:
+    """One line a pair: ratios as driven and at equal driving; first the pairs that differ."""
+    pairs = list_pairs(answer, input_name)
+    sure = [pair for pair in pairs if pair.is_driven_sure or pair.is_equal_sure]
+    groups = (sure, [pair for pair in pairs if pair not in sure])
+    counts = (
+        f"{len(sure)} of {len(pairs)} pairs differ significantly (bold)",
+        f"{len(groups[1])} pairs of which none differs significantly",
+    )
+    return [
+        _tabulate_pair_ratios(rows, f"{count}: times as much slip, {INPUT_WORDS[input_name]}")
+        for rows, count in zip(groups, counts, strict=True)
+        if rows
+    ]
+
+
+def _tabulate_pair_ratios(pairs: Sequence[PairLine], caption: str) -> Table:
     rows: list[list[str | Cell]] = [
         [
             f"{pair.hard} / {pair.easy}",
@@ -397,12 +420,9 @@ def _tabulate_ratios(answer: Answer, input_name: str) -> Table | None:
             pair.common or MISSING,
             pair.carrier or MISSING,
         ]
-        for pair in list_pairs(answer, input_name)
+        for pair in pairs
     ]
-    if not rows:
-        return None
     columns = [i for i in range(len(_RATIOS)) if any(row[i] not in (MISSING, Cell(MISSING)) for row in rows)]
-    caption = f"Times as much slip, {INPUT_WORDS[input_name]}; bold: significant over all pairs"
     return Table(caption, [_RATIOS[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 

@@ -95,15 +95,16 @@ def render_fleet(content: Mapping[str, object]) -> str:
     vehicles = []
     for number, name in enumerate(runs):
         own = [row for row in rows if row["vehicle"] == name]
-        levels = Table(
-            f"Parameters of {name} by level",
-            _LEVELS,
-            [_list(row) for row in own],
-        )
+        known = [row for row in own if row["low"] is not None]
+        few = [row for row in own if row["low"] is None]
+        levels = _tabulate_levels(f"Parameters of {name} by level", known or few)
+        single = f"{format_count(len(few), 'parameter')} of {name} from too few runs for an interval"
         means = [row_means for row in own for row_means in _list_terrains(row)]
-        vehicles.append(
-            (f"vehicle-{number}", name, levels, Table(f"Means of {name} by terrain", _TERRAINS, means))
-        )
+        more = [
+            _tabulate_levels(single, few if known else []),
+            Table(f"Means of {name} by terrain", _TERRAINS, means),
+        ]
+        vehicles.append((f"vehicle-{number}", name, levels, [table for table in more if table.rows]))
     keys = cast("Sequence[str]", content["keys"])
     return render_figures(
         "report/templates/fleet.html",
@@ -121,6 +122,12 @@ def render_fleet(content: Mapping[str, object]) -> str:
         ],
         runs=keys,
     )
+
+
+def _tabulate_levels(caption: str, parameters: Sequence[Mapping[str, object]]) -> Table:
+    rows = [_list(row) for row in parameters]
+    columns = [i for i in range(len(_LEVELS)) if any(row[i] for row in rows)]
+    return Table(caption, [_LEVELS[i] for i in columns], [[row[i] for i in columns] for row in rows])
 
 
 def _label(row: Mapping[str, object]) -> str:

@@ -10,7 +10,14 @@ from pipeline.door import open_door
 
 if TYPE_CHECKING:
     from pipeline.words.check import format_junit, format_markdown, list_lines
-    from pipeline.words.comparison import Line, list_pairs, list_shown_notes, summarize_answer, title_line
+    from pipeline.words.comparison import (
+        Line,
+        PairLine,
+        list_pairs,
+        list_shown_notes,
+        summarize_answer,
+        title_line,
+    )
     from pipeline.words.diagnosis import (
         VERDICT,
         describe,
