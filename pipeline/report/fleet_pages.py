@@ -100,11 +100,11 @@ def render_fleet(content: Mapping[str, object]) -> str:
         levels = _tabulate_levels(f"Parameters of {name} by level", known or few)
         single = f"{format_count(len(few), 'parameter')} of {name} from too few runs for an interval"
         means = [row_means for row in own for row_means in _list_terrains(row)]
-        more = [
+        folded = [
             _tabulate_levels(single, few if known else []),
             Table(f"Means of {name} by terrain", _TERRAINS, means),
         ]
-        vehicles.append((f"vehicle-{number}", name, levels, [table for table in more if table.rows]))
+        vehicles.append((f"vehicle-{number}", name, levels, [table for table in folded if table.rows]))
     keys = cast("Sequence[str]", content["keys"])
     return render_figures(
         "report/templates/fleet.html",
