@@ -170,10 +170,10 @@ def format_remaining_error(error_m: float, floor_m: float, explained: float) -> 
     if error_m < ABOVE_FLOOR * floor_m:
         beside = "" if floor == format_length(error_m) else f" ({floor})"
         return f"{text}, {format_excess(error_m / floor_m)} the noise floor{beside}"
-    removed = (
-        f": the effects remove {format_share(max(explained, 0.0), 0)} of the error above the noise floor"
-    )
-    return f"{text}, noise floor {floor}{'' if math.isnan(explained) else removed}"
+    text, share = f"{text}, noise floor {floor}", format_share(explained, 0)
+    if not explained > 0.0 or share == format_share(0.0, 0):
+        return text
+    return f"{text}: the effects remove {share} of the error above the noise floor"
 
 
 def describe_structure(rest: Unexplained) -> str:

@@ -147,7 +147,9 @@ def _describe_choice(run: RunDiagnosis) -> str:
 def _join_clauses(clauses: Sequence[str]) -> str:
     """Clauses in their order as one sentence, neighbours with the same subject joined."""
     groups = groupby(clauses, key=lambda one: one.startswith("the "))
-    return ", and ".join(f"{'' if own else 'the robot '}{enumerate_texts([*some])}" for own, some in groups)
+    return ", and ".join(
+        ", and ".join(some) if own else f"the robot {enumerate_texts([*some])}" for own, some in groups
+    )
 
 
 def _name_model(step: Step, shown: int) -> str:

@@ -1,6 +1,7 @@
 """The verdict on a run: at most three sentences for people, of which every number is a stored one."""
 
 import json
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -95,3 +96,9 @@ def test_the_verdict_and_the_line_below_agree_on_the_noise_floor(error: float, s
     line = format_remaining_error(error, FLOOR["t_mrmse_m"], 0.98)
     assert ("at the noise floor" in line) is (says == "at the noise floor")
     assert (says in line) or error >= ABOVE_FLOOR * FLOOR["t_mrmse_m"]
+
+
+@pytest.mark.parametrize("explained", [math.nan, -0.2, 0.0, 0.004])
+def test_effects_that_remove_nothing_are_not_said_to_remove_a_share(explained: float) -> None:
+    assert format_remaining_error(0.4, 0.2, explained) == "remaining error 40 cm, noise floor 20 cm"
+    assert "remove 50 % of the error" in format_remaining_error(0.4, 0.2, 0.5)
