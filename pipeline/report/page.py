@@ -286,6 +286,12 @@ def sum_up_slip(page: Page) -> str:
     return f"median slip modulus {', '.join(texts)}" if texts else ""
 
 
+def sum_up_rest(page: Page) -> str:
+    """The error of the model beside the noise floor."""
+    ideal = "that of the ideal model: no effect was added"
+    return format_remaining(page.report) or (ideal if page.report.diagnosis.ladder else "")
+
+
 def sum_up_health(page: Page) -> str:
     """Losses, gaps and serious findings."""
     return ", ".join(words for _, words in summarise_health(page.report))
@@ -297,7 +303,7 @@ SECTIONS = (
     PageSection("what-now", "What to do next", view_what_now),
     PageSection("where", "Where", view_where, sum_up_where),
     PageSection("how-bad", "How much slip", view_how_bad, sum_up_slip),
-    PageSection("rest", "Remaining error", view_rest, lambda page: format_remaining(page.report)),
+    PageSection("rest", "Remaining error", view_rest, sum_up_rest),
     PageSection("health", "Data health", view_health, sum_up_health),
     PageSection(
         "provenance",

@@ -41,7 +41,7 @@ export const buildRuns = (pane) => {
     list.replaceChildren(...shown.map((run) => h("li", {},
       h("button", { type: "button", class: "run", "aria-current": pane.run === run.run ? "true" : null, title: run.run, bar: most > 0 ? (run.median_modulus ?? 0) / most : 0, onclick: () => pane.open(run.run) },
         h("b", {}, run.run),
-        h("span", { class: "slip-of" }, Number.isFinite(run.median_modulus) ? `slip ${say(run.median_modulus)} m/s` : ""),
+        h("span", { class: "slip-of" }, Number.isFinite(run.median_modulus) ? `slip ${say(run.median_modulus, 2)} m/s` : ""),
         h("span", { class: "facts" }, [run.vehicle, run.terrain, sayDuration(run.duration_s)].filter(Boolean).join(" · "), " ", sayHealth(run))))));
   };
   search.addEventListener("input", () => show());

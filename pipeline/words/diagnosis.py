@@ -7,6 +7,7 @@ from itertools import pairwise
 
 from pipeline.core import (
     INPUT_WORDS,
+    enumerate_texts,
     format_angle,
     format_part,
     format_share,
@@ -432,6 +433,10 @@ def format_learned_share(run: RunDiagnosis) -> str:
         return ""
     removed = [f"{format_share(one.physics)} of the {words} error" for words, one in known.items()]
     with_learned = " and ".join(format_share(one.with_learned) for one in known.values())
+    if not run.effects:
+        shares = [f"{format_share(one.with_learned)} of the {words} error" for words, one in known.items()]
+        learns = "a function learned from the data, which names no cause, removes"
+        return f"{scope}above the noise floor, {learns} {enumerate_texts(shares)}"
     beyond = f"with a function learned from the data, which names no cause, {with_learned}"
     return f"{scope}above the noise floor, the effects remove {' and '.join(removed)}; {beyond}"
 

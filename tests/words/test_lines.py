@@ -10,6 +10,7 @@ from pipeline.results import (
     DataNeed,
     Finding,
     Learned,
+    LearnedShare,
     Named,
     PathLadder,
     Region,
@@ -136,6 +137,13 @@ def test_motion_that_lasts_is_one_short_sentence() -> None:
     assert describe_unexplained(lasting) == (
         "the yaw error wanders for seconds at a time (0.19 rad/s); nothing that was tried explains it"
     )
+
+
+def test_without_effects_a_learned_term_stands_beside_none() -> None:
+    share = {"t_mrmse_m": LearnedShare(0.0, 0.66), "r_mrmse_rad": LearnedShare(0.0, 0.02)}
+    text = format_learned_share(RunDiagnosis(learned=Learned(helps=True, explained_share=share)))
+    assert text.endswith("removes 66 % of the position error and 2 % of the heading error")
+    assert "the effects" not in text
 
 
 def test_a_learned_term_is_said_of_the_path_that_it_was_learned_on() -> None:
