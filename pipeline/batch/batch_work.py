@@ -21,7 +21,7 @@ import msgspec
 
 from pipeline.analysis import Options
 from pipeline.analysis.analyze import Outcome, analyze_log
-from pipeline.core import SlipError, end_with, objects_in, silence_warnings
+from pipeline.core import SlipError, end_with, limit_memory, objects_in, read_memory, silence_warnings
 from pipeline.logs import FETCHED
 from pipeline.store import JSON, LOG_NOTES, REPORT, LogSighting, Mirror, Store, StoreError, stored_contexts
 
@@ -202,7 +202,7 @@ def work_on(task: Task) -> Report:
         fetched_bytes=FETCHED.total - fetched,
     )
     Ledger(store, mirror).write(entry)
-    return Report(entry=entry, is_new=is_new, rss_bytes=read_rss())
+    return Report(entry=entry, is_new=is_new, rss_bytes=read_memory(os.getpid()))
 
 
 def _analyze(task: Task, entry: Entry, mirror: Mirror | None) -> tuple[Entry, bool]:
@@ -252,15 +252,6 @@ def _note_surprise(entry: Entry, error: BaseException) -> Entry:
 def _peak_bytes() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-def read_rss() -> int:
-    """Current memory of this process [bytes]; the peak where the system does not provide it."""
-    try:
-        with open("/proc/self/statm", "rb") as file:  # noqa: PTH123 - called for every log
-            return int(file.read().split()[1]) * resource.getpagesize()
-    except OSError:
-        return _peak_bytes()
 
 
 @dataclass(frozen=True)
@@ -367,7 +358,6 @@ def load_libraries() -> None:
 
 
 DEATHS = "batch/deaths"
-_GUARD_PERIOD_S = 0.1
 
 
 def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float, memory_bytes: int) -> Report:
@@ -379,26 +369,20 @@ def run_guarded(work: Callable[[Task], Report], task: Task, *, timeout_s: float,
         timeout_s: time limit [s].
         memory_bytes: memory limit.
     """
-    done = threading.Event()
 
-    def guard() -> None:
-        remaining_s = timeout_s
-        while not done.wait(_GUARD_PERIOD_S):
-            remaining_s -= _GUARD_PERIOD_S
-            held = read_rss()
-            if held > memory_bytes:
-                limit = memory_bytes / 1e9
-                _die_of(task, "out_of_memory", f"it used {held / 1e9:.2g} GB, more than {limit:.2g} GB")
-            if remaining_s <= 0.0:
-                _die_of(task, "timed_out", f"it did not end within {timeout_s:g} s")
+    def give_up(held: int) -> None:
+        limit = memory_bytes / 1e9
+        _die_of(task, "out_of_memory", f"it used {held / 1e9:.2g} GB, more than {limit:.2g} GB")
 
-    watcher = threading.Thread(target=guard, name="guard", daemon=True)
-    watcher.start()
+    late = f"it did not end within {timeout_s:g} s"
+    timer = threading.Timer(timeout_s, _die_of, (task, "timed_out", late))
+    timer.daemon = True
+    timer.start()
     try:
-        return work_safely(work, task)
+        with limit_memory(memory_bytes, give_up):
+            return work_safely(work, task)
     finally:
-        done.set()
-        watcher.join()
+        timer.cancel()
 
 
 def _die_of(task: Task, code: str, reason: str) -> None:

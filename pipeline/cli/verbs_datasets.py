@@ -22,8 +22,6 @@ from pipeline.core import (
 )
 
 if TYPE_CHECKING:
-    import polars as pl
-
     from pipeline.datasets import Answer, Question
     from pipeline.store import Store
 
@@ -240,16 +238,10 @@ def _format_pairs(answer: Answer, name: str) -> list[str]:
     return [*lines, f"... and {omitted} more pairs on the page"] if omitted > 0 else lines
 
 
-_OWN = Path("deployments.csv")
-_PARQUET = b"PAR1"
-"""First bytes of a Parquet file."""
-
-
 def build_map() -> App:
-    """The verb and its two commands."""
+    """The verb and its command."""
     verb = App(name="map", help="Draw deployments by kinetic energy and terrain complexity.")
     verb.default(draw)
-    verb.command(add)
     verb.command(merge)
     return verb
 
@@ -355,40 +347,16 @@ def _format_value(value: float | None, unit: str) -> str:
     return "-" if value is None else f"{value:.3g}{'' if unit == '1' else f' {unit}'}"
 
 
-def add(  # noqa: D417 - arguments document themselves
-    entry: Annotated[Path, Parameter(help="TOML file with one deployment: column = value")],
-    /,
-    *,
-    file: Annotated[Path, Parameter(help="table to add it to; made when it is not there")] = _OWN,
-    json: bool = False,
-    quiet: bool = False,
-) -> int:
-    """Append a deployment to a table, checked against the schema.
-
-    Args:
-        json: print one JSON object.
-        quiet: print nothing.
-    """
-    from pipeline.datasets import add_deployment, write_deployments  # noqa: PLC0415 - heavy
-
-    table = add_deployment(file, entry)
-    write_deployments(table, file)
-    return _print_written(table, file, json=json, quiet=quiet)
-
-
 def merge(  # noqa: D417 - arguments document themselves
-    first: Annotated[Path, Parameter(help="a table of deployments (CSV), or features (Parquet)")],
-    second: Annotated[Path, Parameter(help="another")],
+    first: Annotated[Path, Parameter(help="features of deployments (Parquet)")],
+    second: Annotated[Path, Parameter(help="others")],
     /,
     *,
-    file: Annotated[
-        Path | None,
-        Parameter(help="file to write; may be one of them (default: deployments.csv or features.parquet)"),
-    ] = None,
+    file: Annotated[Path, Parameter(help="file to write; may be one of them")] = Path("features.parquet"),
     json: bool = False,
     quiet: bool = False,
 ) -> int:
-    """Merge two tables of deployments, or two files of `slip fleet share`.
+    """Merge two files of `slip fleet share`.
 
     What stands in both counts once. Contradictions are refused, and so is a file that is not what it should
     be.
@@ -397,39 +365,14 @@ def merge(  # noqa: D417 - arguments document themselves
         json: print one JSON object.
         quiet: print nothing.
     """
-    if _are_features(first, second):
-        return _merge_features(first, second, file or Path("features.parquet"), json=json, quiet=quiet)
-    from pipeline.datasets import merge_deployments, write_deployments  # noqa: PLC0415 - heavy
-
-    file = file or _OWN
-    table = merge_deployments(first, second)
-    write_deployments(table, file)
-    return _print_written(table, file, json=json, quiet=quiet)
-
-
-def _are_features(*paths: Path) -> bool:
-    for path in paths:
-        if path.is_file():
-            with path.open("rb") as file:
-                if file.read(len(_PARQUET)) == _PARQUET:
-                    return True
-    return False
-
-
-def _merge_features(first: Path, second: Path, path: Path, *, json: bool, quiet: bool) -> int:
     from pipeline.datasets import merge_features, read_features, write_features  # noqa: PLC0415 - heavy
 
     merged, twice = merge_features([read_features(path) for path in (first, second)], f"{first} and {second}")
-    write_features(merged, path)
+    write_features(merged, file)
     runs = merged["sha256"].n_unique()
-    content = {"file": str(path), "runs": runs, "rows": merged.height, "twice": twice}
-    line = f"{path}: {runs} runs, {merged.height} rows, {twice} duplicates"
+    content = {"file": str(file), "runs": runs, "rows": merged.height, "twice": twice}
+    line = f"{file}: {runs} runs, {merged.height} rows, {twice} duplicates"
     return print_result(content, lambda: [line], json=json, quiet=quiet)
-
-
-def _print_written(table: pl.DataFrame, path: Path, *, json: bool, quiet: bool) -> int:
-    content = {"table": str(path), "deployments": table.height, "keys": table["key"].to_list()}
-    return print_result(content, lambda: [f"{path}: {table.height} deployments"], json=json, quiet=quiet)
 
 
 def share(  # noqa: D417 - arguments document themselves

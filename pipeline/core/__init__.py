@@ -61,7 +61,7 @@ if TYPE_CHECKING:
         list_caches,
         require_compiler,
     )
-    from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory
+    from pipeline.core.memory import MemoryWatchdog, limit_memory, measure_memory, read_memory
     from pipeline.core.processes import (
         PACKAGE,
         THREAD_VARIABLES,
@@ -138,7 +138,6 @@ if TYPE_CHECKING:
         require_finite,
         resolve_inside,
         too_large,
-        unquote_formulas,
         walk_files,
         walk_tree,
     )

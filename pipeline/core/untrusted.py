@@ -379,13 +379,6 @@ def format_csv(frame: pl.DataFrame, *, header: bool = True, digits: int | None =
     return texts.rename(safe).write_csv(include_header=header, float_precision=digits)
 
 
-def unquote_formulas(frame: pl.DataFrame) -> pl.DataFrame:
-    """The original texts of a table that `format_csv` wrote."""
-    import polars.selectors as cs  # noqa: PLC0415 - heavy
-
-    return frame.with_columns(cs.string().str.replace(f"^'('*[{_FORMULA}])", "$1"))
-
-
 def _quote(text: pl.Expr) -> pl.Expr:
     # Existing leading quotes get one more, so that the original text can be restored.
     return text.str.replace(f"^('*[{_FORMULA}])", "'$1")

@@ -44,10 +44,7 @@ if TYPE_CHECKING:
     from pipeline.datasets.deployments import (
         ZONES,
         DeploymentMap,
-        add_deployment,
         draw_up_map,
-        merge_deployments,
-        write_deployments,
     )
     from pipeline.datasets.equal_driving import LEAST_SAMPLES, SPEED_EDGES, TURN_EDGES
     from pipeline.datasets.features import gather_features, merge_features, read_features, write_features

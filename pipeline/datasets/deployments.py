@@ -1,17 +1,15 @@
-"""Deployments: reading, checking, merging, and their position on the map of energy against terrain."""
+"""Deployments of the literature and own ones: their position on the map of energy against terrain."""
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import polars as pl
 
-from pipeline.core import format_csv, naming_os_errors, read_bounded_text, unquote_formulas
 from pipeline.datasets.compared_runs import choose_input, find_material, measure_runs, read_digest
 from pipeline.datasets.pooling import MEASURES, ComparisonError, Measure, pool_runs
-from pipeline.store import Store, replace_file
+from pipeline.store import Store
 from schemas import Deployments
 
 # Scale of terrain complexity, so that two people rate the same terrain alike.
@@ -185,14 +183,12 @@ class DeploymentMap:
     measure: Measure
 
 
-# Table of deployments: read, check, add, merge. The start of a shared database.
+# Table of deployments: read and checked.
 #
 # The project's own table is `data_samples/deployments.csv` in the repository; an installed package has it
 # beside this module.
 
 _NAME = "deployments.csv"
-_DIGITS = 6
-"""Significant digits in CSV: more than any measurement in it has."""
 
 
 def find_own_table() -> Path:
@@ -228,56 +224,7 @@ def read_deployments(path: Path) -> pl.DataFrame:
     except (pl.exceptions.PolarsError, OSError, UnicodeDecodeError) as error:
         what = f"the table cannot be read: {str(error).splitlines()[0]}"
         raise _refuse(what, str(path), "Write it as CSV, UTF-8, with a line of names") from error
-    return _check(unquote_formulas(text), str(path))
-
-
-def add_deployment(table: Path, entry: Path) -> pl.DataFrame:
-    """Return the table with the deployment of a TOML file appended; nothing is written.
-
-    Args:
-        table: a CSV file; may be missing.
-        entry: a TOML file whose keys are columns of the table.
-
-    Raises:
-        ComparisonError: ``bad_deployment``; ``bad_deployments``: it breaks the schema, or its key exists.
-    """
-    try:
-        content = tomllib.loads(read_bounded_text(entry))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        what = f"the deployment cannot be read: {error}"
-        hint = "Write one line `column = value` for each column known; key, year and drive are needed"
-        raise ComparisonError("bad_deployment", what, where=str(entry), hint=hint) from error
-    row = pl.DataFrame({name: [str(value)] for name, value in content.items()})
-    there = (
-        read_deployments(table)
-        if table.exists()
-        else _check(pl.DataFrame(schema={"key": pl.String}), str(table))
-    )
-    added = _check(_complete_energy(row), str(entry))
-    return _join([there, added], f"{table} and {entry}")
-
-
-def merge_deployments(first: Path, second: Path) -> pl.DataFrame:
-    """Merge two tables, sorted by year and key; rows that are identical in both count once.
-
-    Raises:
-        ComparisonError: ``bad_deployments``, for example the same key with other values.
-    """
-    merged = _join([read_deployments(first), read_deployments(second)], f"{first} and {second}")
-    return merged.sort("year", "key")
-
-
-def write_deployments(frame: pl.DataFrame, path: Path) -> None:
-    """Write a table as CSV and replace the previous file.
-
-    Raises:
-        ComparisonError: ``not_written``, the file cannot be written.
-    """
-    plain = frame.with_columns(pl.col(pl.Float64).round_sig_figs(_DIGITS))
-    what, hint = "the table cannot be written", "Choose another file"
-    with naming_os_errors(ComparisonError, "not_written", what, where=path, hint=hint):
-        path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, format_csv(plain).encode())
+    return _check(text, str(path))
 
 
 def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
@@ -309,27 +256,6 @@ def _check(text: pl.DataFrame, where: str) -> pl.DataFrame:
         hint = "Correct them; every value needs a status; schemas/__init__.py says what columns mean"
         raise _refuse(f"rows break the schema: {'; '.join((lost or broken)[:5])}", where, hint)
     return valid
-
-
-def _complete_energy(row: pl.DataFrame) -> pl.DataFrame:
-    """Kinetic energy from mass and speed where it is not given."""
-    if "kinetic_energy_j" in row.columns or not {"mass_kg", "speed_mps"} <= set(row.columns):
-        return row
-    mass, speed = (pl.col(name).cast(pl.Float64, strict=False) for name in ("mass_kg", "speed_mps"))
-    energy = (0.5 * mass * speed**2).cast(pl.String).alias("kinetic_energy_j")
-    bound = pl.lit("value").alias("kinetic_energy_bound")
-    return (
-        row.with_columns(energy) if "kinetic_energy_bound" in row.columns else row.with_columns(energy, bound)
-    )
-
-
-def _join(tables: list[pl.DataFrame], where: str) -> pl.DataFrame:
-    joined = pl.concat(tables).unique(maintain_order=True)
-    twice = joined.filter(pl.col("key").is_duplicated())["key"].unique().sort().to_list()
-    if twice:
-        what = f"the same key stands for different deployments: {', '.join(twice)}"
-        raise _refuse(what, where, "Give one of them another key, or make the rows agree")
-    return joined
 
 
 def _refuse(what: str, where: str, hint: str) -> ComparisonError:

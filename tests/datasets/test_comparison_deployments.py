@@ -8,36 +8,17 @@ import pytest
 
 from pipeline.cli import main
 from pipeline.datasets import ComparisonError
-from pipeline.datasets.deployments import (
-    add_deployment,
-    find_own_table,
-    merge_deployments,
-    rate_name,
-    read_deployments,
-    write_deployments,
-)
+from pipeline.datasets.deployments import find_own_table, rate_name, read_deployments
 from schemas import FEATURES
 
-ENTRY = """
-key = "Ours2026"
-year = 2026
-vehicle = "Clearpath Warthog"
-vehicle_status = "measured"
-drive = "skid-steer"
-terrain = "wet snow"
-terrain_status = "measured"
-mass_kg = 500
-mass_status = "measured"
-speed_mps = 2.0
-speed_status = "measured"
-slope_score = 0
-roughness_score = 1
-sinkage_score = 2
-friction_score = 3
-scores_status = "estimated"
-temperature_c = -4.5
-temperature_status = "measured"
-"""
+ENTRY = {
+    "key": "Ours2026", "year": "2026", "vehicle": "Clearpath Warthog", "vehicle_status": "measured",
+    "drive": "skid-steer", "terrain": "wet snow", "terrain_status": "measured", "mass_kg": "500",
+    "mass_status": "measured", "speed_mps": "2.0", "speed_status": "measured", "kinetic_energy_j": "1000",
+    "kinetic_energy_bound": "value", "slope_score": "0", "roughness_score": "1", "sinkage_score": "2",
+    "friction_score": "3", "scores_status": "estimated", "temperature_c": "-4.5",
+    "temperature_status": "measured",
+}  # fmt: skip
 
 
 def test_the_own_table_keeps_its_schema_and_says_how_well_each_value_is_known(samples: Path) -> None:
@@ -58,42 +39,33 @@ def test_the_scale_puts_its_anchors_where_they_are(terrain: str, wanted: float |
     assert found == (None if wanted is None else pytest.approx(wanted, abs=0.05))
 
 
-def test_a_deployment_is_added_and_its_energy_worked_out(tmp_path: Path) -> None:
-    entry, table = tmp_path / "ours.toml", tmp_path / "own.csv"
-    entry.write_text(ENTRY, encoding="utf-8")
-    write_deployments(add_deployment(table, entry), table)
+def test_a_table_of_ones_own_is_read_and_what_is_not_known_is_empty(tmp_path: Path) -> None:
+    table = tmp_path / "own.csv"
+    pl.DataFrame(ENTRY).write_csv(table)
     (row,) = read_deployments(table).iter_rows(named=True)
     assert row["kinetic_energy_j"] == pytest.approx(1000.0)
-    assert row["kinetic_energy_bound"] == "value"
     assert row["hardness"] is None
-    merged = merge_deployments(find_own_table(), table)
-    assert merged.height == 38
-    assert merge_deployments(table, table).height == 1
 
 
 @pytest.mark.parametrize(
     ("spoil", "said"),
     [
-        (("mass_status", "#"), "every_value_has_a_status"),
-        (('"skid-steer"', '"hover"'), "drive of 'Ours2026' is 'hover'"),
-        (("mass_kg = 500", 'mass_kg = "heavy"'), "mass_kg of 'Ours2026' is 'heavy'"),
-        (("friction_score = 3", "friction_score = 7"), "friction_score"),
-        (("friction_score = 3", ""), "scores_are_all_there_or_none"),
-        (
-            ("year = 2026", "year = 2026\nkinetic_energy_j = 7\nkinetic_energy_bound = 'value'"),
-            "mass_and_speed",
-        ),
-        (("year = 2026", "year = 2026\ncolour = 'red'"), "unknown columns: colour"),
-        (("year = 2026", "year = "), "cannot be read"),
+        ({"mass_status": ""}, "every_value_has_a_status"),
+        ({"drive": "hover"}, "drive of 'Ours2026' is 'hover'"),
+        ({"mass_kg": "heavy"}, "mass_kg of 'Ours2026' is 'heavy'"),
+        ({"friction_score": "7"}, "friction_score"),
+        ({"friction_score": ""}, "scores_are_all_there_or_none"),
+        ({"kinetic_energy_j": "7"}, "mass_and_speed"),
+        ({"colour": "red"}, "unknown columns: colour"),
     ],
 )
 def test_what_breaks_the_schema_is_refused_with_its_reason(
-    spoil: tuple[str, str], said: str, tmp_path: Path
+    spoil: dict[str, str], said: str, tmp_path: Path
 ) -> None:
-    entry = tmp_path / "ours.toml"
-    entry.write_text(ENTRY.replace(*spoil), encoding="utf-8")
+    table = tmp_path / "own.csv"
+    pl.DataFrame(ENTRY | spoil).write_csv(table)
     with pytest.raises(ComparisonError, match=said):
-        add_deployment(tmp_path / "own.csv", entry)
+        read_deployments(table)
 
 
 def test_the_map_needs_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -107,17 +79,3 @@ def test_the_map_needs_no_results(tmp_path: Path, capsys: pytest.CaptureFixture[
         main(["fleet", "map", str(tmp_path / "none"), "--json"])
     assert ended.value.code == 0
     assert len(json.loads(capsys.readouterr().out)["deployments"]) == 20
-
-
-def test_tables_are_added_to_and_merged_by_commands(tmp_path: Path) -> None:
-    entry, table = tmp_path / "ours.toml", tmp_path / "own.csv"
-    entry.write_text(ENTRY, encoding="utf-8")
-    for arguments, code in (
-        (["fleet", "map", "add", str(entry), "--file", str(table), "--quiet"], 0),
-        (["fleet", "map", "merge", str(find_own_table()), str(table), "--file", str(table), "--quiet"], 0),
-        (["fleet", "map", "add", str(entry), "--file", str(tmp_path / "new.csv"), "--json"], 0),
-    ):
-        with pytest.raises(SystemExit) as ended:
-            main(arguments)
-        assert ended.value.code == code
-    assert read_deployments(table).height == 38

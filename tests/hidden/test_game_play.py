@@ -9,7 +9,6 @@ import pytest
 from game.draw import CATEGORIES, POOLS, Answer, draw_riddle, write_riddle
 from game.freeze import Case, Marks, answer, compare, examine, freeze, read_truth, write_marks
 from game.freeze import describe as describe_comparison
-from game.paired import compare as compare_versions
 from game.play import (
     Job,
     Record,
@@ -182,13 +181,6 @@ def test_an_interrupted_scoring_loses_only_the_line_that_was_being_written(tmp_p
     assert list(read_records([path])) == [one.job, three.job]
     append_record(two, path)
     assert set(read_records([path])) == {one.job, two.job, three.job}
-
-
-def test_two_versions_are_compared_on_logs_that_both_played() -> None:
-    better, worse = (_check(true=0.5, named=0.5), record_failure(Job("single", 1, "drive_lag"), "failed", ""))
-    lines = compare_versions({better.job: better}, {worse.job: worse})
-    assert lines[1].split()[:4] == ["single", "1", "0", "1"]
-    assert "drive_lag -> nothing" in lines[-1]
 
 
 @pytest.mark.long

@@ -131,8 +131,7 @@ WORDS: list[tuple[str, str]] = [
     ("fleet map --cell 3", "Add --terrain"),
     ("fleet map --terrain --cell .01", r"a cell of 0\.01 m is not possible"),
     ("fleet map --terrain --figures svg", "--figures is of the map of deployments"),
-    ("fleet map add text.mcap --file map.csv", "text.mcap"),
-    ("fleet map merge missing.csv text.mcap --file map.csv", "missing.csv"),
+    ("fleet map merge missing.parquet text.mcap --file map.parquet", "missing.parquet"),
     *(
         (f"{verb} --results nowhere", "nowhere: there are no results: there is no such folder. Give")
         for verb in (
